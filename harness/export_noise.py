@@ -1,10 +1,9 @@
 """``python -m harness.export_noise CAMERA --out DIR``: a camera's noise as a table and one file of code.
 
-The files are for other simulators (Isaac Sim, Gazebo, MuJoCo, BlenderProc), which render ideal depth: ``NAME.npz``
-with the table, ``depth_noise.py`` (NumPy) and ``depth_noise_torch.py``, copies of `scenes.sensor.tabled` and
-`scenes.sensor.tabled_torch`, which say what is not modelled. The table is measured on the full model before tilted
-planes of many brightnesses: deviation of single pixels, chance of a return, correlation of neighbours, fixed pattern.
-"""
+The files are for other simulators (Isaac Sim, Gazebo, MuJoCo, BlenderProc), which render ideal depth: ``NAME.npz`` with
+the table, and ``depth_noise.py`` (NumPy, or torch), a copy of `scenes.sensor.tabled`, which says what is not modelled.
+The table is measured on the full model before tilted planes of many brightnesses: deviation of single pixels, chance of
+a return, correlation of neighbours, fixed pattern. """
 
 from __future__ import annotations
 
@@ -46,7 +45,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
 def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0, 2 on a mistake of the user, 130 after Ctrl-C."""
     from harness.vocabulary.files import write_bytes, write_text
-    from scenes.sensor import tabled, tabled_torch
+    from scenes.sensor import tabled
     from scenes.sensor.camera import load_camera
 
     camera = load_camera(options.camera)
@@ -55,13 +54,12 @@ def main(options: argparse.Namespace, command: str) -> int:
     file = io.BytesIO()
     np.savez_compressed(file, **table, command=np.array(command))  # type: ignore[arg-type]
     write_bytes(options.out / f"{camera.name}.npz", file.getvalue())
-    for module, name in ((tabled, "depth_noise.py"), (tabled_torch, "depth_noise_torch.py")):
-        write_text(options.out / name, Path(str(module.__file__)).read_text(encoding="utf-8"))
+    write_text(options.out / "depth_noise.py", Path(str(tabled.__file__)).read_text(encoding="utf-8"))
     seen = table["seen"] > 0.5
     low, high = (1e3 * float(table["sigma_m"][seen][k]) for k in (-1, 0))
     print(f"deviation of one frame {low:.3g} to {high:.3g} mm from bright to faint; fixed pattern of a unit "
           f"{1e3 * float(table['pattern_m']):.3g} mm")  # fmt: skip
-    print(f"wrote {options.out / camera.name}.npz, depth_noise.py, depth_noise_torch.py")
+    print(f"wrote {options.out / camera.name}.npz, depth_noise.py")
     return 0
 
 

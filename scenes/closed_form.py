@@ -45,16 +45,14 @@ def plane_view(
     """Return the plane z = distance + slope_x x + slope_y y, Lambertian, direct light only, sampled at pixel centres.
     Amplitude: albedo cos(incidence) / d^2 with d from the emitter. The footprint's extent and the cone are left out."""
     plane, slopes = Plane(distance_m, slope_x, slope_y), camera.nominal_lens.region_slopes(region)
-    points, amplitude, path_m = _lit(slopes, plane, albedo, camera.optics)
-    phasor = amplitude * np.exp(1j * wave_numbers(camera.optics.frequencies_hz)[:, None, None] * path_m)
-    seen, coverage = np.zeros(amplitude.shape, int), np.ones(amplitude.shape)
-    return _view(camera.optics, region, slopes, phasor, amplitude, points, seen, ("plane",), coverage)
+    points, amplitude, _ = _lit(slopes, plane, albedo, camera.optics)
+    return image_view(camera, region, points[..., 2], amplitude)
 
 
 def image_view(camera: AnyCamera, region: Region, z_m: np.ndarray, light: np.ndarray) -> NoiseFreeView:
     """Return what a depth image shows, sampled at pixel centres: ``z_m`` (h, w), NaN where there is nothing, and the
-    ``light`` (h, w) that comes back from each pixel, in a view's units. Both may be (k, h, w): parts of pixels
-    on different surfaces, of which the first of which counts as its range. Direct light only."""
+    ``light`` (h, w) that comes back from each pixel, in a view's units. Both may be (k, h, w): parts of pixels on
+    different surfaces, of which the first counts as its range. Direct light only."""
     optics, slopes = camera.optics, camera.nominal_lens.region_slopes(region)
     z_m, light = (each.reshape(-1, *region.shape) for each in (z_m, light))
     points = np.concatenate([slopes, np.ones((*region.shape, 1))], axis=-1) * z_m[..., None]
@@ -62,7 +60,7 @@ def image_view(camera: AnyCamera, region: Region, z_m: np.ndarray, light: np.nda
     amplitude, waves = np.where(np.isfinite(z_m), np.nan_to_num(light), 0.0), wave_numbers(optics.frequencies_hz)
     phasor = np.stack([(amplitude * np.exp(1j * wave * path_m)).sum(axis=0) for wave in waves])
     seen, coverage = np.zeros(region.shape, int), np.ones(region.shape)
-    return _view(optics, region, slopes, phasor, amplitude.sum(axis=0), points[0], seen, ("image",), coverage)
+    return _view(optics, region, phasor, amplitude.sum(axis=0), points[0], seen, ("image",), coverage)
 
 
 def layered_view(
@@ -105,10 +103,9 @@ def layered_view(
         pixels = ndimage.binary_dilation(mixed, np.ones((3, 3), bool), footprint.reach_px or 1)
         if not pixels.any():
             break
-    slopes = lens.region_slopes(region)
-    on_front, points, *_ = meet(slopes)
+    on_front, points, *_ = meet(lens.region_slopes(region))
     surface, coverage = np.where(on_front, 0, 1), np.where(on_front, share, 1 - share)
-    return _view(optics, region, slopes, phasor, intensity, points, surface, ("front", "back"), coverage)
+    return _view(optics, region, phasor, intensity, points, surface, ("front", "back"), coverage)
 
 
 def _lit(slopes: np.ndarray, plane: Plane, albedo: float, optics: Optics) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -124,7 +121,6 @@ def _lit(slopes: np.ndarray, plane: Plane, albedo: float, optics: Optics) -> tup
 def _view(
     optics: Optics,
     region: Region,
-    slopes: np.ndarray,
     phasor: np.ndarray,
     intensity: np.ndarray,
     points: np.ndarray,
@@ -145,7 +141,7 @@ def _view(
         surface_names=names,
         coverage=coverage.astype(np.float32),
         rgb=np.full((*range_m.shape, 3), WHITE, np.float32),
-        slopes=slopes,
+        slopes=optics.lens.region_slopes(region),
         seconds=0.0,
         variant="closed form",
     )

@@ -1,8 +1,8 @@
 """Virtual damage for a real scan: what a camera would have measured of a damage, less what it measures without it.
 
-A small board stands where the scan's surface is, at its distance and angle, and is rendered twice: with one damage and
-without. The camera's own model turns both renders into frames, with the same draws of noise. What the recorded frames
-have of their own (noise, fixed pattern, texture, surface) is not in the difference, so they keep it.
+A small board stands where the scan's surface is and is rendered twice: with one damage and without. The camera's own
+model turns both renders into frames, with the same draws of noise. What the recorded frames have of their own (noise,
+fixed pattern, texture, surface) is not in the difference, so they keep it.
 
 Not modelled: the surface's bend within the small board (its tangent plane stands for it), texture at the damage, light
 that reaches the damage by way of other surfaces, and a damage that makes pixels quieter: recorded noise is never taken
@@ -13,7 +13,6 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -66,13 +65,9 @@ def unit_config(name: str, lens: Lens) -> tuple[CameraConfig, bool]:
     its pixels are the recording's: then with the recording's ``lens``, else with its own."""
     facts = camera_of(CameraConfig(name=name))
     same = (facts.nominal_lens.width, facts.nominal_lens.height) == (lens.width, lens.height)
-    numbers: dict[str, Any] = {"engine.output_step_mm": FINEST_STEP_MM}
-    if same:
-        numbers |= numbers_of_lens(lens)
-    known = number_paths(facts.to_data())
-    effects = NO_EFFECTS.model_copy(
-        update=dict.fromkeys(("noise", "multipath", "wiggling", "ambient", "saturation"), True)
-    )
+    numbers = {"engine.output_step_mm": FINEST_STEP_MM, **(numbers_of_lens(lens) if same else {})}
+    known, kept = number_paths(facts.to_data()), ("noise", "multipath", "wiggling", "ambient", "saturation")
+    effects = NO_EFFECTS.model_copy(update=dict.fromkeys(kept, True))
     return CameraConfig(name=name, effects=effects, numbers={k: v for k, v in numbers.items() if k in known}), same
 
 
@@ -107,17 +102,13 @@ def implant_of(
     with this lens; ``config``, ``same`` of `unit_config`. Raises UserError where the board leaves the view."""
     camera = camera_of(config)
     declared = board.at_wavelength(camera.optics.wavelength_nm)
-    count, units, drawn = max(frames, LEAST_DRAWS), [], []
+    count, drawn, smooth = max(frames, LEAST_DRAWS), [], []
+    without_noise = config.model_copy(update={"effects": config.effects.model_copy(update={"noise": False})})
     for target in (declared, declared.hole_free()):
         view, _ = cached_view(target, camera.optics, RenderConfig(), cache)
-        unit = SimulatedUnit(camera, config, view)
-        units.append(unit)
+        unit, quiet = SimulatedUnit(camera, config, view), SimulatedUnit(camera, without_noise, view)
         drawn.append(np.stack([frame.z_m for frame in unit.capture(count, seed, "implant").frames()]).astype(float))
-    without_noise = config.model_copy(update={"effects": config.effects.model_copy(update={"noise": False})})
-    smooth = [
-        next(SimulatedUnit(camera, without_noise, unit.view).capture(1, seed).frames()).z_m.astype(float)
-        for unit in units
-    ]
+        smooth.append(next(quiet.capture(1, seed).frames()).z_m.astype(float))
     with np.errstate(invalid="ignore", divide="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of pixels that no frame shows
         means, spreads = zip(*((np.nanmean(z, axis=0), np.nanvar(z, axis=0)) for z in drawn), strict=True)
@@ -125,11 +116,10 @@ def implant_of(
         middle = [np.where(np.isfinite(z), z, mean) for z, mean in zip(smooth, means, strict=True)]
         more = np.sqrt(np.clip(1.0 - spreads[1] / spreads[0], 0.0, 1.0))
         noise_m = more * (drawn[0] - means[0])
-    near = _near(units[0], board)
+    near, region = _near(unit, board), unit.region
     shift_m = np.where(near, np.nan_to_num(middle[0] - middle[1]), 0.0)
     noise_m = np.where(near, np.nan_to_num(noise_m), 0.0)
     lost = near & np.isnan(drawn[0]) & np.isfinite(drawn[1])
-    region = units[0].region
     if same:
         return Implant(region, shift_m, noise_m, lost)
     # the recording was aligned to other pixels: each takes its value between those of the camera that it lies among

@@ -22,14 +22,13 @@ FWHM_PER_DEVIATION = 2 * np.sqrt(2 * np.log(2))
 class Optics:
     """The geometry of a camera's light, in the camera's frame. An imager looks through ``lens`` and is lit by a point
     at ``emitter_m`` (3,), of uniform intensity within a cone about the axis with a linear roll-off between two half
-    angles. A scanner sends its beam from the origin and receives at ``emitter_m``: on Lambertian surfaces the light of
-    a path is the same in both directions (Helmholtz' reciprocity), so it is described as an imager whose pixels are
-    beams and whose emitter is the receiver. ``beam_fwhm_rad``: full width at half maximum of the beam, a round Gaussian
-    in angle about the pixel's central ray; None for an imager, whose pixel is evenly weighted between its corners.
-    ``frequencies_hz``: where phasors are wanted. ``margin_px``: pixels beyond
-    a region whose light reaches it through the camera's own filter. ``wavelength_nm``: at which surfaces need an
-    albedo. The camera gives no range below ``nearest_m`` or beyond ``farthest_m``, counted along its rays or its axis,
-    whatever the light; they change no render."""
+    angles. A scanner sends its beam from the origin and receives at ``emitter_m``: light takes a path alike in both
+    directions (Helmholtz' reciprocity), so it is described as an imager whose pixels are beams and whose emitter is the
+    receiver. ``beam_fwhm_rad``: full width at half maximum of the beam, a round Gaussian in angle about the pixel's
+    central ray; None for an imager, whose pixel is evenly weighted between its corners. ``frequencies_hz``: where
+    phasors are wanted. ``margin_px``: pixels beyond a region whose light reaches it through the camera's own filter.
+    ``wavelength_nm``: at which surfaces need an albedo. The camera gives no range below ``nearest_m`` or beyond
+    ``farthest_m``, counted along its rays or its axis, whatever the light; they change no render."""
 
     title: str
     lens: Lens
@@ -83,9 +82,9 @@ def corners_of(lens: Lens, region: Region) -> np.ndarray:
 
 
 class Quadrilaterals:
-    """An imager's pixels: the area between a pixel's corners, evenly weighted. Fine sub-rays lie on a golden lattice:
-    an edge along the rows or columns moves past them one by one and not sixteen at a time. Inside a pixel the lens is
-    linear to 1e-7 in slope (0.1 um at 1 m), so slopes are interpolated between its corners."""
+    """An imager's pixels: the area between a pixel's corners, evenly weighted. Fine sub-rays lie on a golden lattice,
+    so that an edge along rows or columns passes them one by one. Inside a pixel the lens is linear to 1e-7 in slope
+    (0.1 um at 1 m), so slopes are interpolated between its corners."""
 
     reach_px = 0
     """Pixels around an edge that have a part of it in their footprint, besides the edge's own."""
@@ -93,24 +92,19 @@ class Quadrilaterals:
     def __init__(self, lens: Lens, region: Region) -> None:
         self.corner = corners_of(lens, region)
 
-    def coarse(self, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
-        """Return slopes (n, COARSE^2, 2) of pixels, a grid by rows."""
-        return self.strata(rows, cols, COARSE)
+    def coarse(self, rows: np.ndarray, cols: np.ndarray, side: int = COARSE) -> np.ndarray:
+        """Return slopes (n, side^2, 2) of the centres of side x side strata of pixels, a grid by rows."""
+        place = (np.arange(side) + 0.5) / side
+        fy, fx = np.meshgrid(place, place, indexing="ij")
+        return self._placed(rows, cols, fx.ravel(), fy.ravel())
 
     def fine(self, rows: np.ndarray, cols: np.ndarray, count: int = FINE) -> np.ndarray:
         """Return slopes (n, count, 2) of sub-rays where a footprint meets an edge."""
         number = np.arange(count) + 0.5
         return self._placed(rows, cols, number / count, (number * GOLDEN) % 1)
 
-    def strata(self, rows: np.ndarray, cols: np.ndarray, side: int) -> np.ndarray:
-        """Return slopes (n, side^2, 2) of the centres of side x side strata."""
-        place = (np.arange(side) + 0.5) / side
-        fy, fx = np.meshgrid(place, place, indexing="ij")
-        return self._placed(rows, cols, fx.ravel(), fy.ravel())
-
     def _placed(self, rows: np.ndarray, cols: np.ndarray, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
-        """Return slopes (n, m, 2) at fractions (m,) of pixels' widths and heights: bilinear, as one product of matrices
-        for each component."""
+        """Return slopes (n, m, 2) at fractions (m,) of pixels' widths and heights, bilinear."""
         c00, c01, c10, c11 = (self.corner[rows + i, cols + j].T for i in (0, 1) for j in (0, 1))
         factors = np.stack([c00, c01 - c00, c10 - c00, c00 - c01 - c10 + c11], axis=-1)
         return np.moveaxis(factors @ np.stack([np.ones(len(fx)), fx, fy, fx * fy]), 0, -1)
@@ -159,8 +153,8 @@ class Beams:
 
 @dataclass(frozen=True)
 class NoiseFreeView:
-    """Noise-free light of one view on a region of the sensor. ``phasor`` (f, h, w) complex64 (its rounding turns 200
-    MHz by 10 nm): per modulation frequency the light of all paths, sum over paths of a * exp(+i 2 pi f L / c), L the
+    """Noise-free light of a view on a region of the sensor. ``phasor`` (f, h, w) complex64 (its rounding turns 200 MHz
+    by 10 nm): per modulation frequency the light of all paths, sum over paths of a * exp(+i 2 pi f L / c), L the
     full path length; amplitudes in units of an unoccluded albedo-1 Lambertian plane facing emitter and camera at 1 m on
     the axis (=1). ``phasor_direct`` (f, h, w): the part without interreflection. ``intensity`` (h, w): the same sum at
     frequency 0. ``indirect_noise_m`` (h, w): one standard deviation of range that the Monte Carlo part leaves in a

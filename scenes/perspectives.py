@@ -22,8 +22,8 @@ from scenes.target.truth import OUTLINE_STEPS, face_grid_m, face_of
 
 def check_in_view(config: TargetConfig, optics: Optics) -> None:
     """Raise UserError where all of the face, or all damage, is out of the camera's field of view, or all of the face
-    out of its range. A face partly out of view is legal, and damage there is no target; so is a face partly out of
-    range: its pixels there have no range, as they would have in the real camera."""
+    out of its range. A face partly out of view or range is legal: damage out of view is no target, and pixels out of
+    range have none."""
     face, places = _face_before_lens(config), np.array([damage.centre_m for damage in config.damages]).reshape(-1, 2)
     centres = transform_points(config.pose.T_camera_board, face_of(config.board).point(*places.T))
     if not len(centres) or not optics.lens.images(centres).any():  # where damage is in view, a part of the face is
@@ -93,15 +93,8 @@ class _Guess(Config):
 class _Spread(_Guess):
     count: Annotated[int, Field(ge=1, le=MAX_VIEWS)]
     spread_deg: Annotated[float, Field(gt=0.0, le=120.0)] = Field(description="from the outermost view to the opposite")
-    distance_jitter_mm: float = Field(
-        0.0, ge=0.0, le=500.0, description="standard deviation of each view's distance; the first keeps its own"
-    )
-    aim_jitter_mm: float = Field(
-        0.0,
-        ge=0.0,
-        le=500.0,
-        description="standard deviation of each view's aim, sideways and upwards; not of the first",
-    )
+    distance_jitter_mm: float = Field(0.0, ge=0.0, le=500.0, description="deviation of distances; not of the first")
+    aim_jitter_mm: float = Field(0.0, ge=0.0, le=500.0, description="the same of aims, sideways and upwards")
 
 
 class ArcViews(_Spread):
@@ -149,11 +142,9 @@ def poses_of(views: AnyViews, pose: PoseConfig) -> tuple[PoseConfig, ...]:
         return views.poses
     if isinstance(views, HandHeldViews):
         return tuple(_moved(pose, *shift) for shift in _walk(views))
-    half, poses = views.spread_deg / 2, []
+    half, poses, turns = views.spread_deg / 2, [], _grid(views.count)
     if isinstance(views, ArcViews):
         turns = [(share, 0.0) if views.about == "x" else (0.0, share) for share in _shares(views.count)]
-    else:
-        turns = _grid(views.count)
     for number, (turn_x, turn_y) in enumerate(turns):
         aside = up = distance = 0.0
         if number > 0:  # the first view keeps its own place
@@ -222,8 +213,8 @@ def _walk(views: HandHeldViews) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(step) for step in (paths / greatest * reach).T.tolist())
 
 
-def _moved(pose: PoseConfig, turn_x: float, turn_y: float, turn_z: float, *shift_mm: float) -> PoseConfig:
-    x_mm, y_mm, z_mm = shift_mm
-    moves = {"distance_m": z_mm * MM, "offset_x_mm": x_mm, "offset_y_mm": y_mm}
-    moves |= {"tilt_x_deg": turn_x, "tilt_y_deg": turn_y, "roll_deg": turn_z}
-    return PoseConfig(**{key: getattr(pose, key) + moved for key, moved in moves.items()})
+def _moved(pose: PoseConfig, *by: float) -> PoseConfig:
+    """Return the pose turned by three angles in degrees and shifted along x, y and z by millimetres."""
+    names = ("tilt_x_deg", "tilt_y_deg", "roll_deg", "offset_x_mm", "offset_y_mm", "distance_m")
+    moves = zip(names, (*by[:5], by[5] * MM), strict=True)
+    return PoseConfig(**{key: getattr(pose, key) + moved for key, moved in moves})

@@ -23,6 +23,7 @@ from harness.vocabulary.geometry import MM, Cloud, Region
 from harness.vocabulary.seeds import random_stream
 from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.sensor.amcw import kernels
+from scenes.sensor.amcw.at_once import BEND, SCALE
 from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.amcw.imager import AmcwImager
 from scenes.sensor.amcw.kernels import LANES
@@ -45,6 +46,13 @@ SURE = 5.0
 SURE_OF_FLOOR = 6.0
 """Far behind a hole the light is dim, and means drawn at once scatter some 7 % less than those of frames: 13 to 15 % of
 the variance of eight frames, measured with 60 captures of either kind, whose standard error is 3 %."""
+
+
+def test_noise_from_bytes_has_the_variance_and_kurtosis_of_a_normal() -> None:
+    v = (np.arange(-128, 128) + 0.5) / 128
+    u = SCALE * v * (1 + BEND * v**2)
+    assert (u**2).mean() == pytest.approx(1.0, abs=1e-12)
+    assert (u**4).mean() == pytest.approx(3.0, abs=1e-12)
 
 
 @pytest.fixture(autouse=True)

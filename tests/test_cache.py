@@ -27,7 +27,6 @@ from scenes.render.cache import (
     read_view,
     render_key,
     stored_renders,
-    stored_view,
     trim_cache,
     write_view,
 )
@@ -92,7 +91,7 @@ def test_flipped_bits_are_found_wherever_they_are(stored, view):
         spoilt = bytearray(whole)
         spoilt[place] ^= 1 << rng.randrange(8)
         stored.write_bytes(bytes(spoilt))
-        assert stored_view(stored) is None, place
+        assert read_view(stored) is None, place
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 0.9, 0.999])

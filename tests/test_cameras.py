@@ -197,7 +197,7 @@ def test_an_experiment_replaces_numbers_of_a_camera():
         camera_of(CameraConfig(numbers={"lens.fx": 500.0}))
     with pytest.raises(UserError, match=r"lens.fx_px.*above 0"):
         camera_of(CameraConfig(numbers={"lens.fx_px": -1.0}))
-    with pytest.raises(UserError, match=r"  modulation.contrast: should be a valid tuple") as caught:
+    with pytest.raises(UserError, match=r"modulation.contrast.value` is 0.5: it should be a list") as caught:
         camera_of(CameraConfig(numbers={"modulation.contrast": 0.5}))
     assert "Value error" not in str(caught.value)
 

@@ -13,7 +13,7 @@ from harness.engine.trial import pair_noise
 from harness.export_noise import main, noise_table
 from scenes.sensor.calibration import unit_before_plane
 from scenes.sensor.camera import load_camera
-from scenes.sensor.tabled import DepthNoise
+from scenes.sensor.tabled import DepthNoise, TorchDepthNoise
 
 PAIRS = 15
 table_of = lru_cache(lambda name: noise_table(load_camera(name)))
@@ -78,10 +78,8 @@ def test_the_program_writes_files_that_stand_alone(tmp_path, capsys):
 
 def test_torch_has_the_same_statistics():
     torch = pytest.importorskip("torch")
-    from scenes.sensor import tabled_torch
-
     table = table_of("azure_kinect_nfov")
-    noise, same = tabled_torch.TorchDepthNoise(table), DepthNoise(table)
+    noise, same = TorchDepthNoise(table), DepthNoise(table)
     z, bright = torch.ones(2 * PAIRS, *noise.stretch.shape), torch.full(noise.stretch.shape, 0.6)
     frames = [frame[200:300, 250:400].double().numpy() for frame in noise(z, bright.expand_as(z))]
     rng = np.random.default_rng(1)

@@ -336,21 +336,6 @@ def test_meshes_that_cannot_be_used_are_refused_with_the_place(tmp_path: Path) -
         check_target(target_from_data({"name": "mesh", "file": str(part_file(tmp_path)), "flaws": [off]}).declare())
 
 
-def test_openings_with_a_flat_rim_are_closed_where_that_is_asked_for(tmp_path: Path) -> None:
-    box = trimesh.creation.box((40.0, 30.0, 20.0)).subdivide()
-    up, aside = box.face_normals[:, 2] < -0.5, box.face_normals[:, 0] > 0.5
-    for gone, name in ((up, "bottom.stl"), (up | (aside & (np.arange(len(aside)) % 2 == 0)), "teeth.stl")):
-        trimesh.Trimesh(box.vertices, box.faces[~gone], process=False).export(tmp_path / name)
-    data = {"name": "mesh", "file": str(tmp_path / "bottom.stl")}
-    with pytest.raises(UserError, match="are open") as refused:
-        target_from_data(data).declare()
-    assert "close: true" in str(refused.value)
-    board = target_from_data({**data, "close": True}).declare()
-    assert build_target(board).parts[0].mesh.volume == pytest.approx(40 * 30 * 20 * 1e-9)
-    with pytest.raises(UserError, match="rim that is not flat"):
-        target_from_data({**data, "file": str(tmp_path / "teeth.stl"), "close": True}).declare()
-
-
 def test_crossing_triangles_are_those_that_pierce_each_other() -> None:
     flat, upright = np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0.0]]), np.array([[1, 1, -1], [1, 1, 1], [9, 9, 0.0]])
     touching, far = upright + np.array([0, 0, 1]), flat + np.array([20, 0, 0])

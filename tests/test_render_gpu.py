@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scenes.render.cache import stored_view
+from scenes.render.cache import read_view
 from scenes.render.scene import _has_nvidia_driver
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -40,7 +40,7 @@ def test_a_gpu_renders_the_same_view(tmp_path):
         )
         assert done.returncode == 0, done.stderr
         (path,) = folder.glob("*.npz")
-        view = stored_view(path)
+        view = read_view(path)
         assert view is not None and view.variant == variant
         views.append(view)
     apart = np.abs(views[0].phasor - views[1].phasor) / np.abs(views[1].phasor).max()

@@ -41,23 +41,21 @@ ARRAYS = tuple(f.name for f in fields(NoiseFreeView) if f.type == "np.ndarray")
 RENDER_NAME = re.compile(r"[0-9a-f]{16}\.npz")
 LEFTOVER_NAME = re.compile(r"\.[0-9a-f]{16}\.\w+\.part\.npz")
 """Names that `harness.vocabulary.files.atomic_path` gives a render that is being written: left by killed processes."""
-LEFTOVER_AFTER_S = 86_400.0
-"""A render is written in less than a second; a day is far from any that is still being written, on any file system."""
+LEFTOVER_AFTER_S = 86_400.0  # a render is written in less than a second
 RENDERING, LOCK = ".rendering", ".lock"
 """Files of which a process locks a byte while it renders a view, and which a sweep holds while it runs."""
 
 
 def render_key(target: TargetConfig, optics: Optics, config: RenderConfig) -> str:
-    """Return the digest of what a render depends on: target, optics of the camera, work, and the code itself. The
-    sensor's noise and engine are left out: cameras that differ there share renders."""
+    """Return the digest of what a render depends on: target, the camera's optics, work, and the code. Cameras that
+    differ in noise and engine alone share renders."""
     content = {"target": target.to_data(), "optics": optics.content(), "render": config.to_data()}
     return digest({"code": source_digest(CODE, PACKAGES), **content})
 
 
 def cached_view(target: TargetConfig, optics: Optics, config: RenderConfig, folder: Path) -> tuple[NoiseFreeView, bool]:
-    """Return the view of a declared target, and whether it came from the cache. A damaged file is rendered again; a
-    view that another process renders is waited for. Raises UserError as `build_target` and `render_view` do, and where
-    the folder cannot be written."""
+    """Return the view of a declared target, and whether it came from the cache; a view that another process renders is
+    waited for. Raises UserError as `build_target` and `render_view` do, and where the folder cannot be written."""
     key = render_key(target, optics, config)
     path = folder / f"{key}.npz"
     found = read_view(path)
@@ -87,18 +85,9 @@ def write_view(path: Path, view: NoiseFreeView) -> None:
 
 
 def read_view(path: Path) -> NoiseFreeView | None:
-    """Return a stored view, or None where the file is absent, truncated, damaged or of another version. A view that was
+    """Return a stored view, or None where the file is absent, truncated, damaged or of another version. Nothing is
+    parsed before the checksum holds, and nothing is unpickled; memory is bounded by the file's size. A view that was
     read has been used: its file's time says so, for `trim_cache`."""
-    view = stored_view(path)
-    if view is not None:
-        with contextlib.suppress(OSError):  # a cache that may only be read serves as well
-            os.utime(path)
-    return view
-
-
-def stored_view(path: Path) -> NoiseFreeView | None:
-    """Read a view as `read_view` does, without a trace. Nothing is parsed before the checksum holds, and nothing is
-    unpickled; memory is bounded by the file's size."""
     try:
         found = os.stat(path)
         if not stat.S_ISREG(found.st_mode) or found.st_size > MOST_BYTES:
@@ -113,15 +102,17 @@ def stored_view(path: Path) -> NoiseFreeView | None:
                 return None
             arrays = {name: archive[name] for name in ARRAYS}
         lists = {name: tuple(facts.pop(name)) for name in ("frequencies_hz", "surface_names")}
-        return NoiseFreeView(**{**facts, **lists, **arrays, "region": Region(**facts["region"])})
+        view = NoiseFreeView(**{**facts, **lists, **arrays, "region": Region(**facts["region"])})
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
         return None
+    with contextlib.suppress(OSError):  # a cache that may only be read serves as well
+        os.utime(path)
+    return view
 
 
 @dataclass(frozen=True)
 class StoredFile:
-    """A file of the cache. ``used_s``: when it was last read or written, seconds since 1970 by the file system's clock;
-    only the order in which renders go rests on it."""
+    """A file of the cache. ``used_s``: when it was last read or written, seconds since 1970 by the file system."""
 
     path: Path
     size_bytes: int
@@ -163,9 +154,9 @@ def longest_unused(renders: Iterable[StoredFile], limit_bytes: int, keep: Collec
 
 
 def trim_cache(folder: Path, limit_bytes: int, keep: Collection[Path] = ()) -> int:
-    """Remove the longest unused renders until the rest fits into ``limit_bytes``, never those of ``keep``; and what
-    killed processes left, when it is older than a day. Returns how many renders are left. Does nothing where another
-    process uses the folder (`in_use`): its trials may need any of them."""
+    """Remove the longest unused renders until the rest fits into ``limit_bytes``, never those of ``keep``, and old
+    leftovers of killed processes; nothing where another process uses the folder (`in_use`). Returns how many are left.
+    """
     with contextlib.suppress(UserError), alone(folder):
         removed([*longest_unused(stored_renders(folder), limit_bytes, keep), *leftovers(folder)])
     return len(stored_renders(folder))
@@ -173,9 +164,8 @@ def trim_cache(folder: Path, limit_bytes: int, keep: Collection[Path] = ()) -> i
 
 @contextlib.contextmanager
 def in_use(folder: Path) -> Iterator[None]:
-    """Let nobody remove renders of this folder while a sweep runs. Any number of sweeps may use it at once. A process
-    that dies gives it back. On systems without such locks nothing is held. Raises nothing where the folder cannot be
-    written: who cannot write a lock cannot be kept from reading."""
+    """Let nobody remove renders of this folder while a sweep runs; any number of sweeps may use it at once. Nothing is
+    held where the system has no such locks or the folder cannot be written."""
     with contextlib.ExitStack() as held:
         with contextlib.suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)

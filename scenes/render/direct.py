@@ -1,10 +1,10 @@
 """The direct part of a view: emitter to surface to pixel, deterministic, fine where a footprint meets an edge.
-Sub-rays of a footprint have equal weight; beside their sums stands what the indirect part needs of them."""
+Sub-rays of a footprint have equal weight."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -28,6 +28,8 @@ FAST: Any = {"cache": True, "fastmath": {"contract", "reassoc", "nsz"}, "nogil":
 """Options of compilation; sums are float64, whose order moves a range by 1e-14 m."""
 COMB_TOLERANCE = 1e-9
 """Unevenness, relative to the highest frequency, up to which a comb is summed by a recurrence."""
+Footprint = Quadrilaterals | Beams
+Frequencies = tuple[float, ...]
 
 
 def comb_step(frequencies_hz: tuple[float, ...]) -> float | None:
@@ -86,11 +88,10 @@ def _sum_comb(amplitude: np.ndarray, path_m: np.ndarray, first: float, step: flo
             out[k, i] = complex(sum_re / m, sum_im / m)
 
 
-@dataclass(frozen=True)
-class Hits:
+class Hits(NamedTuple):
     """Hits of n rays from the lens, float32: range (NaN where a ray met nothing), path out and back, amplitude of
-    direct light, albedo, surface (-1 for nothing), texture place (n, 2), whether it is the board's undamaged face, and
-    the unit normal (n, 3)."""
+    direct light, albedo, surface (int32, -1 for nothing), texture place (n, 2), whether it is the board's undamaged
+    face, and the unit normal (n, 3)."""
 
     range_m: np.ndarray
     path_m: np.ndarray
@@ -104,9 +105,8 @@ class Hits:
 
 @dataclass(frozen=True)
 class OffFace:
-    """Sub-rays that met something other than the undamaged face, by pixel. ``pixel`` (p,): flat indices of pixels that
-    have any, ``count`` (p,): how many, ``share`` (p,): of the footprint; ``slopes`` (sum of count, 2) float32, pixel by
-    pixel."""
+    """Sub-rays that met something other than the undamaged face. ``pixel`` (p,): flat indices of pixels that have any,
+    ``count`` (p,): how many, ``share`` (p,): of the footprint; ``slopes`` (sum of count, 2) float32, by pixel."""
 
     pixel: np.ndarray
     count: np.ndarray
@@ -123,8 +123,7 @@ class DirectLight:
     """The direct part on a region, (h, w): phasor (f, h, w), intensity, the central ray's range, surface and texture
     place, the share of the footprint on that surface, and which pixels were finely divided. ``face`` (f + 1, h, w):
     mean over a pixel's sub-rays on the undamaged face of albedo x exp(i 2 pi f range / c), frequency 0 last;
-    ``face_range_m`` (h, w): their mean range, 0 where there are none. ``off_face``: the other sub-rays that met
-    something."""
+    ``face_range_m``: their mean range, 0 where there are none. ``off_face``: the other sub-rays that met something."""
 
     phasor: np.ndarray
     intensity: np.ndarray
@@ -151,17 +150,9 @@ def cast(lit: LitScene, slopes: np.ndarray) -> Hits:
     path_m, amplitude = dr.select(met.valid, met.distance + leg, 0), albedo * arriving
     surface = dr.select(met.valid, mi.Int32(met.surface), -1)
     on_face = dr.gather(mi.Bool, lit.on_face, met.triangle, met.valid)
-    dr.eval(range_m, path_m, amplitude, albedo, surface, uv, on_face, met.normal)
-    return Hits(
-        range_m=range_m.numpy(),
-        path_m=path_m.numpy(),
-        amplitude=amplitude.numpy(),
-        albedo=albedo.numpy(),
-        surface=surface.numpy().astype(np.int16),
-        uv=uv.numpy().T,
-        on_face=on_face.numpy(),
-        normal=met.normal.numpy().T,
-    )
+    found = range_m, path_m, amplitude, albedo, surface, uv, on_face, met.normal
+    dr.eval(*found)
+    return Hits(*(each.numpy().T for each in found))
 
 
 @numba.njit(**FAST)
@@ -219,13 +210,7 @@ class _Sums:
     """Sums of direct light over a region's pixels, flat, while they are made: fields as of `DirectLight`. What is added
     to a pixel replaces what was there."""
 
-    def __init__(
-        self,
-        lit: LitScene,
-        slopes: np.ndarray,
-        footprint: Quadrilaterals | Beams,
-        frequencies_hz: tuple[float, ...],
-    ) -> None:
+    def __init__(self, lit: LitScene, slopes: np.ndarray, footprint: Footprint, frequencies_hz: Frequencies) -> None:
         self.lit, self.footprint, self.frequencies_hz = lit, footprint, frequencies_hz
         self.slopes, (h, w), lines = slopes.reshape(-1, 2), slopes.shape[:2], len(frequencies_hz)
         self.rows, self.cols = np.divmod(np.arange(h * w), w)
@@ -258,10 +243,8 @@ class _Sums:
         error is left: they are to be divided once more."""
         m = rays.shape[1]
         hits = cast(self.lit, rays.reshape(-1, 2))
-        amplitude, range_m, path_m, surface, albedo, on_face = (
-            each.reshape(-1, m)
-            for each in (hits.amplitude, hits.range_m, hits.path_m, hits.surface, hits.albedo, hits.on_face)
-        )
+        range_m, path_m, amplitude, albedo, surface = (each.reshape(-1, m) for each in hits[:5])
+        on_face = hits.on_face.reshape(-1, m)
         self.phasor[:, here] = phasor_sums(amplitude, path_m, self.frequencies_hz)
         self.intensity[here] = amplitude.mean(axis=1, dtype=float)
         self.coverage[here] = (surface == self.central.surface[here, None]).mean(axis=1)
@@ -288,15 +271,15 @@ class _Sums:
 def direct_light(
     lit: LitScene,
     slopes: np.ndarray,
-    footprint: Quadrilaterals | Beams,
-    frequencies_hz: tuple[float, ...],
+    footprint: Footprint,
+    frequencies_hz: Frequencies,
     closely: np.ndarray | None = None,
     roughly: np.ndarray | None = None,
 ) -> DirectLight:
-    """Return direct light on every pixel of a region with central rays ``slopes`` (h, w, 2). Rays are cast to pixels'
-    centres and corners; where these meet one plane, evenly lit, the pixel's light follows from it. Elsewhere sub-rays
-    are cast: few on a bent surface, many where a footprint meets an edge or a shadow's edge and in the pixels
-    ``closely`` (h, w), and there once more where that leaves an error; few at the edges in the pixels ``roughly``."""
+    """Return direct light on every pixel of a region with central rays ``slopes`` (h, w, 2). Where rays to a pixel's
+    centre and corners meet one plane, evenly lit, its light follows from that. Elsewhere sub-rays are cast: few on a
+    bent surface, many where a footprint meets an edge or a shadow's edge and in the pixels ``closely`` (h, w), and
+    there once more where that leaves an error; few at the edges in the pixels ``roughly``."""
     shape, sums = slopes.shape[:2], _Sums(lit, slopes, footprint, frequencies_hz)
     central, rows, cols = sums.central, sums.rows, sums.cols
     bend_m, edge = _corners(lit, footprint.corner, slopes, central)
@@ -318,7 +301,7 @@ def direct_light(
         phasor=sums.phasor.reshape(-1, *shape),
         intensity=sums.intensity.reshape(shape),
         range_m=central.range_m.reshape(shape).astype(float),
-        surface=central.surface.reshape(shape),
+        surface=central.surface.reshape(shape).astype(np.int16),
         uv=central.uv.reshape(*shape, 2),
         coverage=sums.coverage.reshape(shape).astype(np.float32),
         fine=fine,
@@ -336,8 +319,7 @@ def _chunks(pixels: np.ndarray, per_pixel: int) -> list[np.ndarray]:
 def _corners(lit: LitScene, corner: np.ndarray, slopes: np.ndarray, central: Hits) -> tuple[np.ndarray, np.ndarray]:
     """Return (h, w) each: by how much rays through a pixel's corners, with slopes ``corner`` (h + 1, w + 1, 2), leave
     the plane that its centre met, and whether they say that an edge or a shadow's is in the pixel."""
-    h, w = slopes.shape[:2]
-    hits = cast(lit, corner.reshape(-1, 2))
+    (h, w), hits = slopes.shape[:2], cast(lit, corner.reshape(-1, 2))
     rays = np.concatenate([slopes, np.ones((h, w, 1))], axis=-1)
     normal = central.normal.reshape(h, w, 3).astype(float)
     middle_m, surface = central.range_m.reshape(h, w).astype(float), central.surface.reshape(h, w)
@@ -358,9 +340,8 @@ def _corners(lit: LitScene, corner: np.ndarray, slopes: np.ndarray, central: Hit
 
 
 def _error_m(amplitude: np.ndarray, path_m: np.ndarray) -> np.ndarray:
-    """Return (n,) the error of range that m sub-rays (n, m) of a pixel leave, about. An edge is misplaced by one
-    sub-ray or two of m, so the mean path by the paths' spread over m and, where few sub-rays carry light, more: 3
-    spread / (2 m sqrt(lit share)) was seen on holes of 1/16 to 1 in before a backing."""
+    """Return (n,) the error of range that m sub-rays (n, m) of a pixel leave, about: an edge is misplaced by one
+    sub-ray or two of m. 3 spread / (2 m sqrt(lit share)) was seen on holes of 1/16 to 1 in before a backing."""
     light = np.maximum(amplitude.sum(axis=1), 1e-30)
     mean = (amplitude * path_m).sum(axis=1) / light
     spread = np.sqrt((amplitude * (path_m - mean[:, None]) ** 2).sum(axis=1) / light)

@@ -18,14 +18,14 @@ from scenes.target.mesh import TargetPart
 
 VARIANTS = ("cuda_ad_mono", "llvm_ad_mono")
 LEGAL = "LLVM 17 or newer (14 to 16 abort the process with Dr.Jit 1.5)"
-FIX = "pip install karellen-llvm-core (Linux x86-64), or apt install libllvm19, or set DRJIT_LIBLLVM_PATH"
+FIX = "pip install karellen-llvm-core (Linux x86-64), or set DRJIT_LIBLLVM_PATH to the path of such a library"
 
 
 def load_mitsuba() -> Any:
     """Return the mitsuba module with a variant set. Raises UserError that names what to install where none works.
     Dr.Jit 1.5 aborts the process at the first kernel with LLVM 14 to 16, so the LLVM of the wheel karellen-llvm-core is
-    preferred to the system's; a path in DRJIT_LIBLLVM_PATH has the last word."""
-    # Dr.Jit looks for LLVM when it is imported, so the path comes first; that there is none matters without a GPU only.
+    taken and none of the system; a path in DRJIT_LIBLLVM_PATH has the last word."""
+    # Dr.Jit looks for LLVM when it is imported, so the path comes first; without a GPU only does it matter.
     missing = _point_to_llvm()
     import mitsuba as mi
 
@@ -65,8 +65,8 @@ def _has_nvidia_driver() -> bool:
 
 
 def _point_to_llvm() -> UserError | None:
-    """Set DRJIT_LIBLLVM_PATH where it is not set, to the wheel's LLVM or the newest of the system, because Dr.Jit's own
-    search may pick an older one. Returns the mistake to raise where no LLVM can be used."""
+    """Set DRJIT_LIBLLVM_PATH where it is not set to the wheel's LLVM, because Dr.Jit's own search may pick an older one
+    of the system. Returns the mistake to raise where no LLVM can be used."""
     named = os.environ.get("DRJIT_LIBLLVM_PATH")
     if named:
         message, legal = f"DRJIT_LIBLLVM_PATH names {named}, which does not exist", "the path of LLVM 17 or newer"
@@ -76,23 +76,7 @@ def _point_to_llvm() -> UserError | None:
         if found:
             os.environ["DRJIT_LIBLLVM_PATH"] = str(found[-1])
             return None
-    recent = _system_llvm() if sys.platform == "linux" else None
-    if recent is not None:
-        os.environ["DRJIT_LIBLLVM_PATH"] = str(recent)
-    elif sys.platform == "linux":
-        return UserError("no LLVM was found that Dr.Jit can use", legal=LEGAL, fix=FIX)
-    return None
-
-
-def _system_llvm() -> Path | None:
-    """Return the newest LLVM where distributions put it."""
-    for version in range(30, 16, -1):
-        for pattern in (f"*/libLLVM-{version}.so*", f"*/libLLVM.so.{version}*", f"llvm-{version}/lib/libLLVM*.so*"):
-            for root in (Path("/usr/lib"), Path("/usr/lib64")):
-                found = sorted(root.glob(pattern))
-                if found:
-                    return found[0]
-    return None
+    return UserError("no LLVM was found that Dr.Jit can use", legal=LEGAL, fix=FIX)
 
 
 LIFT_M = 1e-5
@@ -184,13 +168,9 @@ class LitScene:
         cosine = dr.dot(2 * dr.dot(normal, viewer) * normal - viewer, direction)
         return 1 - share + share * (exponent + 2) / 2 * dr.power(dr.maximum(cosine, 1e-6), exponent)
 
-    def reflected(self, met: Met, direction: Any) -> Any:
-        """Return `lobe` of hits, from ``direction`` back along the ray that met them."""
-        return self.lobe(met.surface, met.normal, met.viewer, direction)
-
     def arriving(self, met: Met, active: Any) -> tuple[Any, Any]:
-        """Light from the emitter at each hit: (irradiance, distance), irradiance 1 at 1 m facing; 0 where shadowed.
-        irradiance = cone(direction) cos(incidence) / d^2, times `reflected`, and 0 behind an occluder."""
+        """Light from the emitter at each hit: (irradiance, distance). The irradiance is cone(direction) cos(incidence)
+        / d^2 times the `lobe`, 1 at 1 m facing, and 0 behind an occluder."""
         import drjit as dr
 
         mi = self.mi
@@ -210,7 +190,8 @@ class LitScene:
         ray = mi.Ray3f(origin, way / reach)
         ray.maxt = reach - 2 * LIFT_M
         lit &= ~self.scene.ray_test(ray, lit)
-        return dr.select(lit, cone * cosine / squared * self.reflected(met, towards), 0), distance
+        lobe = self.lobe(met.surface, met.normal, met.viewer, towards)
+        return dr.select(lit, cone * cosine / squared * lobe, 0), distance
 
 
 def lit_scene(

@@ -2,8 +2,7 @@
 
 Indirect light met at least two surfaces; it is gathered by walking paths backwards. The spread between batches of
 low-discrepancy points (Sobol, scrambled anew for each) gives the noise that is left. On the board's undamaged face the
-light is smooth, so it is gathered at the nodes of a coarse grid and interpolated. One compiled loop walks all paths,
-each lane those of one place and batch one after another."""
+light is smooth, so it is gathered at the nodes of a coarse grid and interpolated."""
 
 from __future__ import annotations
 
@@ -58,18 +57,13 @@ class PathWork:
 
 
 def gather_at_points(
-    lit: LitScene,
-    points_m: np.ndarray,
-    normals: np.ndarray,
-    work: PathWork,
-    samples: int,
-    bright: np.ndarray | None = None,
+    lit: LitScene, points_m: np.ndarray, normals: np.ndarray, work: PathWork, samples: int, bright: Any = None
 ) -> np.ndarray:
     """Gather indirect light that arrives at surface points (n, 3) with normals (n, 3), cosine-weighted, per unit
     albedo, weighted by what a glossy board there sends to the lens. All points share their low-discrepancy numbers, so
-    that what noise is left is smooth from point to point. ``bright`` (4, 4): half of the paths go on from their first
-    hit towards a rectangle, -1..1 in x and y of this frame: a lit board, which they would seldom meet by chance. First
-    directions are drawn from cells of the hemisphere in which a probe met something, and seldom from all."""
+    that noise is smooth from point to point. ``bright`` (4, 4): half of the paths go on from their first hit towards a
+    rectangle, -1..1 in x and y of this frame: a lit board, which they would seldom meet by chance. First directions are
+    drawn from cells of the hemisphere in which a probe met something, and seldom from all."""
     import drjit as dr
 
     mi = lit.mi
@@ -277,7 +271,7 @@ class _Walk:
             aimed, weight = _towards(lit, self.aim, hit.place, hit.normal, spread, u1, u2)
             direction = dr.select(fresh, aimed, direction)
             throughput = throughput * dr.select(fresh, weight, 1)
-        throughput = throughput * lit.reflected(hit, direction)
+        throughput = throughput * lit.lobe(hit.surface, hit.normal, hit.viewer, direction)
         more &= throughput > 0
         sample, vertex = sample + dr.select(more, mi.UInt32(0), 1), dr.select(more, vertex + 1, 0)
         return sample, vertex, hit.place, hit.normal, direction, length, throughput, totals
@@ -338,26 +332,16 @@ def _added(totals: list[Any], light: Any, length: Any, frequencies_hz: tuple[flo
 
 def face_triangles(target: Target) -> list[np.ndarray]:
     """Return for each part which of its triangles (n,) lie on the undamaged face: the board's there, all of tapes."""
-    found = []
-    for part in target.parts:
-        on_face = np.full(len(part.mesh.faces), part.name.startswith("tape"))
-        if part.name == "board":
-            board = transform_points(invert(target.T_camera_board), part.mesh.vertices)
-            within_m = MESH_WITHIN_M if target.config.board.shape.kind == "mesh" else FACE_WITHIN_M
-            near = np.abs(board[:, 2] - target.face_height_m(board[:, 0], board[:, 1])) < within_m
-            on_face = np.asarray(near[part.mesh.faces].all(axis=1))
-        found.append(on_face)
-    return found
+    mesh = target.parts[0].mesh
+    board = transform_points(invert(target.T_camera_board), mesh.vertices)
+    within_m = MESH_WITHIN_M if target.config.board.shape.kind == "mesh" else FACE_WITHIN_M
+    near = np.abs(board[:, 2] - target.face_height_m(board[:, 0], board[:, 1])) < within_m
+    others = (np.full(len(part.mesh.faces), part.name.startswith("tape")) for part in target.parts[1:])
+    return [np.asarray(near[mesh.faces].all(axis=1)), *others]
 
 
 def face_light(
-    lit: LitScene,
-    target: Target,
-    direct: DirectLight,
-    slopes: np.ndarray,
-    work: PathWork,
-    spacing_m: float,
-    samples: int,
+    lit: LitScene, target: Target, direct: DirectLight, slopes: np.ndarray, work: PathWork, config: RenderConfig
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return indirect light by way of the face in the pixels that see any of it: mean (f + 1, n), and batches (B, l, n)
     at the frequencies of `noise_lines`. Pixels in the order of `numpy.nonzero` of ``direct.face[-1]``. What a node
@@ -366,7 +350,7 @@ def face_light(
     rays = np.concatenate([slopes[seen], np.ones((int(seen.sum()), 1))], axis=-1)
     rays *= (direct.face_range_m[seen] / np.linalg.norm(rays, axis=-1))[..., None]
     x_seen, y_seen, _ = transform_points(invert(target.T_camera_board), rays).T
-    ends = ((each.min(), each.max()) for each in (x_seen, y_seen))
+    ends, spacing_m = ((each.min(), each.max()) for each in (x_seen, y_seen)), config.face_spacing_mm * MM
     xs, ys = (np.linspace(low, high, max(int(np.ceil((high - low) / spacing_m)) + 1, 3)) for low, high in ends)
     # points above the face, and its unit normals, in the camera's frame
     face, T_camera_board = face_of(target.config.board), target.T_camera_board
@@ -379,7 +363,7 @@ def face_light(
     low, high = outline.min(axis=0), outline.max(axis=0)
     bright[:3, 3] = transform_points(T_camera_board, np.append((low + high) / 2, 0.0))
     bright[:3, :2] *= (high - low) / 2
-    light = gather_at_points(lit, position, normals, work, samples, bright)
+    light = gather_at_points(lit, position, normals, work, config.face_samples, bright)
     few, share = noise_lines(work.frequencies_hz), direct.face[:, seen]
     at_nodes = np.concatenate([light.mean(axis=0, dtype=complex), *light[:, few]])
     everywhere = (between_nodes(xs, ys, x_seen, y_seen) @ at_nodes.T).T
@@ -447,8 +431,7 @@ def render_view(target: Target, optics: Optics, config: RenderConfig) -> NoiseFr
         rgb[here] = part.rgb_at(direct.uv[here])
     if config.bounces > 0:
         indirect, noise_m = indirect_light(lit, target, optics, slopes, direct, inside, config)
-        phasor = phasor + indirect[:-1]
-        intensity = intensity + indirect[-1].real
+        phasor, intensity = phasor + indirect[:-1], intensity + indirect[-1].real
     return NoiseFreeView(
         region=region,
         frequencies_hz=optics.frequencies_hz,
@@ -486,8 +469,7 @@ def indirect_light(
     seen = np.flatnonzero(direct.face[-1].real)
     if seen.size:
         work = PathWork(frequencies, config.bounces - 1, config.seed)
-        samples, spacing_m = config.face_samples, config.face_spacing_mm * MM
-        mean, batches = face_light(lit, target, direct, slopes, work, spacing_m, samples)
+        mean, batches = face_light(lit, target, direct, slopes, work, config)
         indirect[:, seen] = mean
         total[:, seen] += mean[:-1]
         variance[seen] = range_noise_m(batches, total[:, seen], frequencies) ** 2

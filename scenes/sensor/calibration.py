@@ -2,8 +2,7 @@
 
 Run ``python -m scenes.sensor.calibration NAME`` after a change to the sensor model and write the numbers into the
 camera's file; a test compares the two. The gain gives the published temporal deviation of single pixels, without the
-jitter of whole frames (taken off in squares) and jumps; ambient light is that of `CameraConfig`'s default.
-"""
+jitter of whole frames (taken off in squares) and jumps; ambient light is that of `CameraConfig`'s default."""
 
 from __future__ import annotations
 
@@ -97,19 +96,17 @@ def calibrated_numbers(camera: PhotonCamera) -> dict[str, float]:
 
 
 def _main(arguments: list[str]) -> int:
-    parser = argparse.ArgumentParser(
-        prog="python -m scenes.sensor.calibration", description="Solve for the calibrated numbers of a camera's file."
-    )
+    parser = argparse.ArgumentParser("python -m scenes.sensor.calibration", description=__doc__.partition("\n")[0])
     parser.add_argument("camera", help="a file of scenes/cameras/ without its ending")
-    options = parser.parse_args(arguments)
+    name = parser.parse_args(arguments).camera
 
     def print_numbers() -> int:
-        camera = load_camera(options.camera)
+        camera = load_camera(name)
         if isinstance(camera, EmpiricalCamera):
             fix = "measure it anew with python -m harness.characterise"
-            raise UserError(f"{options.camera}: an empirical camera has no gain to calibrate", fix=fix)
+            raise UserError(f"{name}: an empirical camera has no gain to calibrate", fix=fix)
         for key, value in calibrated_numbers(camera).items():
-            print(f"{options.camera}: {key} = {value:.5g}")
+            print(f"{name}: {key} = {value:.5g}")
         return 0
 
     return exit_code_of(print_numbers)

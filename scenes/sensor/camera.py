@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import json
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache
@@ -10,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from harness.vocabulary.config import Config
-from harness.vocabulary.declaration.diagnose import read_as, with_value_at
+from harness.vocabulary.declaration.diagnose import read_as, settings_of, with_value_at
 from harness.vocabulary.declaration.yaml_source import DeclarationError, KeyPath, Problem, Source, read_yaml
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Lens, OtherLens
@@ -37,8 +38,7 @@ CAMERAS = PlugIns(
 
 AnyCamera = AmcwCamera | ScannedLidar | EmpiricalCamera
 """Every kind of camera, told apart by ``kind``. All have name, title, nominal_lens, optics, unit, z_step_m."""
-
-KINDS: dict[str, type[AmcwCamera] | type[ScannedLidar] | type[EmpiricalCamera]] = {
+KINDS: dict[str, type[AnyCamera]] = {
     "amcw_imager": AmcwCamera,
     "scanned_lidar": ScannedLidar,
     "empirical": EmpiricalCamera,
@@ -54,12 +54,8 @@ class EffectsConfig(Config):
     fixed_pattern: bool = Field(True, description="the unit's own error of range in each pixel")
     unit_offset: bool = Field(True, description="the unit's own constant error of range")
     warm_up_drift: bool = Field(True, description="error of range that decays after power-on")
-    ambient: bool = Field(
-        True, description="light of the surroundings, as much as `ambient_uw_cm2_nm`: its noise, and the room it takes"
-    )
-    saturation: bool = Field(
-        True, description="what exceeds a pixel's or its converter's full scale is cut off and invalid"
-    )
+    ambient: bool = Field(True, description="light of the surroundings (`ambient_uw_cm2_nm`): its noise and its room")
+    saturation: bool = Field(True, description="what exceeds a pixel's or its converter's full scale is invalid")
     frame_jumps: bool = Field(True, description="whole frames displaced: rare jumps, and a small jitter")
 
 
@@ -76,13 +72,8 @@ class CameraConfig(Config):
     )
     unit_seed: int = Field(1, ge=0, description="which unit: its fixed pattern is drawn from this seed")
     effects: EffectsConfig = EffectsConfig()
-    fixed_pattern_scale: float = Field(
-        1.0, ge=0, le=100, description="times the file's fixed pattern; 0 switches it off"
-    )
-    edge_gate: bool = Field(
-        True,
-        description="whether the engine's edge threshold acts; its rule is an inference, so studies vary it",
-    )
+    fixed_pattern_scale: float = Field(1.0, ge=0, le=100, description="times the file's fixed pattern; 0: off")
+    edge_gate: bool = Field(True, description="whether the engine's edge threshold, whose rule is inferred, acts")
     ambient_uw_cm2_nm: float = Field(
         0.04,
         ge=0,
@@ -146,13 +137,13 @@ def lens_named(name: str) -> OtherLens:
     """Return the nominal lens of a camera or depth mode, with those of its other modes; UserError for other names."""
     camera_name = lens_names().get(name, name)
     camera = load_camera(camera_name)
-    plain = {camera_name: camera.nominal_lens}
-    plain |= {mode: facts.lens(camera.nominal_lens) for mode, facts in camera.modes.items()}
-    lenses = [
-        OtherLens(**vars(lens), note=f"the lens is the nominal one of {mode}", mode=mode, unit_m=camera.z_step_m)
+    own = camera.nominal_lens
+    plain = {camera_name: own, **{mode: facts.lens(own) for mode, facts in camera.modes.items()}}
+    lenses = {
+        mode: OtherLens(**vars(lens), note=f"the lens is the nominal one of {mode}", mode=mode, unit_m=camera.z_step_m)
         for mode, lens in plain.items()
-    ]
-    return replace(next(lens for lens in lenses if lens.mode == name), others=tuple(lenses))
+    }
+    return replace(lenses[name], others=tuple(lenses.values()))
 
 
 def camera_of(config: CameraConfig) -> AnyCamera:
@@ -163,10 +154,7 @@ def camera_of(config: CameraConfig) -> AnyCamera:
 def guessed_precision(camera: AnyCamera) -> str:
     """Return a sentence on a camera whose precision nobody publishes; empty for others. Noise goes with the root of the
     gain where shot noise rules."""
-    if isinstance(camera, EmpiricalCamera):
-        return ""
-    gain = camera.photons.signal_electrons
-    if gain.range is None:
+    if isinstance(camera, EmpiricalCamera) or (gain := camera.photons.signal_electrons).range is None:
         return ""
     low, high = (float(np.sqrt(gain.value / end)) for end in reversed(gain.range))
     told = f"the precision of {camera.title} is not published: its noise is a guess"
@@ -181,8 +169,6 @@ def numbers_of_lens(lens: Lens) -> dict[str, Any]:
 
 @lru_cache
 def _with_numbers(name: str, numbers_json: str) -> AnyCamera:
-    import json
-
     data = load_camera(name).to_data()
     for path, value in json.loads(numbers_json).items():
         at: Any = data
@@ -194,16 +180,7 @@ def _with_numbers(name: str, numbers_json: str) -> AnyCamera:
             legal = f"a number of {camera_file(name)}, such as lens.fx_px"
             raise UserError(f"source.camera.numbers: {name} has no number {path!r}{hint}", legal=legal)
         at.update(value=value, tag="U", source="set by the experiment")
-    try:
-        return KINDS[data["kind"]].from_data(data)
-    except ValidationError as error:
-        lines = []
-        for mistake in error.errors():
-            where = ".".join(map(str, mistake["loc"])).replace(".value", "")
-            what = str(mistake.get("ctx", {}).get("error", mistake["msg"])).replace("Input should be", "should be")
-            lines.append(f"  {where}: {what}" if where else f"  {what}")
-        message = f"source.camera.numbers, put into {name}, does not describe a camera:\n" + "\n".join(lines)
-        raise UserError(message) from error
+    return settings_of(KINDS[data["kind"]], data, f"source.camera.numbers, put into {name}, does not describe a camera")
 
 
 def number_paths(data: Mapping[str, Any], prefix: str = "") -> list[str]:

@@ -22,9 +22,8 @@ STEEPEST = 6.0  # slope from the axis up to which distortion is examined: 80 deg
 
 class Fact(Config, Generic[T]):
     """One number of a camera with where it comes from. ``tag``: R read in the named public source, D derived from such,
-    S one secondary source, W measured on public captures, O measured on the
-    owner's captures by `harness.characterise`, C calibrated, M a guess, G a guess of the precision with the
-    ``range`` that it may lie in, U set by the user of an experiment."""
+    S one secondary source, W measured on public captures, O measured on the owner's by `harness.characterise`, C
+    calibrated, M a guess, G a guess of the precision with its ``range``, U set by the user of an experiment."""
 
     value: T
     tag: Literal["R", "D", "S", "W", "O", "C", "M", "G", "U"]
@@ -51,10 +50,14 @@ def checked(legal: str, holds: Callable[[Any], bool]) -> AfterValidator:
     return AfterValidator(check)
 
 
-PositiveInt = Annotated[Fact[int], checked("above 0", lambda value: value > 0)]
-Positive = Annotated[Fact[float], checked("above 0", lambda value: value > 0)]
+ABOVE_0 = checked("above 0", lambda value: value > 0)
+TO_1 = checked("from 0 to 1", lambda value: 0 <= value <= 1)
+PositiveInt = Annotated[Fact[int], ABOVE_0]
+Positive = Annotated[Fact[float], ABOVE_0]
+PositiveEach = Annotated[Fact[tuple[float, ...]], ABOVE_0]
 NonNegative = Annotated[Fact[float], checked("0 or more", lambda value: value >= 0)]
-Share = Annotated[Fact[float], checked("from 0 to 1", lambda value: 0 <= value <= 1)]
+Share = Annotated[Fact[float], TO_1]
+ShareEach = Annotated[Fact[tuple[float, ...]], TO_1]
 LengthPx = Annotated[Fact[float], checked("above 0 and at most 1000 pixels", lambda value: 0 < value <= 1000)]
 HalfAngle = Annotated[Fact[float], checked("above 0 and below 90 degrees", lambda value: 0 < value < 90)]
 Wavelength = Annotated[Fact[float], checked("from 300 to 2000 nanometres", lambda value: 300 <= value <= 2000)]
@@ -81,12 +84,10 @@ class LensFacts(Config):
         lens = self.lens()
         across, down = max(lens.cx, lens.width - 1 - lens.cx), max(lens.cy, lens.height - 1 - lens.cy)
         corner, limit = float(np.hypot(across / lens.fx, down / lens.fy)), unfolded_slope(lens.distortion)
-        if min(corner, self.image_radius) > limit:
+        if (ends := min(corner, self.image_radius)) > limit:
             end = "corner of the sensor lies" if corner < self.image_radius else "field ends"
-            raise ValueError(
-                f"distortion folds the image: it turns back at {limit:.3g} focal lengths from the axis, and the {end} "
-                f"at {min(corner, self.image_radius):.3g}"
-            )
+            folds = f"distortion folds the image: it turns back at {limit:.3g} focal lengths from the axis"
+            raise ValueError(f"{folds}, and the {end} at {ends:.3g}")
         u, v = (a.ravel() for a in np.meshgrid(np.linspace(0, lens.width - 1, 9), np.linspace(0, lens.height - 1, 9)))
         seen = np.hypot((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy) < self.image_radius
         u, v = u[seen], v[seen]
@@ -117,8 +118,8 @@ class LensFacts(Config):
 
 
 class ModeFacts(Config):
-    """Another depth mode behind the same lens. ``first_px``: column and row of its first pixel's corner, and
-    ``side_px`` the side of its pixels, both in pixels of the file's own mode."""
+    """Another depth mode behind the same lens. ``first_px``: column and row of its first pixel's corner, ``side_px``:
+    the side of its pixels, both in pixels of the file's own mode."""
 
     width_px: PositiveInt
     height_px: PositiveInt

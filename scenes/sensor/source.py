@@ -42,8 +42,7 @@ class SimulatedUnit:
 
     @cached_property
     def at_once(self) -> AtOnce | None:
-        """Sums of frames of the view without drawing each; None where only frames will do, as of all
-        but continuous-wave imagers."""
+        """Sums of frames of the view without drawing each; None where only frames will do, or of other kinds."""
         if not isinstance(self.model, AmcwImager):
             return None
         asked = np.zeros(self.view.range_m.shape, bool)
@@ -54,12 +53,9 @@ class SimulatedUnit:
     def region(self) -> Region:
         """The view's region less the margin whose filter window is cut, except at the sensor's own border."""
         outer, lens, m = self.view.region, self.camera.nominal_lens, self.camera.optics.margin_px
-        return Region(
-            outer.row0 + (m if outer.row0 > 0 else 0),
-            outer.row1 - (m if outer.row1 < lens.height else 0),
-            outer.col0 + (m if outer.col0 > 0 else 0),
-            outer.col1 - (m if outer.col1 < lens.width else 0),
-        )
+        top, left = m * (outer.row0 > 0), m * (outer.col0 > 0)
+        bottom, right = m * (outer.row1 < lens.height), m * (outer.col1 < lens.width)
+        return Region(outer.row0 + top, outer.row1 - bottom, outer.col0 + left, outer.col1 - right)
 
     @cached_property
     def rgb(self) -> np.ndarray:

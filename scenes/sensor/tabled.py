@@ -1,12 +1,11 @@
-"""A depth camera's noise from a small table: needs NumPy and the table only, so that any simulator can use it.
+"""A depth camera's noise from a small table, for any simulator: needs NumPy (or torch) and the table only.
 
 `harness.export_noise` measures the table of a camera and copies this file beside it. Per pixel and frame, the noise's
 deviation and the chance of no return follow from the light that comes back, intensity / range^2; neighbours are
 correlated by a separable filter; a unit has a fixed pattern, the same in all frames.
 
 Not modelled: what happens at steps of depth (mixing of neighbours, flying pixels), light over several surfaces, ambient
-light, warm-up and displacements of whole frames. `harness.sweep` simulates all of them.
-"""
+light, warm-up and displacements of whole frames. `harness.sweep` simulates all of them."""
 
 from __future__ import annotations
 
@@ -17,14 +16,10 @@ class DepthNoise:
     """Noise of one unit of a camera whose images are (h, w).
 
     ``table``: the arrays of the camera's file, or its path. ``slopes`` (h, w, 2): x/z and y/z of each pixel; None takes
-    the camera's own nominal lens. ``seed``: which unit.
-    """
+    the camera's own nominal lens. ``seed``: which unit."""
 
     def __init__(self, table, slopes=None, seed=1):  # type: ignore[no-untyped-def]
-        if not hasattr(table, "keys"):
-            with np.load(table, allow_pickle=False) as arrays:
-                table = dict(arrays)
-        self.table = table
+        self.table = table = _loaded(table)
         slopes = table["slopes"] if slopes is None else slopes
         self.stretch = np.sqrt(1.0 + (np.asarray(slopes, np.float32) ** 2).sum(axis=-1))
         self.cosine, self.shape = 1.0 / self.stretch, self.stretch.shape
@@ -70,3 +65,49 @@ def filtered(image, rows, columns):  # type: ignore[no-untyped-def]
         for tap, part in zip(taps[::-1], parts, strict=True):
             image += tap * part
     return image
+
+
+def _loaded(table):  # type: ignore[no-untyped-def]
+    if hasattr(table, "keys"):
+        return table
+    with np.load(table, allow_pickle=False) as arrays:
+        return dict(arrays)
+
+
+class TorchDepthNoise:
+    """The same for torch on any ``device`` (as torch names it), and for batches (n, h, w)."""
+
+    def __init__(self, table, device="cpu", seed=1):  # type: ignore[no-untyped-def]
+        import torch
+
+        numbers = {name: values for name, values in _loaded(table).items() if np.asarray(values).dtype.kind == "f"}
+        self.table = {name: torch.as_tensor(np.float32(each), device=device) for name, each in numbers.items()}
+        self.torch = torch
+        self.stretch = (1.0 + (self.table["slopes"] ** 2).sum(-1)).sqrt()
+        generator = torch.Generator(device=device).manual_seed(seed)
+        white = torch.randn(self.stretch.shape, generator=generator, device=device)
+        self.pattern_m = self.table["pattern_m"] * self.filtered(white, "pattern_rows", "pattern_columns")
+
+    def __call__(self, z_m, intensity, generator=None):  # type: ignore[no-untyped-def]
+        """Return frames (.., h, w), NaN without a return, from ideal distances along the axis in metres and
+        intensities (albedo times the cosine of the angle of incidence) of the same shape."""
+        torch, table = self.torch, self.table
+        range_m = z_m * self.stretch
+        level = (torch.log2(table["falloff"] * intensity / range_m**2) - table["first"]) * table["per_octave"]
+        level = torch.nan_to_num(level, nan=-1.0, posinf=1e6, neginf=-1.0)
+        place = (level + 0.5).clamp(0, len(table["sigma_m"]) - 1).long()
+        white = torch.randn(z_m.shape, generator=generator, device=z_m.device)
+        noise = self.filtered(white, "rows", "columns")
+        moved = range_m + table["sigma_m"][place] * noise + self.pattern_m
+        chance = torch.where(level < 0.0, torch.zeros_like(level), table["seen"][place])
+        seen = torch.rand(z_m.shape, generator=generator, device=z_m.device) < chance
+        seen &= (range_m > table["nearest_m"]) & (range_m < table["farthest_m"])
+        z, step = moved / self.stretch, table["step_m"]
+        z = torch.round(z / step) * step if step > 0 else z
+        return torch.where(seen, z, torch.full_like(z, float("nan")))
+
+    def filtered(self, image, rows, columns):  # type: ignore[no-untyped-def]
+        """Return images (.., h, w) after two causal filters of the table; edges wrap around."""
+        for axis, taps in ((-2, self.table[rows]), (-1, self.table[columns])):
+            image = sum(tap * self.torch.roll(image, k, axis) for k, tap in enumerate(taps))
+        return image

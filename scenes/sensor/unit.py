@@ -1,12 +1,13 @@
-"""Frames and their sums, and light and errors of range that a unit or a frame has as a whole, for every kind of
-camera."""
+"""Frames and their sums, and light and errors of range of a unit or a frame, for every kind of camera."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import count
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from scipy import ndimage
@@ -17,6 +18,7 @@ from scenes.optics import NoiseFreeView
 from scenes.sensor.camera import AnyCamera, CameraConfig, EffectsConfig
 from scenes.sensor.facts import UnitFacts
 
+Camera = TypeVar("Camera", bound=AnyCamera)
 N_REASONS = max(Reason) + 1
 SUMMED = ("count", "total", "squares", "amplitude")
 
@@ -101,39 +103,38 @@ def light_of(view: NoiseFreeView, effects: EffectsConfig) -> tuple[np.ndarray, n
     return view.phasor_direct, np.minimum(np.abs(view.phasor_direct).max(axis=0), view.intensity)
 
 
-def unit_error_m(camera: AnyCamera, config: CameraConfig, slope_x: np.ndarray) -> np.ndarray:
-    """Return the drift and constant offset in metres, of pixels with x/z = ``slope_x``, as far as they are on."""
-    error = _drift_m(camera.unit, config.effects, config.minutes_since_power_on, slope_x)
-    if config.effects.unit_offset:
-        deviation = float(random_stream(config.unit_seed, "unit offset", camera.name).standard_normal())
-        error = error + deviation * camera.unit.offset_mm.value * MM
-    return np.asarray(error)
-
-
 KEPT_PATTERNS = 4  # whole sensors' patterns that a process keeps, for further views of the same unit
 _patterns_mm: dict[tuple[str, str, int], np.ndarray] = {}
 
 
-def static_error_m(
-    camera: AnyCamera,
-    config: CameraConfig,
-    region: Region,
-    slopes: np.ndarray,
-    pattern_mm: Callable[[np.random.Generator, tuple[int, int]], np.ndarray],
-) -> np.ndarray:
-    """Return (h, w): all errors of range, metres, that frames of a unit share, as far as they are on. ``pattern_mm``
-    draws the fixed pattern on the whole sensor, from which the region is cut."""
-    error, lens = unit_error_m(camera, config, slopes[..., 0]), camera.nominal_lens
-    if not config.effects.fixed_pattern:
-        return error
-    key = camera.name, canonical_json(config.numbers), config.unit_seed
-    if key not in _patterns_mm:
-        while len(_patterns_mm) >= KEPT_PATTERNS:
-            del _patterns_mm[next(iter(_patterns_mm))]
-        stream = random_stream(config.unit_seed, "fixed pattern", camera.name)
-        _patterns_mm[key] = pattern_mm(stream, (lens.height, lens.width))
-    drawn_mm = _patterns_mm[key][region.within(lens.whole)]
-    return np.asarray(error + drawn_mm * MM * config.fixed_pattern_scale)
+class UnitModel(ABC, Generic[Camera]):
+    """A unit of a camera on a region of its sensor, whose central rays have ``slopes`` (h, w, 2)."""
+
+    def __init__(self, camera: Camera, config: CameraConfig, region: Region, slopes: np.ndarray) -> None:
+        self.camera, self.config, self.region, self.slopes = camera, config, region, slopes
+
+    @abstractmethod
+    def pattern_mm(self, rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
+        """Draw the fixed pattern on the whole sensor (h, w)."""
+
+    @cached_property
+    def static_error_m(self) -> np.ndarray:
+        """(h, w): all errors of range that frames of this unit share, as far as they are on."""
+        camera, config, lens = self.camera, self.config, self.camera.nominal_lens
+        error = _drift_m(camera.unit, config.effects, config.minutes_since_power_on, self.slopes[..., 0])
+        if config.effects.unit_offset:
+            deviation = float(random_stream(config.unit_seed, "unit offset", camera.name).standard_normal())
+            error = error + deviation * camera.unit.offset_mm.value * MM
+        if not config.effects.fixed_pattern:
+            return error
+        key = camera.name, canonical_json(config.numbers), config.unit_seed
+        if key not in _patterns_mm:
+            while len(_patterns_mm) >= KEPT_PATTERNS:
+                del _patterns_mm[next(iter(_patterns_mm))]
+            stream = random_stream(config.unit_seed, "fixed pattern", camera.name)
+            _patterns_mm[key] = self.pattern_mm(stream, (lens.height, lens.width))
+        drawn_mm = _patterns_mm[key][self.region.within(lens.whole)]
+        return np.asarray(error + drawn_mm * MM * config.fixed_pattern_scale)
 
 
 def _drift_m(facts: UnitFacts, effects: EffectsConfig, minutes: float, slope_x: np.ndarray) -> np.ndarray:

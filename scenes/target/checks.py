@@ -20,13 +20,15 @@ THICKEST_BEND = 0.5
 WIDEST_BEND = 0.25
 """A damage's radius over the smallest radius of curvature at its centre: the truth's volumes are good to its square."""
 SHALLOWEST_BEND = 0.5
-"""The radius of a dent's ball over that: at 1 a face that bends away from the camera has no rim."""
+"""A dent's ball's radius over the same: at 1 a face that bends away from the camera has no rim."""
 MOST_TURN = 0.8
 """Cosine between the face's normals at a flaw's centre and at its rim: depth counts along the first."""
 LEAST_WEB_MM = 0.01
 """Web between two damages or a damage and the edge: a circle's polygon sticks out by 2.5 um at 1 in."""
 NEAREST_M = 0.05
 """Least distance of the board from the lens plane."""
+_TURN = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+_CIRCLE = np.column_stack([np.cos(_TURN), np.sin(_TURN)])
 
 
 def check_target(config: custom.TargetConfig) -> None:
@@ -94,8 +96,7 @@ def _board_problems(board: custom.BoardConfig) -> list[str]:
 def _damage_problems(damage: custom.AnyDamage, board: custom.BoardConfig, face: Face) -> list[str]:
     """Find damage that is too deep, off the board, or on a face too bent for it."""
     name, (x, y), depth_mm, problems = _name(damage), damage.centre_m, damage.depth_mm, []
-    half_x, half_y = board.width_mm * MM / 2, board.height_mm * MM / 2
-    outward = np.zeros(2)
+    half_x, half_y, outward = board.width_mm * MM / 2, board.height_mm * MM / 2, np.zeros(2)
     if isinstance(damage, ChipConfig):
         outward = np.round([-np.sin(damage.turn_rad), np.cos(damage.turn_rad)])
         off_mm = float(np.abs(outward @ ((x, y) - outward * (half_x, half_y)))) / MM
@@ -123,9 +124,8 @@ def _damage_problems(damage: custom.AnyDamage, board: custom.BoardConfig, face: 
         return [f"{name}: too shallow ({ball}) for a face bent to a radius of {1 / tightest / MM:.3g} mm there"]
     stands_or_bends = isinstance(damage, PressedConfig) or damage.kind == "protrusion"
     if depth_mm is not None and depth_mm >= board.thickness_mm and not stands_or_bends:
-        problems.append(
-            f"{name}: depth {depth_mm:g} mm is not less than the board's thickness {board.thickness_mm:g} mm"
-        )
+        thick = f"the board's thickness {board.thickness_mm:g} mm"
+        problems.append(f"{name}: depth {depth_mm:g} mm is not less than {thick}")
     deep_mm = board.thickness_mm if depth_mm is None else depth_mm
     if isinstance(damage, custom.HoleConfig) and damage.chamfer_mm >= deep_mm:
         problems.append(f"{name}: a chamfer of {damage.chamfer_mm:g} mm must be less than the depth, {deep_mm:g} mm")
@@ -135,24 +135,19 @@ def _damage_problems(damage: custom.AnyDamage, board: custom.BoardConfig, face: 
     # The rim, at the face and at the bottom of the damage, against the board's edge in plan. The side walls follow the
     # normals of the edge, so below the face the limits move by the depth times the normal there.
     centre, axis = face.point(x, y), face.normal(x, y)
-    across = np.cross(axis, [0.0, 1.0, 0.0])
-    across /= np.linalg.norm(across)
-    angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)[:, None]
     if not isinstance(damage, FlawConfig):
-        rim = centre + widest_rim_m(damage, face) * (np.cos(angle) * across + np.sin(angle) * np.cross(axis, across))
+        across = np.cross(axis, [0.0, 1.0, 0.0])
+        across /= np.linalg.norm(across)
+        circle = _CIRCLE[:, :1] * across + _CIRCLE[:, 1:] * np.cross(axis, across)
+        rim = centre + widest_rim_m(damage, face) * circle
     over = []
-    for depth_m in (0.0, _reach_m(damage, board)):
-        points = rim - depth_m * axis
-        for along, side, edge in (
-            (0, 1, (half_x, y)),
-            (0, -1, (-half_x, y)),
-            (1, 1, (x, half_y)),
-            (1, -1, (x, -half_y)),
-        ):
-            if outward[along] == side:
-                continue
+    for along, side in ((0, 1), (0, -1), (1, 1), (1, -1)):
+        if outward[along] == side:
+            continue
+        edge = (side * half_x, y) if along == 0 else (x, side * half_y)
+        for depth_m in (0.0, _reach_m(damage, board)):
             limit = (face.point(*edge) - depth_m * face.normal(*edge))[along]
-            over.append(float((side * (points[:, along] - limit)).max()) / MM)
+            over.append(float((side * ((rim - depth_m * axis)[:, along] - limit)).max()) / MM)
     if max(over) > -LEAST_WEB_MM:
         problems.append(f"{name}: leaves {_size(board)} by {max(round(max(over), 3), 0.0) + 0.0:g} mm")
     return problems
@@ -160,14 +155,12 @@ def _damage_problems(damage: custom.AnyDamage, board: custom.BoardConfig, face: 
 
 def _reach_m(damage: custom.AnyDamage, board: custom.BoardConfig) -> float:
     """Return the depth to which a damage keeps its full width: holes and slots alone do not narrow from the face on."""
-    if damage.kind not in ("through", "blind", "slot"):
-        return 0.0
-    return (board.thickness_mm if damage.depth_mm is None else damage.depth_mm) * MM
+    upright = damage.kind in ("through", "blind", "slot")
+    return (board.thickness_mm if damage.depth_mm is None else damage.depth_mm) * MM if upright else 0.0
 
 
 def _overlap_problems(damages: list[custom.AnyDamage], board: custom.BoardConfig, face: Face) -> list[str]:
-    """Find pairs without a web between them, at the face or at the depth that both reach; of outlines that are no
-    circles at the face, in plan."""
+    """Find pairs without a web between them: at the face or at the depth that both reach; other outlines in plan."""
     x, y = np.array([damage.centre_m for damage in damages]).reshape(-1, 2).T
     centres, axes = face.point(x, y), face.normal(x, y)
     rims_m = np.array([widest_rim_m(damage, face) for damage in damages])
@@ -193,8 +186,7 @@ def _outline_m(damage: custom.AnyDamage, face: Face) -> np.ndarray:
     """Return the outline (n, 2) of a damage in plan."""
     if isinstance(damage, FlawConfig):
         return border(relief_points(damage, face, 0.0)[0])[:, :2]
-    turn = np.linspace(0, 2 * np.pi, 64, endpoint=False)
-    return damage.centre_m + widest_rim_m(damage, face) * np.column_stack([np.cos(turn), np.sin(turn)])
+    return damage.centre_m + widest_rim_m(damage, face) * _CIRCLE
 
 
 def _turn(tape: custom.TapeConfig) -> np.ndarray:
@@ -244,8 +236,8 @@ def _pose_problems(config: custom.TargetConfig) -> list[str]:
         backing = transform_points(T_camera_board, backing_corners_board_m(config, config.backing))
         farthest_m = max(farthest_m, backing[:, 2].max())
     if nearest_m < NEAREST_M:
-        said = f"nearest point is {nearest_m:.3g} m before the lens; the limit is {NEAREST_M} m"
-        problems.append(f"pose: the board's {said}")
+        said = f"the board's nearest point is {nearest_m:.3g} m before the lens; the limit is {NEAREST_M} m"
+        problems.append(f"pose: {said}")
     floor_m, wall_m = (room.floor_below_lens_m, room.back_wall_distance_m) if room else (None, None)
     if floor_m is not None and lowest_m >= floor_m:
         problems.append(f"room: the board reaches {lowest_m:.3g} m below the lens, through the floor at {floor_m:g} m")

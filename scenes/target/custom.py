@@ -1,6 +1,6 @@
 """Declaration of a target: board, damage, tape, material, backing, room and pose.
 
-Frames. ``board``: x along the row, y up the face, z out of the face towards the camera, origin on the face's centre.
+Frames. ``board``: x across the face, y up, z out of the face towards the camera, origin on the face's centre.
 ``camera``: OpenCV's (x right, y down, z forward), origin at the depth lens. At zero tilt board +x, +y, +z are camera
 +x, -y, -z. Albedos are linear diffuse reflectances in 0..1, at 850 nm and for red, green and blue. Ranges of single
 fields are checked here; what concerns several together (a hole that leaves the board) by `scenes.target.checks`."""
@@ -26,13 +26,7 @@ Albedo = Annotated[float, Field(ge=0.0, le=1.0)]
 Rgb = tuple[Albedo, Albedo, Albedo]
 Length = Annotated[float, Field(ge=1.0, le=1e4)]
 SizeMm = tuple[Length, Length]
-Chamfer = Annotated[
-    float,
-    Field(ge=0.0, le=100.0, description="leg of a chamfer of 45 degrees that widens the hole's edge on the face"),
-]
-
-
-Close = Annotated[bool, Field(description="whether openings of a mesh with a flat rim are closed by lids")]
+Chamfer = Annotated[float, Field(ge=0.0, le=100.0, description="leg of 45 degrees that widens the hole at the face")]
 
 
 class FlatConfig(Config):
@@ -90,9 +84,8 @@ class CorrugatedConfig(Config):
 
 
 class PanelConfig(Config):
-    """A panel like a car door's: bent in both directions, with a swage line along x at which the face steps by
-    ``swage_mm`` as a hyperbolic tangent: z = -x^2 / 2 R_x - y^2 / 2 R_y + swage / 2 (tanh((y - y0) / w) + tanh(y0 /
-    w)). Its radii and step are guesses of what a door looks like."""
+    """A panel like a car door's, by guess: bent in both directions, with a swage line along x at which the face steps:
+    z = -x^2 / 2 R_x - y^2 / 2 R_y + swage / 2 (tanh((y - y0) / w) + tanh(y0 / w))."""
 
     kind: Literal["panel"]
     radius_x_mm: Annotated[float, Field(ge=50.0, le=1e6)] = 4000.0
@@ -135,7 +128,6 @@ class MeshConfig(_FileConfig):
     kind: Literal["mesh"]
     unit: FileUnit = "mm"
     front: FrontAxis = "+z"
-    close: Close = False
 
 
 ShapeConfig = Annotated[
@@ -256,7 +248,7 @@ class TextureConfig(_FileConfig):
 
 class ReflectanceConfig(Config):
     """Reflectance of a board: diffuse, with a grain along x or a ``texture`` that scales 850 nm and all colours alike;
-    glossy at the camera's wavelength where ``gloss`` says so, on the face and in holes, never on tape."""
+    with ``gloss`` at the camera's wavelength, on the face and in holes, never on tape."""
 
     albedo_850: Albedo = Field(0.6, description="pale wood: 0.5 to 0.7; no published value for plywood found")
     rgb: Rgb = (0.55, 0.42, 0.28)
@@ -280,9 +272,7 @@ class BackingConfig(Config):
     distance_mm: float = Field(ge=0.0, le=5e3, description="behind the deepest point of the back face")
     albedo_850: Albedo = 0.6
     rgb: Rgb = (0.55, 0.55, 0.55)
-    size_mm: SizeMm | None = Field(
-        None, description="none: the board's shadow as seen from the lens at zero tilt, so that it fills every hole"
-    )
+    size_mm: SizeMm | None = Field(None, description="none: the board's shadow as seen from the lens at zero tilt")
 
 
 class RoomConfig(Config):
@@ -307,6 +297,11 @@ class WavelengthConfig(Config):
     backing: Albedo | None = None
     floor: Albedo | None = None
     back_wall: Albedo | None = None
+
+
+OtherWavelengths = Annotated[
+    tuple[WavelengthConfig, ...], Field(max_length=20, description="for cameras that do not work near 850 nm")
+]
 
 
 class PoseConfig(Config):
@@ -345,9 +340,7 @@ class TargetConfig(Config):
     backing: BackingConfig | None = None
     room: RoomConfig | None = None
     pose: PoseConfig = PoseConfig()
-    other_wavelengths: tuple[WavelengthConfig, ...] = Field(
-        (), max_length=20, description="for cameras that do not work near 850 nm"
-    )
+    other_wavelengths: OtherWavelengths = ()
 
     @model_validator(mode="before")
     @classmethod
@@ -361,8 +354,7 @@ class TargetConfig(Config):
     @model_validator(mode="after")
     def _ids_once(self) -> Self:
         ids = [damage.id for damage in self.damages]
-        twice = sorted({i for i in ids if ids.count(i) > 1})
-        if twice:
+        if twice := sorted({i for i in ids if ids.count(i) > 1}):
             raise ValueError(f"ids of damage must differ; given more than once: {', '.join(map(str, twice))}")
         return self
 

@@ -1,10 +1,9 @@
 """A family of boards, drawn at random, on which a detection limit is measured.
 
-Each board has so many holes or dents of random size, depth and place, its own grain, and stands before the camera in a
-random pose. Every quantity of every board has a random stream of its own, named by the family's seed, the board's
-purpose and its number. So a board is the same however many others there are, and what is changed for an axis changes
-nothing else: at another distance, albedo, kind of hole or depth the boards keep their places, sizes and tilts, and
-their results are paired.
+Each board has so many damages of random size, depth and place, its own grain, and stands before the camera in a random
+pose. Every quantity of every board has a random stream of its own, named by the family's seed, the board's purpose and
+its number. So a board is the same however many others there are, and at another distance, albedo, kind of hole or depth
+the boards keep their places, sizes and tilts: their results are paired.
 
 Not modelled: damage that is correlated (a row, a cluster), several kinds on one board."""
 
@@ -14,10 +13,10 @@ import math
 from collections.abc import Callable
 from functools import lru_cache
 from itertools import product
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, Union, get_args
 
 import numpy as np
-from pydantic import AfterValidator, Field, TypeAdapter, model_validator
+from pydantic import AfterValidator, Field, TypeAdapter, create_model, model_validator
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
@@ -35,8 +34,8 @@ NEAREST_M, FARTHEST_M = 0.1, 10.0
 WIDEST_BACKING_MM = 1e4
 """Widest backing that a declaration allows."""
 ATTEMPTS, TRIES = 50, 400
-"""Boards begun anew, and places tried for each damage of one: with discs of the diameter ``apart_mm`` over 40 % of the
-free area (the most that random placement reaches is 54.7 %) one attempt in three or more fills a board."""
+"""Boards begun anew, and places tried for each damage: where discs ``apart_mm`` wide are to cover 40 % of the free area
+(random placement reaches 54.7 % at most), one attempt in three or more fills a board."""
 
 
 def _ascending(limits: tuple[float, float]) -> tuple[float, float]:
@@ -52,9 +51,8 @@ Jitter = Annotated[float, Field(ge=0.0, le=1e3)]
 
 
 class _Drawn(Config):
-    """Number and sizes, as of every kind of drawn damage. The range of sizes is parted into ``per_board`` equal parts,
-    and every board has one size from each, uniform within it: over all boards sizes are uniform, and each board covers
-    the range evenly."""
+    """Number and sizes of every kind of drawn damage. The range of sizes is parted into ``per_board`` equal parts, and
+    every board has one size from each, uniform within it."""
 
     per_board: Annotated[int, Field(ge=1, le=100)]
     sizes: Literal["uniform", "log"] = Field(
@@ -66,8 +64,8 @@ class _Drawn(Config):
     @property
     def size_mm(self) -> tuple[float, float]:
         """Ends of the size that ``size_of`` names."""
-        low, high = getattr(self, f"{self.size_of}_mm")
-        return float(low), float(high)
+        ends: tuple[float, float] = getattr(self, f"{self.size_of}_mm")
+        return ends
 
     @property
     def depths_mm(self) -> tuple[float, float] | None:
@@ -95,22 +93,33 @@ class DrawnThrough(_Drawn):
 
 class DrawnDeep(DrawnThrough):
     """Blind holes with a flat bottom, or spherical caps. Depths are uniform, one from each of ``per_board`` equal parts
-    of their range, in random order: size and depth are independent. Of a dent it is that part of the range which is
-    legal for its size: no deeper than its radius, and on a bent face no shallower than its ball allows
-    (`scenes.target.checks`)."""
+    of their range, in random order. Of a dent it is that part of the range which is legal for its size: no deeper than
+    its radius, and on a bent face no shallower than its ball allows (`scenes.target.checks`)."""
 
     kind: Literal["blind", "dent"]  # type: ignore[assignment]
     depth_mm: Depths
 
 
 Extents = Annotated[tuple[flaws.Extent, flaws.Extent], AfterValidator(_ascending)]
-FlawDepths = Annotated[tuple[flaws.Depth, flaws.Depth], AfterValidator(_ascending)]
-Angles = Annotated[tuple[flaws.Angle, flaws.Angle], AfterValidator(_ascending)]
+RANGES: dict[str, Any] = dict.fromkeys(("length_mm", "width_mm", "diameter_mm"), (Extents, ...))
+RANGES["depth_mm"] = Annotated[tuple[flaws.Depth, flaws.Depth], AfterValidator(_ascending)], ...
+RANGES["angle_deg"] = Annotated[tuple[flaws.Angle, flaws.Angle], AfterValidator(_ascending)], (-90.0, 90.0)
+"""Quantities that are ranges in a family of flaws: type and default."""
 
 
-class _DrawnFlaws(_Drawn):
-    """Kinds of `scenes.target.flaws`. Each pair is a range: of the size that ``size_of`` names and of the depth as of
+class DrawnFlaws(_Drawn):
+    """A kind of `scenes.target.flaws`. Each pair is a range: of the size that ``size_of`` names and of the depth as of
     holes, of every other quantity uniform and independent; what is one number is the same on all boards."""
+
+    kind: Any
+
+    @property
+    def widest_mm(self) -> float:
+        """Diameter of a circle in plan that holds the largest."""
+        if self.kind not in ("slot", "gouge"):
+            return self.size_mm[1]
+        long: Any = self
+        return math.hypot(long.length_mm[1], long.width_mm[1] + 6 * long.wander_mm)
 
     def declare(self, facts: dict[str, Any], stream: Callable[[str], np.random.Generator]) -> dict[str, Any]:
         """Return the declaration of a flaw: ``facts`` (id, place, size and depth) and what else is drawn for it."""
@@ -121,69 +130,30 @@ class _DrawnFlaws(_Drawn):
             if isinstance(value, tuple) and name != "centre_mm":
                 held[name] = float(value[0] + (value[1] - value[0]) * stream(name).random(number)[-1])
         seed = {"seed": int(stream("shapes").integers(2**32, size=number)[-1])}
-        return held | (seed if self.kind in ("slot", "gouge", "corrosion") else {})  # type: ignore[attr-defined]
+        return held | (seed if self.kind in ("slot", "gouge", "corrosion") else {})
 
 
-class _DrawnLong(_DrawnFlaws):
-    length_mm: Extents
-    width_mm: Extents
-    angle_deg: Angles = (-90.0, 90.0)
-    wander_mm: Annotated[float, Field(ge=0.0, le=200.0)] = 0.0
-
-    @property
-    def widest_mm(self) -> float:
-        """Diameter of a circle in plan that holds the largest."""
-        return math.hypot(self.length_mm[1], self.width_mm[1] + 6 * self.wander_mm)
-
-
-class DrawnSlots(_DrawnLong):
-    """Slots or open cracks, by their width."""
-
-    kind: Literal["slot"]
-    size_of: ClassVar[str] = "width"
-    depth_mm: FlawDepths | None = Field(None, description="none: through the board")
+def _drawn_of(flaw: type[flaws.FlawConfig]) -> type[DrawnFlaws]:
+    """Return the declaration of a family of a kind of flaw: as one of them, with ranges."""
+    fields: dict[str, Any] = {}
+    for name, field in flaw.model_fields.items():
+        # places and seeds are drawn, and with a chip's place the edge that its angle names
+        if name in ("id", "centre_mm", "seed") or (name, flaw) == ("angle_deg", flaws.ChipConfig):
+            continue
+        range_, default = RANGES.get(name, (field.annotation, field))
+        fields[name] = (range_ | None, field) if field.default is None else (range_, default)
+    name = f"Drawn{flaw.__name__}"
+    made = create_model(name, __base__=DrawnFlaws, __doc__=flaw.__doc__, __module__=__name__, **fields)
+    made.size_of = flaw.size_of
+    globals()[name] = made  # under its name, or it could not be sent to another process
+    return made
 
 
-class DrawnGouges(_DrawnLong):
-    """Scratches or gouges, by their length, or by their depth where all are as long."""
-
-    kind: Literal["gouge"]
-    size_of: ClassVar[str] = "length"
-    depth_mm: FlawDepths
-    section: Literal["v", "round"] = "v"
-    run_out_mm: Annotated[float, Field(ge=0.1, le=1e3)] = 5.0
-
-
-class DrawnRound(_DrawnFlaws):
-    """Pressed dents or bumps, spatter or rivets, by their diameter, or by their depth where all are as wide."""
-
-    kind: Literal["pressed_dent", "pressed_bump", "protrusion"]
-    diameter_mm: Extents
-    depth_mm: FlawDepths
-
-
-class DrawnCorrosion(DrawnRound):
-    """Corroded patches, by the diameter of a circle of their area, or by their mean depth where all are as large."""
-
-    kind: Literal["corrosion"]  # type: ignore[assignment]
-    rough_mm: Annotated[float, Field(ge=0.0, le=100.0)] = 0.2
-    grain_mm: Annotated[float, Field(ge=0.1, le=200.0)] = 3.0
-    uneven: Annotated[float, Field(ge=0.0, le=0.3)] = 0.12
-
-
-class DrawnChips(_DrawnFlaws):
-    """Chips anywhere along the board's edges, by their length."""
-
-    kind: Literal["chip"]
-    size_of: ClassVar[str] = "length"
-    length_mm: Extents
-    width_mm: Extents
-    depth_mm: FlawDepths
-
-
-_Drilled = DrawnThrough | DrawnDeep
-_Flawed = DrawnSlots | DrawnGouges | DrawnRound | DrawnCorrosion | DrawnChips
-AnyDrawn = Annotated[_Drilled | _Flawed, Field(discriminator="kind")]
+_flawed = tuple(map(_drawn_of, get_args(flaws.FlawConfig)))
+if TYPE_CHECKING:
+    AnyDrawn = DrawnThrough | DrawnDeep | DrawnFlaws
+else:
+    AnyDrawn = Annotated[Union[DrawnThrough, DrawnDeep, *_flawed], Field(discriminator="kind")]
 
 
 class DrawnTargetConfig(Config):
@@ -199,26 +169,21 @@ class DrawnTargetConfig(Config):
         default_factory=lambda: custom.BoardConfig(
             width_mm=304.8, height_mm=203.2, thickness_mm=12.7, shape=custom.FlatConfig()
         ),
-        description="the thesis' half an inch of plywood, of 12 x 8 in: its face has as many pixels as the thesis' "
-        "board of 24 x 4.5 in, and less of it lies near the edge",
+        description="the thesis' plywood, of 12 x 8 in: as many pixels as its board of 24 x 4.5 in, fewer at the edge",
     )
     apart_mm: Annotated[float, Field(gt=0.0, le=1e4)] = Field(
         default=40.0,
-        description="least distance of two centres in plan. More than twice a hit radius of 15 mm, so that no finding "
-        "can count for either; 16 neighbouring pixels farther than the 5 x 5 window reaches, at 0.7 m",
+        description="least distance of two centres in plan: more than twice a hit radius of 15 mm, so that no finding "
+        "can count for either",
     )
     edge_mm: Annotated[float, Field(ge=LEAST_WEB_MM, le=1e4)] = Field(
         default=15.0,
-        description="least distance of a rim from the board's edge. A crop takes 3 or 4 pixels off the edge, 6 mm at "
-        "0.7 m and 12 mm at 1.5 m: what lies there is missed for its place, not for its size",
+        description="least distance of a rim from the board's edge, off which a crop takes 6 mm at 0.7 m and 12 mm at "
+        "1.5 m: what lies there is missed for its place, not for its size",
     )
-    tapes: Annotated[tuple[custom.TapeConfig, ...], Field(max_length=100)] = Field(
-        default=(), description="the same on all boards; none: one view needs no marks"
-    )
+    tapes: Annotated[tuple[custom.TapeConfig, ...], Field(max_length=100)] = Field((), description="of all boards")
     distance_m: Annotated[float, Field(ge=NEAREST_M, le=FARTHEST_M)] = 0.7
-    distance_jitter_mm: Jitter = Field(
-        default=10.0, description="ten of the camera's steps of 1 mm, so that a limit does not hang on one of them"
-    )
+    distance_jitter_mm: Jitter = Field(default=10.0, description="so that a limit does not hang on a step of range")
     offset_mm: Annotated[float, Field(ge=0.0, le=5e3)] = Field(
         default=20.0, description="sideways and upwards: 14 pixels at 0.7 m, so that all parts of a pixel are met"
     )
@@ -226,28 +191,22 @@ class DrawnTargetConfig(Config):
         default=8.0, description="about x and about y: as far off frontal as is plausible for a sheet put up by hand"
     )
     roll_deg: Annotated[float, Field(ge=0.0, le=90.0)] = Field(default=2.0, description="a board is set down by eye")
-    material: custom.ReflectanceConfig = Field(
-        default=custom.ReflectanceConfig(), description="every board has a grain of its own"
-    )
+    material: custom.ReflectanceConfig = Field(custom.ReflectanceConfig(), description="each board has its own grain")
     backing: custom.BackingConfig | None = Field(
-        default=custom.BackingConfig(distance_mm=20.0),
-        description="as behind the thesis' board. Without a size it fills every hole in every pose that can be drawn",
+        default=custom.BackingConfig(distance_mm=20.0), description="without a size it fills every hole in every pose"
     )
     room: custom.RoomConfig | None = custom.RoomConfig(floor_below_lens_m=0.75, back_wall_distance_m=2.5)
-    other_wavelengths: Annotated[tuple[custom.WavelengthConfig, ...], Field(max_length=20)] = Field(
-        default=(), description="for cameras that do not work near 850 nm"
-    )
+    other_wavelengths: custom.OtherWavelengths = ()
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
         damage, board, bend_per_mm, problems = self.damage, self.board, _tightest_per_mm(self.board), []
         thick, widest_mm, jitter_mm = board.thickness_mm, damage.size_mm[1], self.distance_jitter_mm
-        depths_mm = None if damage.kind in ("pressed_dent", "pressed_bump", "protrusion") else damage.depths_mm
-        if depths_mm is not None and depths_mm[1] >= thick:
-            deep = f"{depths_mm[1]:g} mm is not less than the board's thickness, {thick:g} mm"
+        declared = damage.depths_mm or (0.0, 0.0)
+        if declared[1] >= thick and damage.kind not in ("pressed_dent", "pressed_bump", "protrusion"):
+            deep = f"{declared[1]:g} mm is not less than the board's thickness, {thick:g} mm"
             problems.append(f"damage.depth_mm: {deep}")
         # Both limits of a dent's depth grow with the diameter, so the ends of the sizes tell for all.
-        declared = damage.depths_mm or (0.0, math.inf)
         dents = isinstance(damage, DrawnDeep) and damage.kind == "dent"
         for diameter_mm in sorted(set(damage.size_mm)) if dents else []:
             least_mm, most_mm = _dent_depths_mm(diameter_mm, bend_per_mm)
@@ -256,13 +215,13 @@ class DrawnTargetConfig(Config):
                 problems.append(f"damage.depth_mm: {can}, not {declared[0]:g} to {declared[1]:g} mm")
         if isinstance(damage, DrawnDeep) and dents and damage.chamfer_mm > 0:
             problems.append("damage.chamfer_mm: dents are not drilled and have no chamfer")
-        if not isinstance(damage, _DrawnFlaws) and widest_mm / 2 * bend_per_mm > WIDEST_BEND:
+        if not isinstance(damage, DrawnFlaws) and widest_mm / 2 * bend_per_mm > WIDEST_BEND:
             wide = f"{widest_mm:g} mm is too wide for a face bent to a radius of {1 / bend_per_mm:.3g} mm"
             problems.append(f"damage.diameter_mm: {wide}")
         rim_mm, shrinkage, margin_mm = self._room_mm()
         needed_mm = 2 * rim_mm * shrinkage + LEAST_WEB_MM
         if self.apart_mm < needed_mm:
-            what = "damage" if isinstance(damage, _DrawnFlaws) else "holes"
+            what = "damage" if isinstance(damage, DrawnFlaws) else "holes"
             meet = f"{self.apart_mm:g} mm lets {what} of {damage.widest_mm:g} mm meet"
             problems.append(f"apart_mm: {meet}; it must be {needed_mm:.4g} mm or more")
         if min(board.width_mm, board.height_mm) / 2 < margin_mm:
@@ -278,11 +237,10 @@ class DrawnTargetConfig(Config):
     def _room_mm(self) -> tuple[float, float, float]:
         """Return the largest radius of a rim; the factor by which axes along a bent face's normals start farther apart
         in plan, so as not to meet within the board (parallel surfaces at a depth t shrink by 1 - t / radius of
-        curvature); and the least distance of centres from the edge, the same for all sizes, so that size and place are
-        independent. A dent's rim on a face that bends away is up to sqrt 2 larger than on a flat one; allowed for with
-        holes too, so that the kind of damage does not change its places."""
+        curvature); and the least distance of centres from the edge, the same for all sizes. A dent's rim on a face that
+        bends away is up to sqrt 2 larger than on a flat one; holes get the same room, to keep the dents' places."""
         bend_per_mm = _tightest_per_mm(self.board)
-        round_on_bent = bend_per_mm > 0 and not isinstance(self.damage, _DrawnFlaws)
+        round_on_bent = bend_per_mm > 0 and not isinstance(self.damage, DrawnFlaws)
         rim_mm = self.damage.widest_mm / 2 * (math.sqrt(2) if round_on_bent else 1.0)
         shrinkage = 1 / (1 - min(self.board.thickness_mm * bend_per_mm, 0.5))
         return rim_mm, shrinkage, (self.edge_mm + rim_mm) * shrinkage
@@ -292,16 +250,15 @@ class DrawnTargetConfig(Config):
         return self.drawn("damaged", 0)
 
     def drawn(self, purpose: Purpose, number: int) -> custom.TargetConfig:
-        """Return a board of the family, with its damage; ids count from 1 in the order of size. Boards that are to be
-        hole-free have damage too: call ``hole_free()`` on the answer, and what was left out are unflawed sites, placed
-        as damage is. Raises UserError where the board is too full for the damage."""
+        """Return a board of the family with its damage, ids from 1 in the order of size. Boards that are to be
+        hole-free have damage too: what ``hole_free()`` of the answer leaves out are unflawed sites, placed as damage
+        is. Raises UserError where the board is too full for the damage."""
 
         def stream(quantity: str) -> np.random.Generator:
             return random_stream(self.seed, "drawn board", purpose, number, quantity)
 
-        def within(quantity: str, limit: float, count: int) -> list[float]:
-            drawn: list[float] = (limit * stream(quantity).uniform(-1.0, 1.0, count)).tolist()
-            return drawn
+        def within(quantity: str, limit: float, count: int) -> list[Any]:
+            return (limit * stream(quantity).uniform(-1.0, 1.0, count)).tolist()
 
         damage, count, depths = self.damage, self.damage.per_board, stream("depths")
         made: list[custom.AnyDamage] = []
@@ -309,7 +266,7 @@ class DrawnTargetConfig(Config):
         sizes = low * (high / low) ** parts if damage.sizes == "log" else low + (high - low) * parts
         quantiles = depths.permutation((np.arange(count) + depths.random(count)) / count).tolist()
         # What is placed first has the freest choice: which size that is, is drawn too.
-        places = self._edge_places_mm if isinstance(damage, DrawnChips) else self._places_mm
+        places = self._edge_places_mm if damage.kind == "chip" else self._places_mm
         places_mm = stream("order of places").permutation(places(stream("places"))).tolist()
         for size, quantile, (x, y, *edge) in zip(np.clip(sizes, low, high).tolist(), quantiles, places_mm, strict=True):
             facts: dict[str, Any] = {"id": len(made) + 1, f"{damage.size_of}_mm": size, "centre_mm": (x, y)}
@@ -319,7 +276,7 @@ class DrawnTargetConfig(Config):
                     legal = _dent_depths_mm(size, _tightest_per_mm(self.board))
                     least, most = max(least, legal[0]), min(most, legal[1])
                 facts["depth_mm"] = float(min(least + (most - least) * quantile, most))
-            if isinstance(damage, _DrawnFlaws):
+            if isinstance(damage, DrawnFlaws):
                 facts |= {"angle_deg": round(edge[0])} if edge else {}
                 made.append(TypeAdapter(flaws.AnyFlawConfig).validate_python(damage.declare(facts, stream)))
             elif damage.kind == "dent":
@@ -328,10 +285,14 @@ class DrawnTargetConfig(Config):
                 made.append(custom.HoleConfig(**facts, kind=damage.kind, chamfer_mm=damage.chamfer_mm))
         common: dict[str, Any] = {key: getattr(self, key) for key in ("tapes", "backing", "room", "other_wavelengths")}
         kinds = "dents" if damage.kind == "dent" else "holes"
-        common["flaws" if isinstance(damage, _DrawnFlaws) else kinds] = tuple(made)
+        common["flaws" if isinstance(damage, DrawnFlaws) else kinds] = tuple(made)
         pose = within("offset", self.offset_mm, 2) + within("tilt", self.tilt_deg, 2) + within("roll", self.roll_deg, 1)
+        board = self.board
+        if isinstance(board.shape, custom.RoughConfig):
+            own = {"seed": int(stream("roughness").integers(2**32))}
+            board = board.model_copy(update={"shape": board.shape.model_copy(update=own)})
         config = custom.TargetConfig(
-            board=self._board(stream),
+            board=board,
             **common,
             material=custom.MaterialConfig(
                 **self.material.model_dump(), grain_seed=int(stream("grain").integers(2**32))
@@ -343,14 +304,6 @@ class DrawnTargetConfig(Config):
         # a backing that fills every hole: the face's shadow on it from the lens, in the extreme poses
         size_mm = _backing_size_mm(self, float(backing_corners_board_m(config, self.backing)[0, 2]))
         return config.model_copy(update={"backing": self.backing.model_copy(update={"size_mm": size_mm})})
-
-    def _board(self, stream: Callable[[str], np.random.Generator]) -> custom.BoardConfig:
-        """Return the board; one with a rough face has a face of its own."""
-        shape = self.board.shape
-        if not isinstance(shape, custom.RoughConfig):
-            return self.board
-        own = shape.model_copy(update={"seed": int(stream("roughness").integers(2**32))})
-        return self.board.model_copy(update={"shape": own})
 
     def extreme_poses(self) -> tuple[custom.PoseConfig, ...]:
         """Return the corners of what poses can be drawn, with the rolls at which the board reaches farthest sideways

@@ -1,12 +1,10 @@
 """Damage beside drilled holes and ball dents: a slot, a gouge, a pressed dent or bump, corrosion, a chip, a protrusion.
 
-All are one thing: a depth over a frame of the damage's own. The frame touches the face at the damage's centre; s runs
-along the damage, t across it, and depth counts along the face's normal there, into the board. A kind gives its depth on
-a grid of (s, t) whose border is the damage's outline; `mesh.solids_of` cuts or adds the solid between that grid and
-the face, and `truth.truth_of` measures outline, centre line and volume on the same grid.
-
-``angle_deg`` turns s from board +x towards board +y. A size is the one in the plane that touches the face at the
-centre: good to second order in size over radius of curvature.
+All are a depth over a frame of their own, which touches the face at the damage's centre: s runs along the damage, t
+across it, and depth counts along the face's normal there, into the board. A kind gives its depth on a grid of (s, t)
+whose border is the outline; `mesh.solids_of` cuts or adds the solid between that grid and the face, and
+`truth.truth_of` measures outline, centre line and volume on it. ``angle_deg`` turns s from board +x towards board +y.
+Sizes are those in the plane that touches the face: good to second order in size over radius of curvature.
 
 Not modelled: burrs, spring-back, rust that stands on the face, another albedo of what is laid bare."""
 
@@ -27,7 +25,6 @@ from harness.vocabulary.seeds import random_stream
 
 Coordinate = Annotated[float, Field(ge=-5e3, le=5e3)]
 PlaceMm = tuple[Coordinate, Coordinate]
-DamageId = Annotated[int, Field(ge=1, le=9999)]
 Extent = Annotated[float, Field(ge=0.05, le=2e3)]
 Depth = Annotated[float, Field(gt=0.0, le=500.0)]
 Angle = Annotated[float, Field(ge=-180.0, le=180.0)]
@@ -43,9 +40,8 @@ CHIP_ARC = 0.998
 @dataclass(frozen=True)
 class Relief:
     """The depth of a damage over its own frame, metres. ``s_m``, ``t_m``, ``depth_m`` (rows, columns): a grid whose
-    border is the outline; ``depth_m`` is negative where the damage stands out of the face, and NaN where it goes
-    through the board. ``open_row``: whether the last row lies
-    on the board's edge, beyond which a cutter goes on."""
+    border is the outline; ``depth_m`` is negative where the damage stands out of the face, and NaN through the board.
+    ``open_row``: whether the last row lies on the board's edge, beyond which a cutter goes on."""
 
     s_m: np.ndarray
     t_m: np.ndarray
@@ -54,12 +50,12 @@ class Relief:
 
 
 class PlacedConfig(Config):
-    """Declaration that all damage has in common."""
+    """Declaration that all damage has in common. ``size_of``: the size in plan that a limit is of where it varies;
+    where it does not, the limit is of the depth."""
 
-    id: DamageId
+    id: Annotated[int, Field(ge=1, le=9999)]
     centre_mm: PlaceMm
     size_of: ClassVar[str] = "diameter"
-    """The size in plan that a limit is of where it varies; where it does not, the limit is of the depth."""
 
     @property
     def centre_m(self) -> tuple[float, float]:
@@ -73,8 +69,6 @@ class PlacedConfig(Config):
 
 
 class _FlawConfig(PlacedConfig):
-    """Declaration that these kinds have in common."""
-
     @property
     def sides_mm(self) -> tuple[float, float]:
         """Length and width."""
@@ -184,12 +178,10 @@ class CorrosionConfig(_FlawConfig):
         s, t, ring = _disc(1.0)
         angle, turn = np.arctan2(t, s), np.linspace(0, 2 * np.pi, 721)
         turns, weights = rng.uniform(0, 2 * np.pi, 4), rng.uniform(0.3, 1.0, 4)
-        spread = self.uneven / np.sqrt((weights**2).sum() / 2)
+        spread, waves = self.uneven / np.sqrt((weights**2).sum() / 2), [*zip((2, 3, 4, 5), weights, turns, strict=True)]
 
         def outline(at: np.ndarray) -> np.ndarray:
-            return 1 + spread * sum(
-                w * np.cos(k * at + p) for k, w, p in zip((2, 3, 4, 5), weights, turns, strict=True)
-            )
+            return 1 + spread * sum(w * np.cos(k * at + p) for k, w, p in waves)
 
         stretch = radius_m * outline(angle) / np.sqrt(np.mean(outline(turn[:-1]) ** 2))
         noise = gaussian_filter(rng.standard_normal(s.shape), self.grain_mm / self.diameter_mm * ROUND / np.sqrt(2))
@@ -213,7 +205,7 @@ class ChipConfig(_FlawConfig):
     angle_deg: Literal[0, 90, 180, -90]
 
     def relief(self) -> Relief:
-        """Return the depth over the chip's frame; its last row lies on the board's edge."""
+        """Return the depth over the chip's frame."""
         u, v = np.meshgrid(CHIP_ARC * np.sin(np.linspace(-1, 1, ALONG + 1) * np.pi / 2), np.linspace(1, 0, ACROSS + 1))
         v = np.sin(v * np.pi / 2)
         s, t = u * self.length_mm * MM / 2, -v * np.sqrt(1 - u**2) * self.width_mm * MM
@@ -264,14 +256,11 @@ def closed_grid(upper: np.ndarray, lower: np.ndarray) -> tuple[np.ndarray, np.nd
     grid = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = (part.ravel() for part in (grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]))
     top = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
-    rim = border(grid)
-    following, below = np.roll(rim, -1), grid.size
-    walls = [
-        np.column_stack([rim + below, following + below, following]),
-        np.column_stack([rim + below, following, rim]),
-    ]
+    rim, below = border(grid), grid.size
+    following = np.roll(rim, -1)
+    corners = (rim + below, following + below, following), (rim + below, following, rim)
     vertices = np.concatenate([upper.reshape(-1, 3), lower.reshape(-1, 3)])
-    return vertices, np.concatenate([top, top[:, ::-1] + below, *walls])
+    return vertices, np.concatenate([top, top[:, ::-1] + below, *map(np.column_stack, corners)])
 
 
 def volume_m3(vertices: np.ndarray, faces: np.ndarray) -> float:
@@ -290,8 +279,7 @@ def from_line_m(line_m: np.ndarray, places_m: np.ndarray) -> np.ndarray:
     """Return the distance (n,) of places (n, 2) from a line of straight pieces (k, 2), or from one point (1, 2)."""
     if len(line_m) == 1:
         return np.asarray(np.linalg.norm(places_m - line_m[0], axis=-1))
-    start, way = line_m[:-1], np.diff(line_m, axis=0)
+    way, to = np.diff(line_m, axis=0), places_m[:, None] - line_m[:-1]
     square = np.maximum((way**2).sum(axis=1), 1e-30)
-    to = places_m[:, None] - start
     part = np.clip((to * way).sum(axis=-1) / square, 0.0, 1.0)
     return np.asarray(np.linalg.norm(to - part[..., None] * way, axis=-1).min(axis=1))

@@ -1,5 +1,4 @@
-"""Built targets, a renderer's input: parts with meshes and reflectances (wood grain), and the truth beside them; as
-files: PLY or GLB for viewers, JSON for the truth.
+"""Built targets, a renderer's input: parts with meshes and reflectances, and the truth; as PLY, GLB and JSON files.
 
 A texture is (rows, columns[, channels]); u = x / width + 1/2 runs with the columns from the left (-x), v = 1/2 - y /
 height runs with the rows from the top (+y): row 0 begins at v = 0. The centre of texel (row, column) is at u = (column
@@ -56,7 +55,7 @@ FIBRE_LENGTH_MM, FIBRE_WIDTH_MM = 12.0, 0.5
 
 def grain(material: MaterialConfig, width_mm: float, height_mm: float) -> np.ndarray:
     """Return the grain of a board's face: (rows, columns) float64 with mean 0 and standard deviation 1. Not modelled:
-    knots, seams of the veneer, gloss, a contrast that depends on the wavelength."""
+    knots, seams of the veneer, a contrast that depends on the wavelength."""
     texel_mm = max(TEXEL_MM, width_mm / MAX_TEXELS, height_mm / MAX_TEXELS)
     shape = tuple(max(2, round(size / texel_mm)) for size in (height_mm, width_mm))
     stream = random_stream(material.grain_seed, "grain")
@@ -178,6 +177,7 @@ class Target:
 
 def build_target(config: TargetConfig) -> Target:
     """Build a declaration. Raises UserError that names every part that does not fit (`scenes.target.checks`)."""
+    import trimesh
 
     check_target(config)
     T_camera_board, board, material = config.pose.T_camera_board, config.board, config.material
@@ -200,22 +200,22 @@ def build_target(config: TargetConfig) -> Target:
     def add(name: str, mesh: trimesh.Trimesh, albedo_850: float, rgb: tuple[float, float, float]) -> None:
         parts.append(TargetPart(name, mesh, None, albedo_850, None, np.array(rgb), None))
 
+    def add_plane(name: str, corners: np.ndarray, *colours: Any) -> None:
+        add(name, trimesh.Trimesh(vertices=corners, faces=[(0, 1, 2), (0, 2, 3)], process=False), *colours)
+
     for number, tape in enumerate(config.tapes, start=1):
-        (width, height), (x, y), angle = tape.size_mm, tape.centre_mm, float(np.deg2rad(tape.angle_deg))
-        offsets: dict[str, Any] = {"top_m": tape.thickness_mm * MM, "bottom_m": -TAPE_SINK_M, "sagitta_m": sagitta_m}
-        size_m, centre_m = (width * MM, height * MM), (x * MM, y * MM)
-        strip = sheet(face_of(board), size_m, **offsets, centre_m=centre_m, angle_rad=angle)
+        (width, height), (x, y), top_m = tape.size_mm, tape.centre_mm, tape.thickness_mm * MM
+        size_m, at = (width * MM, height * MM), ((x * MM, y * MM), float(np.deg2rad(tape.angle_deg)))
+        strip = sheet(face_of(board), size_m, top_m, -TAPE_SINK_M, sagitta_m, *at)
         add(f"tape_{number}", strip.apply_transform(T_camera_board), tape.albedo_850, tape.rgb)
     backing, room = config.backing, config.room
     if backing is not None:
         corners = transform_points(T_camera_board, backing_corners_board_m(config, backing))
-        add("backing", _rectangle(corners), backing.albedo_850, backing.rgb)
+        add_plane("backing", corners, backing.albedo_850, backing.rgb)
     if room is not None and room.floor_below_lens_m is not None:
-        corners = floor_corners_camera_m(room, room.floor_below_lens_m)
-        add("floor", _rectangle(corners), room.floor_albedo_850, room.floor_rgb)
+        add_plane("floor", floor_corners_camera_m(room), room.floor_albedo_850, room.floor_rgb)
     if room is not None and room.back_wall_distance_m is not None:
-        corners = wall_corners_camera_m(room, room.back_wall_distance_m)
-        add("back_wall", _rectangle(corners), room.back_wall_albedo_850, room.back_wall_rgb)
+        add_plane("back_wall", wall_corners_camera_m(room), room.back_wall_albedo_850, room.back_wall_rgb)
     return Target(config, tuple(parts), truth, T_camera_board, outline_board_m(board))
 
 
@@ -231,7 +231,7 @@ def board_solid(config: TargetConfig, truth: tuple[Damage, ...]) -> trimesh.Trim
         body = trimesh.Trimesh(*part_of(config.board.shape), process=False)
     else:
         sagitta_m = _sagitta_m(config)
-        body = sheet(face, size_m, top_m=0.0, bottom_m=-thickness_m, sagitta_m=sagitta_m, flat_back=face.rough)
+        body = sheet(face, size_m, 0.0, -thickness_m, sagitta_m, flat_back=face.rough)
     for damage, item in zip(truth, config.damages, strict=True):
         if isinstance(item, FlawConfig):
             more, less = solids_of(item, face, thickness_m)
@@ -241,24 +241,16 @@ def board_solid(config: TargetConfig, truth: tuple[Damage, ...]) -> trimesh.Trim
     return subtract(body, cutters, added) if truth else body
 
 
-def _rectangle(corners: np.ndarray) -> trimesh.Trimesh:
-    import trimesh
-
-    return trimesh.Trimesh(vertices=corners, faces=[(0, 1, 2), (0, 2, 3)], process=False)
-
-
 def _sagitta_m(config: TargetConfig) -> float:
     if face_of(config.board).rough:
         return ROUGH_SAGITTA_M
-    bowls = (*config.dents, *(flaw for flaw in config.flaws if flaw.depth_mm is not None))
-    depths_m = [bowl.depth_mm * MM for bowl in bowls if bowl.depth_mm is not None]
+    depths_m = [bowl.depth_mm * MM for bowl in (*config.dents, *config.flaws) if bowl.depth_mm is not None]
     return float(np.clip(min(depths_m, default=np.inf) / 400, FINEST_SAGITTA_M, COARSEST_SAGITTA_M))
 
 
 def sheet(
     face: Face,
     size_m: tuple[float, float],
-    *,
     top_m: float,
     bottom_m: float,
     sagitta_m: float,
@@ -309,25 +301,23 @@ def solids_of(item: FlawConfig, face: Face, thickness_m: float) -> tuple[list[tr
         depth_m = np.concatenate([depth_m, depth_m[-1:]])
 
     def between(upper_m: np.ndarray | float, lower_m: np.ndarray | float) -> trimesh.Trimesh:
-        """The solid between two heights over the face, along the axis."""
+        """Return the solid between two heights over the face, along the axis."""
         heights = (np.broadcast_to(height, depth_m.shape)[..., None] for height in (upper_m, lower_m))
         return trimesh.Trimesh(*closed_grid(*(points + height * axis for height in heights)), process=False)
 
-    through = np.isnan(relief.depth_m).any()
-    inside_m, out = -thickness_m / 2, bool(depth_m.min() < 0)
+    out = bool(depth_m.min() < 0)
     if not isinstance(item, PressedConfig):
         if out:
             return [between(-depth_m, -min(spare_m, thickness_m / 2))], []
-        return [], [between(spare_m, -depth_m - (spare_m if through else 0.0))]
+        return [], [between(spare_m, -depth_m - (spare_m if np.isnan(relief.depth_m).any() else 0.0))]
     # the back is the face moved by the thickness along its own normals
     normals = face.normal(points[..., 0], points[..., 1])
-    back = points - thickness_m * normals
+    back, middle = points - thickness_m * normals, points + -thickness_m / 2 * normals
     moved = back - depth_m[..., None] * axis
-    middle = points + inside_m * normals
-    beyond = back - spare_m * axis
     front = between(-depth_m, -thickness_m / 2) if out else between(spare_m, -depth_m)
-    rear = trimesh.Trimesh(*(closed_grid(moved, beyond) if out else closed_grid(middle, moved)), process=False)
-    return ([front], [rear]) if out else ([rear], [front])
+    rear = closed_grid(moved, back - spare_m * axis) if out else closed_grid(middle, moved)
+    solid = trimesh.Trimesh(*rear, process=False)
+    return ([front], [solid]) if out else ([solid], [front])
 
 
 def cutter(damage: Damage, declared: HoleConfig | DentConfig) -> trimesh.Trimesh:
@@ -352,11 +342,9 @@ def cutter(damage: Damage, declared: HoleConfig | DentConfig) -> trimesh.Trimesh
             profile = np.vstack([profile, (profile[-1, 0], spare_m)])
         profile = np.vstack([profile, (0.0, spare_m)])
     else:
-        bottom_m = -depth_m - (spare_m if damage.kind == "through" else 0.0)
-        leg_m = declared.mouth_m - radius_m
-        edge = [(radius_m, -leg_m), (radius_m + leg_m, 0.0)] if leg_m > 0 else []
-        top_m = radius_m + leg_m
-        profile = np.array([(0.0, bottom_m), (radius_m, bottom_m), *edge, (top_m, spare_m), (0.0, spare_m)])
+        bottom_m, mouth_m = -depth_m - (spare_m if damage.kind == "through" else 0.0), declared.mouth_m
+        edge = [(radius_m, radius_m - mouth_m), (mouth_m, 0.0)] if mouth_m > radius_m else []
+        profile = np.array([(0.0, bottom_m), (radius_m, bottom_m), *edge, (mouth_m, spare_m), (0.0, spare_m)])
     sides = 4 * int(np.ceil(np.pi / 2 * np.sqrt(radius_m / (12 * CORNER_M))))
     angle = 2 * np.pi / sides
     equal_area = np.sqrt(angle / np.sin(angle))
@@ -378,8 +366,7 @@ def subtract(
     import manifold3d  # type: ignore[import-not-found]
     import trimesh
 
-    longest_m = max(CELL_M, float(np.ptp(body.vertices, axis=0).max()) / MOST_ALONG)
-    solids = []
+    longest_m, solids = max(CELL_M, float(np.ptp(body.vertices, axis=0).max()) / MOST_ALONG), []
     for mesh in (body, *added, *cutters):
         vertices, faces = np.array(mesh.vertices, float), np.array(mesh.faces, np.uint64)
         if mesh is body:
@@ -394,8 +381,7 @@ def subtract(
     whole = manifold3d.Manifold.batch_boolean(solids[: 1 + len(added)], manifold3d.OpType.Add)
     left = [whole, *solids[1 + len(added) :]]
     result = manifold3d.Manifold.batch_boolean(left, manifold3d.OpType.Subtract).to_mesh64()
-    faces = result.tri_verts.astype(np.int64)
-    return trimesh.Trimesh(vertices=result.vert_properties[:, :3], faces=faces, process=False)
+    return trimesh.Trimesh(result.vert_properties[:, :3], result.tri_verts.astype(np.int64), process=False)
 
 
 MESH_SUFFIXES = (".glb", ".ply")
@@ -404,8 +390,7 @@ MESH_SUFFIXES = (".glb", ".ply")
 def write_mesh(target: Target, path: Path) -> None:
     """Write all parts, in metres, by the suffix of ``path``; colours are sRGB. ``.ply``: one binary mesh in the
     camera's frame (z forward, y down), each part's mean colour at its vertices. ``.glb``: one node a part, the grain as
-    a texture, in glTF's frame (y up, the camera at the origin looks along -z). Raises UserError for another suffix or
-    where the file cannot be written."""
+    a texture, in glTF's frame (y up, the camera at the origin looks along -z). Raises UserError for another suffix."""
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise UserError(f"{path}: no mesh format is called {suffix or 'nothing'!r}", legal=" or ".join(MESH_SUFFIXES))
@@ -437,14 +422,13 @@ def _glb(target: Target) -> bytes:
     scene = trimesh.Scene()
     upright = np.diag([1.0, -1.0, -1.0, 1.0])
     for part in target.parts:
-        rough = {"metallicFactor": 0.0, "roughnessFactor": 1.0, "name": part.name}
-        if part.uv is None or part.texture_rgb is None:
-            material = PBRMaterial(baseColorFactor=[*part.rgb, 1.0], **rough)
-            visual = trimesh.visual.TextureVisuals(uv=np.zeros((len(part.mesh.vertices), 2)), material=material)
-        else:
-            material = PBRMaterial(baseColorTexture=Image.fromarray(_srgb_bytes(part.texture_rgb)), **rough)
-            # trimesh counts v upwards from the image's lower edge.
-            visual = trimesh.visual.TextureVisuals(uv=part.uv * (1, -1) + (0, 1), material=material)
+        colour: dict[str, Any] = {"baseColorFactor": [*part.rgb, 1.0]}
+        uv = np.zeros((len(part.mesh.vertices), 2))
+        if part.uv is not None and part.texture_rgb is not None:
+            colour = {"baseColorTexture": Image.fromarray(_srgb_bytes(part.texture_rgb))}
+            uv = part.uv * (1, -1) + (0, 1)  # trimesh counts v upwards from the image's lower edge
+        material = PBRMaterial(**colour, metallicFactor=0.0, roughnessFactor=1.0, name=part.name)
+        visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
         mesh = trimesh.Trimesh(part.mesh.vertices, part.mesh.faces, visual=visual, process=False)
         # No normals: glTF viewers then shade each facet flat, which keeps the rims of holes sharp.
         scene.add_geometry(mesh, node_name=part.name, geom_name=part.name, transform=upright)

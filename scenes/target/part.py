@@ -1,8 +1,8 @@
 """Parts from mesh files as targets: read, repaired or refused, and their front as a height field.
 
-The part's frame is the board's: its ``front`` axis is z, towards the camera, x and y are centred on its bounds, and
-z = 0 is its foremost point. The front is what is seen along z; damage lies there. Its heights are read off the
-triangles on a grid of `NODES` along the longer side, between which they are bilinear.
+The part's frame is the board's: its ``front`` axis is z, x and y are centred on its bounds, and z = 0 is its foremost
+point. The front is what is seen along z; damage lies there. Its heights are read off the triangles on a grid of `NODES`
+along the longer side, between which they are bilinear.
 
 Not checked: neighbouring triangles that fold onto each other. Not modelled: steps of the front within a step of the
 grid; pressed dents and chips, which need a sheet's back or a declared edge."""
@@ -35,36 +35,30 @@ class MeshTargetConfig(Config):
     file: Annotated[str, Field(min_length=1, max_length=1000, description=".stl, .ply, .obj or .glb")]
     unit: FileUnit = "mm"
     front: FrontAxis = "+z"
-    close: custom.Close = False
     flaws: Annotated[tuple[custom.AnyFlawConfig, ...], Field(max_length=500)] = ()
     material: custom.MaterialConfig = custom.MaterialConfig(grain_contrast=0.0)
     backing: custom.BackingConfig | None = None
     room: custom.RoomConfig | None = None
     pose: custom.PoseConfig = custom.PoseConfig()
-    other_wavelengths: Annotated[tuple[custom.WavelengthConfig, ...], Field(max_length=20)] = ()
+    other_wavelengths: custom.OtherWavelengths = ()
 
     def declare(self) -> custom.TargetConfig:
         """Return the full declaration. Raises UserError where the file cannot be used."""
         shape = custom.MeshConfig(kind="mesh", **{key: getattr(self, key) for key in OF_MESH})
         sizes = np.round(np.ptp(part_of(shape)[0], axis=0), 9) / MM
         board = dict(zip(("width_mm", "height_mm", "thickness_mm"), sizes.tolist(), strict=True))
-        kept: dict[str, Any] = {
-            key: getattr(self, key) for key in type(self).model_fields if key not in (*OF_MESH, "name")
-        }
+        kept: dict[str, Any] = {key: value for key, value in self if key not in (*OF_MESH, "name")}
         return custom.TargetConfig(board=custom.BoardConfig(**board, shape=shape), **kept)
 
 
-OF_MESH = ("file", "unit", "front", "close")
-FLAT = 0.02
-"""Height of an opening's rim off its plane, over its width, up to which a lid closes it."""
+OF_MESH = ("file", "unit", "front")
 
 
 @lru_cache(maxsize=8)
 def part_of(shape: custom.MeshConfig) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (n, 3) and outward triangles (m, 3) of a closed part, board frame, metres. Equal vertices are
-    joined, flat and doubled triangles left out, openings closed by lids where the declaration says so, and a part that
-    is inside out is turned. Raises UserError, with the place, for what is open, not manifold, not oriented, crosses
-    itself or is no mesh."""
+    joined, flat and doubled triangles left out, and a part that is inside out is turned. Raises UserError, with the
+    place, for what is open, not manifold, not oriented, crosses itself or is no mesh."""
     mesh = read_mesh(shape.file)
     if shape.content and file_digest(Path(shape.file)) != shape.content:
         raise UserError(f"{shape.file}: has changed since the experiment was declared")
@@ -77,12 +71,7 @@ def part_of(shape: custom.MeshConfig) -> tuple[np.ndarray, np.ndarray]:
 
     edges, counts = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
     refuse(edges[counts > 2], "edges of {} are shared by three faces or more", "split them")
-    if (counts == 1).any() and shape.close:
-        mesh.faces = np.concatenate([mesh.faces, *_lids(mesh)])
-        edges, counts = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
-    rim = "have a rim that is not flat" if shape.close else "are open"
-    also = "" if shape.close else "declare close: true, which puts a lid on each opening with a flat rim, or "
-    refuse(edges[counts == 1], f"edges of {{}} {rim}", f"{also}close them")
+    refuse(edges[counts == 1], "edges of {} are open", "close them")
     if not len(mesh.faces):
         raise UserError(f"{shape.file}: is no mesh: it holds no triangles", legal="a closed surface")
     if not mesh.is_winding_consistent:
@@ -94,29 +83,6 @@ def part_of(shape: custom.MeshConfig) -> tuple[np.ndarray, np.ndarray]:
     points = front_first(mesh, shape.unit, shape.front)
     low, high = points.min(axis=0), points.max(axis=0)
     return points - [*(low[:2] + high[:2]) / 2, high[2]], np.asarray(mesh.faces, np.int64)
-
-
-def _lids(mesh: Any) -> list[np.ndarray]:
-    """Return triangles (k, 3) that close each opening with a flat rim, oriented as the faces about it."""
-    import manifold3d  # type: ignore[import-not-found]
-
-    _, back, counts = np.unique(mesh.edges_sorted, axis=0, return_inverse=True, return_counts=True)
-    following = {int(end): int(begin) for begin, end in mesh.edges[counts[back.ravel()] == 1]}
-    lids = []
-    while following:
-        loop = [next(iter(following))]
-        while loop[-1] in following:
-            loop.append(following.pop(loop[-1]))
-        if len(loop) < 4 or loop[0] != loop[-1]:  # openings that meet in a corner
-            continue
-        rim = mesh.vertices[loop[:-1]] - mesh.vertices[loop[:-1]].mean(axis=0)
-        x, y, height = np.linalg.svd(rim, full_matrices=False)[2] @ rim.T
-        if np.ptp(height) <= FLAT * np.ptp(x):
-            # the triangulation wants its polygon counter-clockwise
-            clockwise = (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() < 0
-            plan = np.column_stack([y, x] if clockwise else [x, y])
-            lids.append(np.array(loop)[manifold3d.triangulate([plan])])
-    return lids
 
 
 def crossing(corners: np.ndarray) -> np.ndarray:

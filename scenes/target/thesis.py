@@ -7,7 +7,7 @@ with a reason, fixed before any claim was scored; `experiments/averaging.yaml` t
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field
 
@@ -33,12 +33,8 @@ class ThesisTargetConfig(Config):
     """The open facts of the thesis' target. ``declare()`` gives the full declaration."""
 
     name: Literal["thesis"] = "thesis"
-    hole_kind: Literal["through", "blind"] = _open(
-        "through", "'Drilled' in a sheet of half an inch reads as drilled through; a drill stopped short is as easy."
-    )
-    blind_depth_mm: Annotated[float, Field(gt=0.0, lt=THICKNESS_MM)] = _open(
-        9.5, "Counts for blind holes only. Three quarters of the thickness."
-    )
+    hole_kind: Literal["through", "blind"] = _open("through", "'Drilled' in a thin sheet reads as drilled through.")
+    blind_depth_mm: Annotated[float, Field(gt=0.0, lt=THICKNESS_MM)] = _open(9.5, "Three quarters of the thickness.")
     backing_distance_mm: NonNegativeMm | None = _open(
         20.0,
         "Only points with z < 1.1 m and a range < 1 m are kept, and the holes still show points at depth, so something "
@@ -49,36 +45,26 @@ class ThesisTargetConfig(Config):
         50.8, "2 in by the ruler readings of holes 4 to 11; taken to be the same for 1 to 3."
     )
     board_width_mm: Annotated[float, Field(ge=100.0, le=5e3)] = _open(
-        609.6, "Eleven holes at 2 in need 20 in and margins: 24 in, a stock size."
+        609.6, "24 in, a stock size; the row needs 20 in."
     )
-    board_height_mm: Annotated[float, Field(ge=30.0, le=5e3)] = _open(
-        114.3, "4.5 in: room for a row of holes with a strip of tape above and below."
-    )
+    board_height_mm: Annotated[float, Field(ge=30.0, le=5e3)] = _open(114.3, "4.5 in: the row, and tape on both sides.")
     row_offset_y_mm: Annotated[float, Field(ge=-2e3, le=2e3)] = _open(0.0, "The row is centred.")
     distance_m: Annotated[float, Field(ge=0.3, le=5.0)] = _open(
-        0.7,
-        "The camera's lower limit is 0.5 m; a range < 1 m at the board's end, 0.305 m off the axis, bounds it by "
-        "0.95 m. The middle.",
+        0.7, "The middle of 0.5 m, the camera's limit, and 0.95 m, where the board's end has a range of 1 m."
     )
     offset_x_mm: custom.Coordinate = _open(0.0, "A board is put before the camera's centre.")
     offset_y_mm: custom.Coordinate = _open(0.0, "A board is put before the camera's centre.")
     tilt_x_deg: Degrees = _open(
-        3.0,
-        "A sheet put up by hand is never frontal, and a frontal one would hide noise under the camera's rounding to "
-        "1 mm.",
+        3.0, "A sheet put up by hand is never frontal; a frontal one would hide noise under the rounding to 1 mm."
     )
     tilt_y_deg: Degrees = _open(4.0, "As tilt_x_deg.")
     roll_deg: Annotated[float, Field(ge=-180.0, le=180.0)] = _open(0.0, "A board is set down level.")
-    plywood_albedo_850: custom.Albedo = _open(
-        0.6, "No published value for plywood at 850 nm was found. Pale wood: 0.5 to 0.7."
-    )
+    plywood_albedo_850: custom.Albedo = _open(0.6, "Pale wood: 0.5 to 0.7. No published value for plywood was found.")
     plywood_rgb: custom.Rgb = _open((0.55, 0.42, 0.28), "Pale wood. A guess.")
     grain_contrast: Annotated[float, Field(ge=0.0, le=0.3)] = _open(
-        0.05, "Standard deviation of the albedo over its mean. A guess: moderate."
+        0.05, "The albedo's deviation over its mean. A guess."
     )
-    grain_period_mm: Annotated[float, Field(ge=1.0, le=200.0)] = _open(
-        8.0, "Spacing of the dark lines of a peeled softwood veneer. A guess."
-    )
+    grain_period_mm: Annotated[float, Field(ge=1.0, le=200.0)] = _open(8.0, "Dark lines of a softwood veneer. A guess.")
     grain_seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = _open(1, "Which board out of all alike.")
     tape_length_mm: custom.Length = _open(40.0, "Four strips, one near each corner, clear of the row.")
     tape_width_mm: custom.Length = _open(12.0, "Half-inch tape.")
@@ -86,21 +72,12 @@ class ThesisTargetConfig(Config):
     tape_y_mm: NonNegativeMm = _open(38.0, "The strips' centres: +-y.")
     tape_thickness_mm: Annotated[float, Field(ge=0.02, le=3.0)] = _open(0.15, "Vinyl tape is 0.13 to 0.18 mm thick.")
     tape_albedo_850: custom.Albedo = _open(0.6, "Red dyes are clear in the near infrared. A guess.")
-    tape_rgb: custom.Rgb = _open(
-        (0.85, 0.08, 0.08),
-        "The strips are told by a red channel above mean + 2.6 standard deviations: redder than the wood.",
-    )
-    floor_below_lens_m: Annotated[float, Field(ge=0.05, le=10.0)] | None = _open(
-        0.75, "A table's height. A guess; none: no floor."
-    )
+    tape_rgb: custom.Rgb = _open((0.85, 0.08, 0.08), "Strips have red above mean + 2.6 deviations: redder than wood.")
+    floor_below_lens_m: Annotated[float, Field(ge=0.05, le=10.0)] | None = _open(0.75, "A table's height, by guess.")
     floor_albedo_850: custom.Albedo = _open(0.3, "A guess.")
-    back_wall_distance_m: Annotated[float, Field(ge=0.1, le=20.0)] | None = _open(
-        2.5, "The wall of a small laboratory. A guess; none: no wall."
-    )
+    back_wall_distance_m: Annotated[float, Field(ge=0.1, le=20.0)] | None = _open(2.5, "A small laboratory, by guess.")
     back_wall_albedo_850: custom.Albedo = _open(0.6, "A painted wall. A guess.")
-    other_wavelengths: Annotated[tuple[custom.WavelengthConfig, ...], Field(max_length=20)] = Field(
-        default=(), description="for cameras that do not work near 850 nm, as the thesis' three do"
-    )
+    other_wavelengths: custom.OtherWavelengths = ()
 
     def declare(self) -> custom.TargetConfig:
         """Return the full declaration. Whether the parts fit together is checked when it is built."""
@@ -110,11 +87,7 @@ class ThesisTargetConfig(Config):
         if self.backing_distance_mm is not None:
             backing = custom.BackingConfig(distance_mm=self.backing_distance_mm, albedo_850=self.backing_albedo_850)
         sizes = {"width_mm": self.board_width_mm, "height_mm": self.board_height_mm, "thickness_mm": THICKNESS_MM}
-        strip: dict[str, Any] = {
-            "rgb": self.tape_rgb,
-            "albedo_850": self.tape_albedo_850,
-            "thickness_mm": self.tape_thickness_mm,
-        }
+        strip: dict[str, Any] = {key: getattr(self, f"tape_{key}") for key in ("rgb", "albedo_850", "thickness_mm")}
         return custom.TargetConfig(
             board=custom.BoardConfig(**sizes, shape=custom.FlatConfig()),
             # hole 1 at -x ... hole 11 at +x, the row's middle hole on the board's middle
@@ -149,14 +122,7 @@ class ThesisTargetConfig(Config):
         )
 
 
-AnyTargetConfig = Annotated[
-    ThesisTargetConfig | custom.TargetConfig | DrawnTargetConfig | MeshTargetConfig, Field(discriminator="name")
-]
-TARGETS: dict[
-    str, type[ThesisTargetConfig] | type[custom.TargetConfig] | type[DrawnTargetConfig] | type[MeshTargetConfig]
-] = {
-    "thesis": ThesisTargetConfig,
-    "custom": custom.TargetConfig,
-    "drawn": DrawnTargetConfig,
-    "mesh": MeshTargetConfig,
-}
+_AnyTarget = ThesisTargetConfig | custom.TargetConfig | DrawnTargetConfig | MeshTargetConfig
+AnyTargetConfig = Annotated[_AnyTarget, Field(discriminator="name")]
+_KINDS = zip(("thesis", "custom", "drawn", "mesh"), get_args(_AnyTarget), strict=True)
+TARGETS: dict[str, type[_AnyTarget]] = dict(_KINDS)

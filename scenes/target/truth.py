@@ -32,7 +32,7 @@ _UNIT_CORNERS = np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
 @dataclass(frozen=True)
 class Face:
     """A smooth height field with z(0, 0) = 0. ``derivatives`` gives z and its derivatives (`ORDERS`), each of the shape
-    of x and y, NaN beyond its reach. Arguments of the methods broadcast; every answer is vectorised."""
+    of x and y, NaN beyond its reach. Arguments of the methods broadcast."""
 
     derivatives: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
     rough: bool = False
@@ -135,9 +135,8 @@ def face_of(board: custom.BoardConfig) -> Face:
         return Face(round_face)
     half_x, half_y = board.width_mm * MM / 2, board.height_mm * MM / 2
     terms = shape.terms if isinstance(shape, custom.PolynomialConfig) else ()
-    coefficients = np.zeros(
-        tuple(max((getattr(t, key) for t in terms), default=0) + 1 for key in ("power_x", "power_y"))
-    )
+    powers = np.array([(0, 0), *((term.power_x, term.power_y) for term in terms)])
+    coefficients = np.zeros(powers.max(axis=0) + 1)
     for term in terms:
         scale = MM / half_x**term.power_x / half_y**term.power_y
         coefficients[term.power_x, term.power_y] += term.coefficient_mm * scale
@@ -210,31 +209,30 @@ def backing_corners_board_m(config: custom.TargetConfig, backing: custom.Backing
     return np.column_stack([_UNIT_CORNERS * size_m, np.full(4, -z_m)])
 
 
-def floor_corners_camera_m(room: custom.RoomConfig, floor_below_lens_m: float) -> np.ndarray:
+def floor_corners_camera_m(room: custom.RoomConfig) -> np.ndarray:
     """Return the floor's corners in the camera's frame; it faces up and reaches from the lens to the back wall."""
     far_m = room.back_wall_distance_m or OPEN_FLOOR_M
     x, z = room.width_m * _UNIT_CORNERS[:, 0], far_m * (_UNIT_CORNERS[:, 1] + 0.5)
-    return np.column_stack([x, np.full(4, floor_below_lens_m), z])
+    return np.column_stack([x, np.full(4, room.floor_below_lens_m, float), z])
 
 
-def wall_corners_camera_m(room: custom.RoomConfig, back_wall_distance_m: float) -> np.ndarray:
+def wall_corners_camera_m(room: custom.RoomConfig) -> np.ndarray:
     """Return the back wall's corners in the camera's frame, on the floor (without a floor, centred on the axis)."""
     foot_m = room.height_m / 2 if room.floor_below_lens_m is None else room.floor_below_lens_m
     x, up = room.width_m * _UNIT_CORNERS[:, 0], room.height_m * (_UNIT_CORNERS[:, 1] + 0.5)
-    return np.column_stack([x, foot_m - up, np.full(4, back_wall_distance_m)])
+    return np.column_stack([x, foot_m - up, np.full(4, room.back_wall_distance_m, float)])
 
 
 @dataclass(frozen=True)
 class Damage:
     """A hole, a dent or another damage. ``centre_*`` (3,) lies on the undamaged face, ``axis_*`` (3,) is the face's
     unit normal there, out of the board. ``diameter_m``: of the drill; of a dent the rim on this face (by equal area);
-    of other kinds the size in plan that ``size_of`` names. ``depth_m``: of the material removed, along the axis (of
-    corrosion the mean, of what stands out its height); through the board its thickness, so the gap to a backing comes
-    on top. ``volume_m3`` of holes and dents: exact on a flat face, to second order in diameter over radius of curvature
-    on a curved one; of other kinds as `scenes.target.flaws` meshes them, of a pressed sheet on its front. ``raised``:
-    stands out of the face. Kinds with an outline of their own have it and their centre line in plan, metres
-    (``outline_board_m`` (n, 2), ``line_board_m`` (k, 2); None of round ones), with length, width and ``angle_rad`` from
-    board +x."""
+    of other kinds the size in plan that ``size_of`` names. ``depth_m``: along the axis, of corrosion the mean, of what
+    stands out (``raised``) its height, of what goes through the board's thickness. ``volume_m3`` of holes and dents:
+    exact on a flat face, to second order in diameter over radius of curvature on a curved one; of other kinds as
+    `scenes.target.flaws` meshes them, of a pressed sheet on its front. Kinds with an outline of their own have it and
+    their centre line in plan (``outline_board_m`` (n, 2), ``line_board_m`` (k, 2); None of round ones), with length,
+    width and ``angle_rad`` from board +x."""
 
     id: int
     kind: str
@@ -321,9 +319,8 @@ def relief_points(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return a flaw's grid on the face: points (rows, columns, 3) on it, depths (rows, columns) along the axis, that
     axis (3,) out of the board, and the direction (3,) of t; board frame, metres."""
-    relief, (x, y), angle = item.relief(), item.centre_m, item.turn_rad
-    axis = face.axis(x, y)
-    along = np.array([math.cos(angle), math.sin(angle), 0.0])
+    relief, (x, y) = item.relief(), item.centre_m
+    axis, along = face.axis(x, y), np.array([math.cos(item.turn_rad), math.sin(item.turn_rad), 0.0])
     along[2] = -(axis[:2] @ along[:2]) / axis[2]
     along /= np.linalg.norm(along)
     across = np.cross(axis, along)
@@ -332,20 +329,22 @@ def relief_points(
     return face.point(plan[..., 0], plan[..., 1]), depth_m, axis, across
 
 
-def _flaw_truth(item: FlawConfig, face: Face, thickness_m: float, places: tuple[np.ndarray, ...]) -> Damage:
+Places = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+def _flaw_truth(item: FlawConfig, face: Face, thickness_m: float, places: Places) -> Damage:
     points, depth_m, axis, _ = relief_points(item, face, thickness_m)
     plan, moved, raised = points[..., :2], points - depth_m[..., None] * axis, bool(depth_m.min() < 0)
     length_mm, width_mm = item.sides_mm
+    deepest_m = thickness_m if item.depth_mm is None else item.depth_mm * MM
+    removed_m3 = volume_m3(*(closed_grid(moved, points) if raised else closed_grid(points, moved)))
     return Damage(
         item.id,
         item.kind,
         item.size_mm * MM,
-        thickness_m if item.depth_mm is None else item.depth_mm * MM,
-        volume_m3(*(closed_grid(moved, points) if raised else closed_grid(points, moved))),
-        places[0],
-        places[1],
-        places[2],
-        places[3],
+        deepest_m,
+        removed_m3,
+        *places,
         size_of=item.size_of,
         raised=raised,
         outline_board_m=border(plan),

@@ -78,10 +78,10 @@ def render(name: str, boards: int, folder: Path) -> None:
 def apart(first: Path, second: Path) -> np.ndarray:
     """Return (2, n): the difference of range in mm of two stored views of a board, and the deviation of what their
     noise makes of it; pixels with less light than 0.03 of a white plane at 1 m are left out."""
-    from scenes.render.cache import stored_view
+    from scenes.render.cache import read_view
     from scenes.render.view import range_change_m
 
-    one, two = stored_view(first), stored_view(second)
+    one, two = read_view(first), read_view(second)
     assert one is not None and two is not None
     lit = np.abs(two.phasor).mean(axis=0) > 0.03
     change = (one.phasor[:, lit] - two.phasor[:, lit]).astype(complex)

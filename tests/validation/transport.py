@@ -94,7 +94,7 @@ def compared(scene: Scene, title: str, here: np.ndarray, paths: int, most: int) 
     picked = slice(None, None, max(len(rows) // most, 1))
     rows, cols = rows[picked], cols[picked]
     frequencies = scene.optics.frequencies_hz
-    slopes = Quadrilaterals(scene.optics.lens, scene.view.region).strata(rows, cols, SIDE)
+    slopes = Quadrilaterals(scene.optics.lens, scene.view.region).coarse(rows, cols, SIDE)
     hits = cast(scene.lit, slopes.reshape(-1, 2))
     direct = phasor_sums(hits.amplitude.reshape(-1, SIDE**2), hits.path_m.reshape(-1, SIDE**2), frequencies)
     count = np.full(len(rows), SIDE**2)

@@ -8,8 +8,7 @@ that of z (in frames their correlation is 0.1 at most); a pixel without a range 
 its mean has; variance of second order (2.5 % at most) is put on the centre's noise. tests/validation/at_once.py
 measures the accuracy: the variance of averages of 50 frames of a board is equal to 0.002 (even pixels), 0.005 (uneven)
 and 0.017 (listed). Far behind a hole, where light is dim, the variance of means of 8 frames is 13 to 15 % less than
-that of single frames' means (standard error 3 %); the cause is not known.
-"""
+that of single frames' means (standard error 3 %); the cause is not known."""
 
 from __future__ import annotations
 
@@ -38,13 +37,11 @@ NONE, EVEN, UNEVEN = 0, 1, 2
 
 
 class Linear(NamedTuple):
-    """Pixels of a view, (n,) float32 but for ``kind`` (uint8) and ``row`` (int32); z in steps of the output.
-
-    ``noise``: one deviation of a pixel's noise, in any unit. ``z``: the mean less ``base``, a whole number.
-    ``by_path``: by how much a step of half path moves z. EVEN pixels: ``each``: by how much a neighbour's noise moves z
-    at weight 1, ``more``: the centre's own beyond its weight's part. UNEVEN pixels: ``row`` in ``moved`` (m, k), the
-    same by each neighbour. ``taps`` (side,): symmetric weights by distance along a row.
-    """
+    """Pixels of a view, (n,) float32 but for ``kind`` (uint8) and ``row`` (int32); z in steps of the output. ``noise``:
+    one deviation of a pixel's noise, in any unit. ``z``: the mean less ``base``, a whole number. ``by_path``: by how
+    much a step of half path moves z. EVEN pixels: ``each``: by how much a neighbour's noise moves z at weight 1,
+    ``more``: the centre's own beyond its weight's part. UNEVEN pixels: ``row`` in ``moved`` (m, k), the same by each
+    neighbour. ``taps`` (side,): symmetric weights by distance along a row."""
 
     kind: np.ndarray
     noise: np.ndarray
@@ -58,18 +55,8 @@ class Linear(NamedTuple):
     taps: np.ndarray
 
 
-def _bend() -> tuple[float, float]:
-    """Return (b, scale): u = scale v (1 + b v^2) of 256 even v in -1..1 has variance 1 and a normal's kurtosis."""
-    v = (np.arange(-128, 128) + 0.5) / 128
-    low, high = 1.0, 6.0
-    for _ in range(60):
-        middle = (low + high) / 2
-        u = v * (1 + middle * v**2)
-        low, high = (middle, high) if (u**4).mean() < 3 * (u**2).mean() ** 2 else (low, middle)
-    return low, float(1 / np.sqrt((v**2 * (1 + low * v**2) ** 2).mean()))
-
-
-BEND, SCALE = _bend()
+BEND, SCALE = 2.9117528287640084, 0.6075658039822274
+"""SCALE v (1 + BEND v^2) of 256 even v in -1..1 has variance 1 and a normal's kurtosis."""
 
 
 @numba.njit(**FAST)
@@ -135,10 +122,8 @@ def add_linear_frames(  # type: ignore[no-untyped-def]
     shape, linear, words, given, given_at, errors, counted, total, squares
 ):
     """Add `LANES` frames at the EVEN and UNEVEN pixels of ``linear`` to (n,): z less base, and its square, in steps.
-
     ``words`` (n lanes,) int8: random bytes, in whose place ``given`` (g, lanes) normals stand where ``given_at`` (n,)
-    is not -1: pixels simulated otherwise share their noise. ``errors`` (lanes,): displacements in steps of half
-    path.
+    is not -1: pixels simulated otherwise share their noise. ``errors`` (lanes,): displacements in steps of half path.
     """
     h, w = shape
     side = linear.taps.size
@@ -311,10 +296,8 @@ def _linear(
 @dataclass(frozen=True)
 class AtOnce:
     """Sums of frames of an exposure, equal in distribution to those of single frames, for a fraction of their cost.
-
     ``light`` and ``shares`` (g, f) of the list's halo: before the filter, and each frequency's in the noise that moves
-    z. A frame may be displaced by ``farthest_error_m`` at most.
-    """
+    z. A frame may be displaced by ``farthest_error_m`` at most."""
 
     imager: AmcwImager
     shape: tuple[int, int]
@@ -363,8 +346,7 @@ class AtOnce:
     ) -> FrameTotals:
         """Sum the frames of numbers ``frames`` (t,), which ``errors_m`` (t,) displace. The noise of frames `LANES` k to
         `LANES` (k + 1) - 1 is from ``stream`` (k), whichever of them are asked for."""
-        n, p, shape = self.linear.z.size, len(self._asked), self.shape
-        step_m = self.imager.camera.z_step_m
+        n, p, shape, step_m = self.linear.z.size, len(self._asked), self.shape, self.imager.camera.z_step_m
         total, squares, sway, given_at = np.zeros(n), np.zeros(n), np.zeros(n, f4), np.full(n, -1, np.int32)
         given_at[self.list.halo] = np.arange(len(self.list.halo))
         sums = np.zeros(p, np.int32), np.zeros(p), np.zeros(p), np.zeros(p), np.zeros((N_REASONS, p), np.uint16)

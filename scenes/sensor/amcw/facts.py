@@ -21,8 +21,10 @@ from scenes.sensor.facts import (
     NonNegative,
     OutputFacts,
     Positive,
+    PositiveEach,
     PositiveInt,
     Share,
+    ShareEach,
     checked,
 )
 
@@ -33,8 +35,7 @@ class UnwrapTable(NamedTuple):
     ``lattice`` (f,) float32: integers m with f_k = m_k f_0. ``combination`` (f - 1, f) float32: integer rows orthogonal
     to m; they sum the wrapped phases to whole numbers, which are a key of the wrap counts: ``sizes`` and ``offset`` (f
     - 1,) int32 of the keys, ``wraps`` (f, keys) float32, -1 where no distance has them. ``metres_per_turn`` (f,)
-    float32. ``unambiguous_m``: R = c / 2 f_0.
-    """
+    float32. ``unambiguous_m``: R = c / 2 f_0."""
 
     lattice: np.ndarray
     combination: np.ndarray
@@ -108,10 +109,7 @@ def _orthogonal_rows(lattice: np.ndarray, reach: int = 16) -> np.ndarray:
     raise UserError(f"modulation frequency ratios {lattice.tolist()} cannot be unwrapped within {reach} turns")
 
 
-SHARE = checked("from 0 to 1", lambda value: 0 <= value <= 1)
-PositiveEach = Annotated[Fact[tuple[float, ...]], checked("above 0", lambda value: value > 0)]
 Contrasts = Annotated[Fact[tuple[float, ...]], checked("above 0 and at most 1", lambda value: 0 < value <= 1)]
-ShareEach = Annotated[Fact[tuple[float, ...]], SHARE]
 Window = Annotated[Fact[int], checked("an odd number from 1 to 31", lambda value: 0 < value < 32 and value % 2 == 1)]
 Phases = Annotated[Fact[int], checked("3 or more, to tell phase, amplitude and offset apart", lambda value: value >= 3)]
 WIDEST_PX = 2128
@@ -119,10 +117,9 @@ WIDEST_PX = 2128
 
 
 class EmitterFacts(ConeFacts):
-    """The light source: a point beside the lens, uniform intensity in its cone.
-    ``irradiance_w_m2``: on a surface that faces it on the axis at 1 m; only ambient light is measured by it.
-    ``mask_slopes``: corners (x/z, y/z), counter-clockwise in the image's axes, of a convex polygon outside which the
-    camera gives no range."""
+    """The light source: a point beside the lens, uniform intensity in its cone. ``irradiance_w_m2``: on a surface that
+    faces it on the axis at 1 m; only ambient light is measured by it. ``mask_slopes``: corners (x/z, y/z),
+    counter-clockwise in the image's axes, of a convex polygon outside which the camera gives no range."""
 
     irradiance_w_m2: Positive
     mask_slopes: Fact[tuple[tuple[float, float], ...]] | None = None
@@ -131,10 +128,8 @@ class EmitterFacts(ConeFacts):
     def _mask_is_convex(self) -> EmitterFacts:
         if self.mask_slopes is not None:
             # corners of a convex area turn one way, counter-clockwise in axes x right, y down as the file has them
-            corners = np.array(self.mask_slopes.value)
-            sides = np.roll(corners, -1, axis=0) - corners
-            after = np.roll(sides, -1, axis=0)
-            if len(corners) < 3 or not (sides[:, 0] * after[:, 1] - sides[:, 1] * after[:, 0] > 0).all():
+            x, y = np.diff([*self.mask_slopes.value, *self.mask_slopes.value[:2]], axis=0).T
+            if len(x) < 4 or not (x[:-1] * y[1:] - y[:-1] * x[1:] > 0).all():
                 what = "mask_slopes must be the corners of a convex polygon, counter-clockwise in the image's axes"
                 raise ValueError(what)
         return self
@@ -255,10 +250,8 @@ class EngineFacts(OutputFacts):
     ``spatial_sigma_px``: Gaussian of the window; None is a box. A centre not brighter than ``dim_amplitude_units`` gets
     weights by distance alone; before a brighter one, dimmer neighbours are dropped where ``drop_dim_neighbours``.
     ``edge_threshold``: limit of the sum over the window of (1 - cos dphi)/2, in ``edges_in`` any of the frequencies or
-    in their mean; ``edges_to_dim``: whether it counts such dim neighbours.
-    ``amplitude_gains`` multiply each frequency's amplitude before all gates. ``limits_along``: of the limits of
-    range.
-    """
+    in their mean; ``edges_to_dim``: whether it counts such dim neighbours. ``amplitude_gains`` multiply each
+    frequency's amplitude before all gates. ``limits_along``: of the limits of range."""
 
     window_px: Window
     filter_on: Fact[Literal["unit_phasors", "phasors"]]
@@ -273,7 +266,7 @@ class EngineFacts(OutputFacts):
     edges_in: Fact[Literal["any", "mean"]]
     lattice_residual_turns: Positive | None = None
     residual_by_amplitude: ResidualByAmplitudeFacts | None = None
-    amplitude_ratio: Annotated[Fact[float], SHARE] | None = None
+    amplitude_ratio: Share | None = None
     min_amplitude_units: NonNegative
     min_amplitude_sum_units: NonNegative
     min_reflectivity_units_mm2: NonNegative | None = None

@@ -7,8 +7,7 @@ light and exposures that end early where the camera's file has them. Not modelle
 changes during a frame, cross-talk between pixels, in-pixel rejection of ambient light, gain switching, the steps in
 which exposures end, errors of phase that differ between frequencies other than harmonics, any post-processing beyond
 this. Tables of a unit's lens, emitter and phase offsets are exact; what real ones leave is the fixed pattern and the
-unit's offset.
-"""
+unit's offset."""
 
 from __future__ import annotations
 
@@ -26,7 +25,7 @@ from scenes.sensor.amcw.at_once import windows_of
 from scenes.sensor.amcw.facts import AmcwCamera, ScatterFacts, unwrap_table
 from scenes.sensor.camera import CameraConfig
 from scenes.sensor.normals import standard_normals
-from scenes.sensor.unit import DecodedFrame, light_of, rays_of, smooth_field, static_error_m
+from scenes.sensor.unit import DecodedFrame, UnitModel, light_of, rays_of, smooth_field
 
 f4 = np.float32
 HIGHEST_HARMONIC = 31  # harmonics above change the phase by less than 0.1 mrad in all
@@ -36,8 +35,7 @@ class AmcwExposure(NamedTuple):
     """Light of a view as the converter sees it before noise, in converter units, flat over n = h w pixels.
 
     ``means`` (f, k, n): noise-free samples; ``sigma`` (n,): deviation of each sample; ``limit`` (n,): the largest
-    sample that wells and converter hold, infinite where saturation is off; ``shape``: (h, w).
-    """
+    sample that wells and converter hold, infinite where saturation is off; ``shape``: (h, w)."""
 
     means: np.ndarray
     sigma: np.ndarray
@@ -45,52 +43,11 @@ class AmcwExposure(NamedTuple):
     shape: tuple[int, int]
 
 
-def exposure_of(
-    camera: AmcwCamera, config: CameraConfig, view: NoiseFreeView, gathered: np.ndarray, error_m: np.ndarray
-) -> AmcwExposure:
-    """Return the noise-free samples of a view. ``gathered`` (h, w): light that each pixel's optics gather, 1 on the
-    axis; ``error_m`` (h, w): errors of range that all frames share, put in as a delay of the light."""
-    photons, modulation, phases = camera.photons, camera.modulation, camera.modulation.phases.value
-    phasor, intensity = light_of(view, config.effects)
-    electrons = photons.signal_electrons.value * gathered
-    contrast = np.array(modulation.contrast.value)[:, None, None]
-    turns = np.array(camera.frequencies_hz)[:, None, None] * (2 * error_m / SPEED_OF_LIGHT_AIR)
-    signal = contrast * electrons * phasor * np.exp(2j * np.pi * turns)
-    if config.effects.wiggling:
-        signal = with_harmonics(signal, phases, np.array(modulation.wiggling_residual.value))
-    both_wells = electrons * intensity + ambient_electrons(camera, config, view, gathered)
-    # an exposure that ends early is scaled to the full length, and its noise with it
-    share = 1.0
-    if photons.exposure_ends_electrons is not None:
-        share = np.minimum(1.0, photons.exposure_ends_electrons.value / np.maximum(both_wells, 1e-9))
-    variance = both_wells / share + 2 * (photons.read_noise_electrons.value / share) ** 2
-    sigma = np.sqrt(variance) if config.effects.noise else np.zeros_like(variance)
-    # (f, k, h, w): the samples Re(S exp(-2 pi j k / N)) of the demodulated signal S (f, h, w) at N phases
-    steps = 2 * np.pi * np.arange(phases)[None, :, None, None] / phases
-    samples = signal.real[:, None] * np.cos(steps) + signal.imag[:, None] * np.sin(steps)
-    # the largest sample that fits: the fuller well holds half of both wells' electrons and half the sample
-    limit = np.full(both_wells.shape, np.inf)
-    if config.effects.saturation:
-        limit = np.full(both_wells.shape, float(camera.converter.full_scale_units.value))
-        if photons.full_well_electrons is not None:
-            room = 2 * photons.full_well_electrons.value / share - both_wells
-            limit = np.clip(room / photons.electrons_per_unit.value, 0, limit)
-    return AmcwExposure(
-        (samples / photons.electrons_per_unit.value).reshape(*samples.shape[:2], -1).astype(f4),
-        (sigma / photons.electrons_per_unit.value).ravel().astype(f4),
-        limit.ravel().astype(f4),
-        intensity.shape,
-    )
-
-
 def with_harmonics(signal: np.ndarray, phases: int, residual: np.ndarray) -> np.ndarray:
     """Return the signal (f, h, w) with the harmonics that N ``phases`` alias onto the fundamental, times ``residual``
-    (f,).
-
-    Square light under square demodulation correlates to a triangle: odd harmonics n of 1/n^2. N equidistant samples see
-    the n-th as the fundamental where n = +1 mod N, as its conjugate where n = -1. Approximation: a pixel that sees
-    several paths has the harmonics of their sum, not the sum of their harmonics.
-    """
+    (f,). Square light under square demodulation correlates to a triangle: odd harmonics n of 1/n^2. N equidistant
+    samples see the n-th as the fundamental where n = +1 mod N, as its conjugate where n = -1. Approximation: a pixel
+    that sees several paths has the harmonics of their sum, not the sum of their harmonics."""
     size = np.abs(signal)
     direction = np.divide(signal, size, out=np.zeros_like(signal), where=size > 0)
     apart = phases if phases % 2 == 0 else 2 * phases
@@ -100,25 +57,6 @@ def with_harmonics(signal: np.ndarray, phases: int, residual: np.ndarray) -> np.
         power = power * wave
         alias = alias + power.conj() / (centre - 1) ** 2 + power / (centre + 1) ** 2
     return np.asarray(signal * (1 + residual[:, None, None] * alias))
-
-
-def ambient_electrons(
-    camera: AmcwCamera, config: CameraConfig, view: NoiseFreeView, gathered: np.ndarray
-) -> np.ndarray:
-    """Return (h, w): electrons of daylight or lamps in both wells of one exposure; zeros where the effect is off.
-
-    There are as many as the emitter's own, times the ratio of irradiances within the filter's band, for light that
-    falls on the surface as the camera's own does. A pixel that sees several surfaces is taken to get its light from the
-    nearest.
-    """
-    if not config.effects.ambient:
-        return np.zeros(view.intensity.shape)
-    irradiance = config.ambient_uw_cm2_nm * UW_CM2 * camera.photons.band_nm.value
-    one_metre = camera.photons.signal_electrons.value * irradiance / camera.emitter.irradiance_w_m2.value
-    _, intensity = light_of(view, config.effects)
-    nearest_m = ndimage.minimum_filter(np.where(np.isfinite(view.range_m), view.range_m, np.inf), 3, mode="nearest")
-    range_m = np.where(view.coverage < 1, np.where(np.isfinite(nearest_m), nearest_m, 0.0), np.nan_to_num(view.range_m))
-    return np.asarray(one_metre * gathered * intensity * range_m**2)
 
 
 def scattered(image: np.ndarray, facts: ScatterFacts) -> np.ndarray:
@@ -144,13 +82,13 @@ def pixel_spans(lens: Lens) -> np.ndarray:
     return np.asarray(area * lens.fx * lens.fy)
 
 
-class AmcwImager:
+class AmcwImager(UnitModel[AmcwCamera]):
     """A camera of this kind on a region of its sensor: `expose` once per view, then `frame` for each exposure."""
 
     def __init__(self, camera: AmcwCamera, config: CameraConfig, region: Region, slopes: np.ndarray) -> None:
-        self.camera, self.config, self.region, self.slopes = camera, config, region, slopes
+        super().__init__(camera, config, region, slopes)
         phases = 2 * np.pi * np.arange(camera.modulation.phases.value) / camera.modulation.phases.value
-        self._cosines, self._sines = np.cos(phases).astype(f4), np.sin(phases).astype(f4)
+        self._waves = np.cos(phases).astype(f4), np.sin(phases).astype(f4)
         self.gains = np.array(camera.engine.amplitude_gains.value, f4)
         self.unwrap = unwrap_table(camera.frequencies_hz, camera.engine.fusion.value)
 
@@ -172,12 +110,8 @@ class AmcwImager:
         lens = self.camera.nominal_lens
         return pixel_spans(lens)[self.region.within(lens.whole)] / (1 + (self.slopes**2).sum(axis=-1)) ** 2
 
-    @cached_property
-    def static_error_m(self) -> np.ndarray:
-        """(h, w): all errors of range that frames of this unit share, before the filter."""
-        return static_error_m(self.camera, self.config, self.region, self.slopes, self._pattern_mm)
-
-    def _pattern_mm(self, rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
+    def pattern_mm(self, rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
+        """Draw smooth and pixel-wise errors of range, as before the filter."""
         facts = self.camera.fixed_pattern
         smooth, pixel = rng.standard_normal((2, *shape), dtype=f4)
         return facts.smooth_mm.value * smooth_field(smooth, facts.smooth_length_px.value) + facts.pixel_mm.value * pixel
@@ -188,7 +122,53 @@ class AmcwImager:
             light, facts = (view.phasor, view.phasor_direct, view.intensity), self.camera.scatter
             phasor, direct, intensity = (scattered(image, facts) for image in light)
             view = replace(view, phasor=phasor, phasor_direct=direct, intensity=intensity)
-        return exposure_of(self.camera, self.config, view, self.gathered, self.static_error_m)
+        camera, photons, phases = self.camera, self.camera.photons, self.camera.modulation.phases.value
+        phasor, intensity = light_of(view, self.config.effects)
+        electrons = photons.signal_electrons.value * self.gathered
+        contrast = np.array(camera.modulation.contrast.value)[:, None, None]
+        # errors of range that all frames share are put in as a delay of the light
+        turns = np.array(camera.frequencies_hz)[:, None, None] * (2 * self.static_error_m / SPEED_OF_LIGHT_AIR)
+        signal = contrast * electrons * phasor * np.exp(2j * np.pi * turns)
+        if self.config.effects.wiggling:
+            signal = with_harmonics(signal, phases, np.array(camera.modulation.wiggling_residual.value))
+        both_wells = electrons * intensity + self._ambient_electrons(view, intensity)
+        # an exposure that ends early is scaled to the full length, and its noise with it
+        share = 1.0
+        if photons.exposure_ends_electrons is not None:
+            share = np.minimum(1.0, photons.exposure_ends_electrons.value / np.maximum(both_wells, 1e-9))
+        variance = both_wells / share + 2 * (photons.read_noise_electrons.value / share) ** 2
+        sigma = np.sqrt(variance) if self.config.effects.noise else np.zeros_like(variance)
+        # (f, k, h, w): the samples Re(S exp(-2 pi j k / N)) of the demodulated signal S (f, h, w) at N phases
+        steps = 2 * np.pi * np.arange(phases)[None, :, None, None] / phases
+        samples = signal.real[:, None] * np.cos(steps) + signal.imag[:, None] * np.sin(steps)
+        # the largest sample that fits: the fuller well holds half of both wells' electrons and half the sample
+        limit = np.full(both_wells.shape, np.inf)
+        if self.config.effects.saturation:
+            limit = np.full(both_wells.shape, float(camera.converter.full_scale_units.value))
+            if photons.full_well_electrons is not None:
+                room = 2 * photons.full_well_electrons.value / share - both_wells
+                limit = np.clip(room / photons.electrons_per_unit.value, 0, limit)
+        return AmcwExposure(
+            (samples / photons.electrons_per_unit.value).reshape(*samples.shape[:2], -1).astype(f4),
+            (sigma / photons.electrons_per_unit.value).ravel().astype(f4),
+            limit.ravel().astype(f4),
+            intensity.shape,
+        )
+
+    def _ambient_electrons(self, view: NoiseFreeView, intensity: np.ndarray) -> np.ndarray:
+        """Return (h, w): electrons of daylight or lamps in both wells of one exposure; zeros where the effect is off.
+        There are as many as the emitter's own, times the ratio of irradiances within the filter's band, for light that
+        falls on the surface as the camera's own does. A pixel that sees several surfaces is taken to get its light from
+        the nearest."""
+        config, photons = self.config, self.camera.photons
+        if not config.effects.ambient:
+            return np.zeros(intensity.shape)
+        irradiance = config.ambient_uw_cm2_nm * UW_CM2 * photons.band_nm.value
+        one_metre = photons.signal_electrons.value * irradiance / self.camera.emitter.irradiance_w_m2.value
+        nearest_m = ndimage.minimum_filter(np.where(np.isfinite(view.range_m), view.range_m, np.inf), 3, mode="nearest")
+        nearest_m = np.where(np.isfinite(nearest_m), nearest_m, 0.0)
+        range_m = np.where(view.coverage < 1, nearest_m, np.nan_to_num(view.range_m))
+        return np.asarray(one_metre * self.gathered * intensity * range_m**2)
 
     def frame(self, exposure: AmcwExposure, rng: np.random.Generator, error_m: float = 0.0) -> DecodedFrame:
         """Draw a frame: noise from ``rng`` on the samples, then the depth engine; ``error_m`` displaces the frame."""
@@ -201,10 +181,7 @@ class AmcwImager:
         unit, amplitude = np.empty((2, n_frequencies, n), f4), np.empty((n_frequencies, n), f4)
         saturated = np.empty(n, np.uint8)
         normals, knee = standard_normals(rng, exposure.means.shape), f4(self.camera.converter.knee_units.value)
-        kernels.expose(
-            exposure.means, exposure.sigma, exposure.limit, normals, knee, self.gains, self._cosines, self._sines,
-            unit, amplitude, saturated,
-        )  # fmt: skip
+        kernels.expose(*exposure[:3], normals, knee, self.gains, *self._waves, unit, amplitude, saturated)
         return unit, amplitude, saturated
 
     def filter(self, unit: np.ndarray, amplitude: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -238,11 +215,9 @@ class AmcwImager:
     def filter_settings(self) -> kernels.FilterSettings:
         """The filter's settings in float32."""
         engine = self.camera.engine
-        half = engine.window_px.value // 2
-        space = np.ones((2 * half + 1, 2 * half + 1), f4)
-        if engine.spatial_sigma_px is not None:
-            gauss = np.exp(-(np.arange(-half, half + 1) ** 2) / (2 * engine.spatial_sigma_px.value**2))
-            space = np.outer(gauss, gauss).astype(f4)
+        half, sigma_px = engine.window_px.value // 2, engine.spatial_sigma_px
+        across = np.exp(-(np.arange(-half, half + 1) ** 2) / (2 * sigma_px.value**2 if sigma_px else np.inf))
+        space = np.outer(across, across).astype(f4)
         limits = f4(engine.concentration.value), f4(engine.dim_amplitude_units.value)
         by_amplitude = engine.filter_on.value == "phasors"
         rules = engine.drop_dim_neighbours.value, engine.edges_to_dim.value, by_amplitude

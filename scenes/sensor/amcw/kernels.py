@@ -1,7 +1,6 @@
 """Compiled inner loops of the continuous-wave imager up to the filtered phasor: exposure, phase-space filter.
 
-Each loop serves a full image and a list of pixels, of which `LANES` frames are done together. One core, float32.
-"""
+Each loop serves a full image and a list of pixels, of which `LANES` frames are done together. One core, float32."""
 
 from __future__ import annotations
 
@@ -37,8 +36,7 @@ def expose(  # type: ignore[no-untyped-def]
     converter units; ``normals`` (f, k, n); ``gains`` (f,); ``cosines`` and ``sines`` (k,) of the phases. Writes
     ``unit`` (2, f, n), ``amplitude`` (f, n) and ``saturated`` (n,). The difference of two wells, with Poisson shot
     noise and read noise of both, is taken as a normal, cut off at the limit, then companded. A pixel with a saturated
-    sample has no phasor.
-    """
+    sample has no phasor."""
     n_frequencies, n_phases, n = means.shape
     per_knee = ONE / knee
     saturated[:] = 0

@@ -3,11 +3,10 @@
 Before the filter noise turns a pixel's phasor and changes its amplitude (`Light`). The filtered phasor S is a sum over
 the window of s F(t), F = exp(i t - c (1 - cos t)), t = the neighbour's phase less its own. Noise of a neighbour turns t
 by a normal of variance v, so F acts as F + v F''/2 in the mean and, to first order, by its derivative F' + v F'''/2
-(Stein: E[f(x) x] = E[f'(x)] E[x^2]). The centre's noise is in all differences: over it the mean is taken last, of
-arg S, by three nodes. On a face of phase noise s the centre's own noise so counts more than by its weight, by some
-c s^2 of the window's sum, and a neighbour's less by c s^2.
-Terms of second and third order are left out and estimated; a pixel where they count is not for this module.
-"""
+(Stein: E[f(x) x] = E[f'(x)] E[x^2]). The centre's noise is in all differences: over it the mean is taken last, of arg
+S, by three nodes. On a face of phase noise s the centre's own noise so counts more than by its weight, by some c s^2 of
+the window's sum, and a neighbour's less by c s^2. Terms of second and third order are left out and estimated; a pixel
+where they count is not for this module."""
 
 from __future__ import annotations
 

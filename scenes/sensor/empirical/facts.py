@@ -11,7 +11,7 @@ from pydantic import model_validator
 from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import MM
 from scenes.optics import Optics
-from scenes.sensor.facts import CameraFacts, Fact, NonNegative, OutputFacts, Positive, checked
+from scenes.sensor.facts import CameraFacts, Fact, NonNegative, OutputFacts, Positive, PositiveEach, ShareEach, checked
 
 CARRIER_HZ = 1e6
 """Frequency whose phase tells the mean distance over a pixel's footprint, without ambiguity up to 150 m; complex64
@@ -19,8 +19,6 @@ rounds it by 2 um."""
 BLUR_REACH = 3.0
 """Deviations of the edge's kernel that a region needs as margin: 0.3 % of it lies beyond."""
 
-Values = Annotated[Fact[tuple[float, ...]], checked("above 0", lambda value: value > 0)]
-Shares = Annotated[Fact[tuple[float, ...]], checked("from 0 to 1", lambda value: 0 <= value <= 1)]
 Taps = Fact[tuple[float, ...]]
 """Taps of a causal filter; their squares sum to 1."""
 
@@ -39,8 +37,8 @@ class NoiseLawFacts(Config):
     of another brightness b, relative to it, has b^-``brightness_exponent`` times as much. ``rows`` and ``columns``:
     filters down and across, which give neighbours their correlation."""
 
-    range_mm: Values
-    sigma_mm: Values
+    range_mm: PositiveEach
+    sigma_mm: PositiveEach
     range_exponent: NonNegative
     brightness_exponent: NonNegative
     rows: Taps
@@ -58,8 +56,8 @@ class FilteredPatternFacts(Config):
 class DropoutFacts(Config):
     """Chance of no return in a frame: ``share`` at each of ``amplitude``, interpolated over its logarithm."""
 
-    amplitude: Values
-    share: Shares
+    amplitude: PositiveEach
+    share: ShareEach
 
 
 class EdgeKernelFacts(Config):

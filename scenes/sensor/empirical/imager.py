@@ -4,12 +4,10 @@ Modelled: noise that grows with range and darkness as measured, its correlation 
 the measured spectrum, dropouts by amplitude, smoothed depth and missing pixels at steps, displacements of whole frames,
 drift, rounding. Not modelled by measurement: light that met more than one surface (the direct light alone counts),
 shadows of an emitter or of a second lens, texture that a stereo camera needs, noise shared by successive frames, and
-dropouts that come in clusters. The effects multipath, wiggling, ambient and saturation change nothing.
-"""
+dropouts that come in clusters. The effects multipath, wiggling, ambient and saturation change nothing."""
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +19,7 @@ from scenes.sensor.camera import CameraConfig
 from scenes.sensor.empirical.facts import EmpiricalCamera
 from scenes.sensor.normals import standard_normals
 from scenes.sensor.tabled import filtered
-from scenes.sensor.unit import DecodedFrame, static_error_m
+from scenes.sensor.unit import DecodedFrame, UnitModel
 
 f4 = np.float32
 
@@ -36,24 +34,19 @@ class IdealRange(NamedTuple):
     chance: np.ndarray
 
 
-class EmpiricalImager:
+class EmpiricalImager(UnitModel[EmpiricalCamera]):
     """A camera of this kind on a region of its sensor: `expose` once per view, then `frame` for each exposure."""
 
     def __init__(self, camera: EmpiricalCamera, config: CameraConfig, region: Region, slopes: np.ndarray) -> None:
-        self.camera, self.config, self.region, self.slopes = camera, config, region, slopes
+        super().__init__(camera, config, region, slopes)
         self._stretch = np.sqrt(1 + (slopes**2).sum(axis=-1)).astype(f4)
         self._filters = [np.asarray(taps.value, f4) for taps in (camera.noise.rows, camera.noise.columns)]
 
-    @cached_property
-    def static_error_m(self) -> np.ndarray:
-        """(h, w): all errors of range that frames of this unit share; the fixed pattern has the measured spectrum."""
+    def pattern_mm(self, rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
+        """Draw a pattern with the measured spectrum."""
         facts = self.camera.fixed_pattern
-        taps = [np.asarray(each.value, f4) for each in (facts.rows, facts.columns)]
-
-        def pattern_mm(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
-            return filtered(rng.standard_normal(shape, dtype=f4), *taps) * facts.deviation_mm.value
-
-        return static_error_m(self.camera, self.config, self.region, self.slopes, pattern_mm)
+        taps = (np.asarray(each.value, f4) for each in (facts.rows, facts.columns))
+        return filtered(rng.standard_normal(shape, dtype=f4), *taps) * facts.deviation_mm.value
 
     def _sigma_m(self, range_m: np.ndarray, brightness: np.ndarray) -> np.ndarray:
         law = self.camera.noise
@@ -64,8 +57,7 @@ class EmpiricalImager:
 
     def expose(self, view: NoiseFreeView) -> IdealRange:
         """Return the range, noise and chances of a view that covers this region."""
-        camera, effects = self.camera, self.config.effects
-        direct = view.phasor_direct[0].astype(complex)
+        camera, direct = self.camera, view.phasor_direct[0].astype(complex)
         light = np.abs(direct)
         lit = light > 0
         phase = np.mod(np.angle(direct), 2 * np.pi)
@@ -76,8 +68,8 @@ class EmpiricalImager:
             sigma_m = np.where(lit, self._sigma_m(range_m, brightness), 0.0)
             level = np.log(np.where(lit, amplitude, camera.dropouts.amplitude.value[0]))
         chance = np.interp(level, np.log(camera.dropouts.amplitude.value), camera.dropouts.share.value)
-        if not effects.noise:
-            sigma_m, chance = np.zeros(lit.shape), np.zeros(lit.shape)
+        if not self.config.effects.noise:
+            sigma_m = chance = np.zeros(lit.shape)
         chance = np.where(lit, 1 - (1 - chance) * (1 - self._gap(range_m)), 1.0)
         range_m = self._blurred(range_m) + self.static_error_m
         return IdealRange(*(each.astype(f4) for each in (range_m, sigma_m, amplitude, chance)))

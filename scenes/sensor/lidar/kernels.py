@@ -2,8 +2,7 @@
 
 A code of period T correlates to a pulse that repeats with T, so its spectrum stands on the lines k / T. The view's
 phasors on that comb are the spectrum H of all paths of light within a beam, hence with weights W of the pulse c(t) =
-sum_k W_k Re(H_k exp(-2 pi i k t / T)) / sum_k W_k, whose single return of light a is a pulse of height a.
-"""
+sum_k W_k Re(H_k exp(-2 pi i k t / T)) / sum_k W_k, whose single return of light a is a pulse of height a."""
 
 from __future__ import annotations
 
@@ -94,8 +93,7 @@ def _peaks(
                     first, second = j, first
                 elif second < 0 or y > row[second]:
                     second = j
-        for rank in range(2):
-            at = first if rank == 0 else second
+        for rank, at in enumerate((first, second)):
             angle, top, bend = 0.0, NO_PEAK, 1.0
             if at >= 0:
                 angle, top, bend = _refined(spectrum[i], at * spacing, spacing)
@@ -157,8 +155,7 @@ def noise_peaks(  # type: ignore[no-untyped-def]
     """Let the highest maximum of the noise over one period win where it exceeds the return; flat indices ``weak``. A
     level of x deviations is crossed upwards rate * exp(-x^2 / 2) times in a period (Rice); taken as Poisson, the
     highest maximum has P(< x) = exp(-rate exp(-x^2 / 2)). ``averaged``: what the mean over neighbours leaves of the
-    noise before the peak is looked for. ``bandwidth_m``: deviation of half the path at one noise
-    deviation."""
+    noise before the peak is looked for. ``bandwidth_m``: deviation of half the path at one noise deviation."""
     w = noise.shape[1]
     for i in range(weak.size):
         v, u = weak[i] // w, weak[i] % w
@@ -179,8 +176,7 @@ def smooth(  # type: ignore[no-untyped-def]
 
     ``half_m``, ``share``, ``height`` (h + 2 p, w + 2 q), with a border of p and q at least r where the taps reach: half
     path; weight of what agreed so far; strength. ``gate_m`` (h, w): how far a neighbour's half path may differ. Writes
-    the mean half path, the weight and the strength of those that agree, (h, w) each.
-    """
+    the mean half path, the weight and the strength of those that agree, (h, w) each."""
     h, w = gate_m.shape
     p, q, r = (half_m.shape[0] - h) // 2, (half_m.shape[1] - w) // 2, taps.size // 2
     zero = np.float32(0)
@@ -212,8 +208,7 @@ def gated(  # type: ignore[no-untyped-def]
     ``share``, ``height``: weight and strength of the neighbours that agree; ``everyone``: weight of all within the
     picture. A pixel whose agreeing neighbours are too small a share is invalid. Half the path s by a receiver at e
     gives the range r = (4 s^2 - e.e) / (4 s - 2 u.e) along the unit ray u; ``along_m`` is u.e, ``cosine`` u_z.
-    ``limits``: e.e, least strength, least agreeing share, least and greatest range, step.
-    """
+    ``limits``: e.e, least strength, least agreeing share, least and greatest range, step."""
     h, w = cosine.shape
     e2, least, alike, nearest, farthest, step = limits
     for v in range(h):

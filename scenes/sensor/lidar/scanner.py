@@ -6,8 +6,7 @@ noise after an average over neighbours; integration over more than one point's t
 ripples of a unit; smoothing among agreeing neighbours; confidence threshold, least range, saturation; the receiver
 beside the transmitter; rounding. Not modelled: wiggling and the edge gate (those effects change nothing), side lobes of
 the real code, the mirror's uneven speed and errors of direction, the beam's width changing with distance, drift over
-seconds, light of other lidars, motion, walk error with amplitude, and the vendor's own filters beyond these.
-"""
+seconds, light of other lidars, motion, walk error with amplitude, and the vendor's own filters beyond these."""
 
 from __future__ import annotations
 
@@ -24,7 +23,7 @@ from scenes.sensor.lidar import kernels
 from scenes.sensor.lidar.facts import ScannedLidar
 from scenes.sensor.lidar.kernels import Peaks, strongest_peaks
 from scenes.sensor.normals import standard_normals
-from scenes.sensor.unit import DecodedFrame, light_of, rays_of, smooth_field, static_error_m
+from scenes.sensor.unit import DecodedFrame, UnitModel, light_of, rays_of, smooth_field
 
 f4 = np.float32
 BLOCK_ROWS = 16  # rows whose correlations are held at once: 16 rows of 1,024 pixels take 8 MB
@@ -47,11 +46,11 @@ class LidarReturns(NamedTuple):
     weak: np.ndarray
 
 
-class LidarScanner:
+class LidarScanner(UnitModel[ScannedLidar]):
     """A camera of this kind on a region of its raster: `expose` once per view, then `frame` for each exposure."""
 
     def __init__(self, camera: ScannedLidar, config: CameraConfig, region: Region, slopes: np.ndarray) -> None:
-        self.camera, self.config, self.region, self.slopes = camera, config, region, slopes
+        super().__init__(camera, config, region, slopes)
         # weights of the points along a column whose light one point integrates
         self.smear = smear_weights(camera.integration_points)
         # a slope's error over the curvature is the place's error; the noise has the pulse's own spectrum
@@ -66,16 +65,10 @@ class LidarScanner:
         range_m = engine.min_range_mm.value * MM, camera.unambiguous_m, camera.z_step_m
         self._limits = tuple(map(f4, (*least, *range_m)))
 
-    @cached_property
-    def static_error_m(self) -> np.ndarray:
-        """(h, w): all errors of range that frames of this unit share; the fixed pattern is smooth ripples."""
-        facts = self.camera.fixed_pattern
-
-        def ripples_mm(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
-            white = rng.standard_normal(shape, dtype=f4)
-            return smooth_field(white, facts.smooth_length_px.value) * facts.smooth_mm.value
-
-        return static_error_m(self.camera, self.config, self.region, self.slopes, ripples_mm)
+    def pattern_mm(self, rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
+        """Draw smooth ripples of range."""
+        facts, white = self.camera.fixed_pattern, rng.standard_normal(shape, dtype=f4)
+        return smooth_field(white, facts.smooth_length_px.value) * facts.smooth_mm.value
 
     @cached_property
     def averaged(self) -> float:
@@ -140,9 +133,7 @@ class LidarScanner:
             normals = standard_normals(rng, (3, h + len(taps) - 1, w))
             kernels.correlate_along_columns(normals, taps)
             sweep_m = standard_normals(rng, (w,)) * f4(camera.scan.sweep_jitter_mm.value * MM)
-        kernels.stronger_peak(
-            exposure.height, exposure.half_m, exposure.deviation_m, exposure.noise, normals, sweep_m, *won
-        )
+        kernels.stronger_peak(*exposure[:4], normals, sweep_m, *won)
         # the Cramer-Rao bound of a delay in white noise through the matched filter, at a height of one noise deviation
         bound_m = camera.unambiguous_m / (camera.period_s * camera.bandwidth_rad_s)
         rates = self.slope, bound_m, camera.unambiguous_m
@@ -159,9 +150,8 @@ class LidarScanner:
             for bordered_image, result in zip(image, smoothed, strict=True):
                 bordered_image[inner] = result
         z_m, strength, reason = np.empty((h, w), f4), np.empty((h, w), f4), np.empty((h, w), np.uint8)
-        kernels.gated(
-            *smoothed, everyone, *self._geometry, exposure.saturated, self._limits, f4(error_m), z_m, reason, strength
-        )
+        scene = *self._geometry, exposure.saturated, self._limits, f4(error_m)
+        kernels.gated(*smoothed, everyone, *scene, z_m, reason, strength)
         return DecodedFrame(z_m, reason, strength)
 
 
