@@ -24,14 +24,10 @@ from scenes.sensor.camera import NO_EFFECTS, CameraConfig, camera_of, number_pat
 from scenes.sensor.source import SimulatedUnit
 from scenes.target import custom
 
-LEAST_DRAWS = 48
-"""Frames drawn with and without the damage, at least: they tell how much noisier the damage makes a pixel."""
-FINEST_STEP_MM = 1e-3
-"""Rounding step of the frames drawn; that of the recording is in its own range already."""
-BEYOND_PX = 2
-"""Pixels beyond the reach of the camera's filter about the damage's rim that may change."""
-AROUND_PX = 8
-"""Pixels of the small board beyond those: its rim disturbs both renders alike."""
+LEAST_DRAWS = 48  # frames drawn with and without the damage: they tell how much noisier it makes a pixel
+FINEST_STEP_MM = 1e-3  # rounding step of the frames drawn; that of the recording is in its own range already
+BEYOND_PX = 2  # pixels beyond the reach of the camera's filter about the damage's rim that may change
+AROUND_PX = 8  # pixels of the small board beyond those: its rim disturbs both renders alike
 
 
 @dataclass(frozen=True)
@@ -71,8 +67,7 @@ def unit_config(name: str, lens: Lens) -> tuple[CameraConfig, bool]:
     return CameraConfig(name=name, effects=effects, numbers={k: v for k, v in numbers.items() if k in known}), same
 
 
-KINDS = ("holes", "dents", "flaws")
-"""Lists of a declaration that hold damage."""
+KINDS = ("holes", "dents", "flaws")  # lists of a declaration that hold damage
 
 
 def local_board(

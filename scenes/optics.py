@@ -14,8 +14,7 @@ from scipy.special import ndtri
 from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import SPEED_OF_LIGHT_AIR, Lens, Region
 
-FWHM_PER_DEVIATION = 2 * np.sqrt(2 * np.log(2))
-"""Full width at half maximum of a Gaussian by its standard deviation."""
+FWHM_PER_DEVIATION = 2 * np.sqrt(2 * np.log(2))  # of a Gaussian
 
 
 @dataclass(frozen=True)
@@ -61,12 +60,9 @@ def wave_numbers(frequencies_hz: tuple[float, ...]) -> np.ndarray:
     return 2 * np.pi * np.array(frequencies_hz, float) / SPEED_OF_LIGHT_AIR
 
 
-COARSE = 4
-"""Sub-rays per side on a smooth surface: the midpoint rule leaves 1e-4 mm."""
-FINE = 256
-"""Sub-rays where a footprint meets an edge: one of them is 0.4 % of a step."""
-BEAM_REACH = 3.0
-"""Standard deviations of a beam within which an edge is looked for: 1 % of the light lies beyond."""
+COARSE = 4  # sub-rays per side on a smooth surface: the midpoint rule leaves 1e-4 mm
+FINE = 256  # sub-rays where a footprint meets an edge: one of them is 0.4 % of a step
+BEAM_REACH = 3.0  # deviations of a beam within which an edge is looked for: 1 % of the light lies beyond
 GOLDEN = (np.sqrt(5) - 1) / 2
 
 

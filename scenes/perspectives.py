@@ -29,11 +29,9 @@ def check_in_view(config: TargetConfig, optics: Optics) -> None:
     if not len(centres) or not optics.lens.images(centres).any():  # where damage is in view, a part of the face is
         seen_region(config, optics)
         if len(centres):
-            raise UserError(
-                f"none of the target's {len(centres)} damages is in view of {optics.title}",
-                legal="one damage or more in view; those out of view are not counted as targets",
-                fix="change target.pose, or move the damage",
-            )
+            message = f"none of the target's {len(centres)} damages is in view of {optics.title}"
+            legal = "one damage or more in view; those out of view are not counted as targets"
+            raise UserError(message, legal=legal, fix="change target.pose, or move the damage")
     range_m = face[..., 2] if optics.limits_along == "axis" else np.sqrt((face**2).sum(axis=-1))
     if range_m.max() < optics.nearest_m or range_m.min() > optics.farthest_m:
         raise UserError(
@@ -49,11 +47,8 @@ def seen_region(config: TargetConfig, optics: Optics) -> Region:
     lens, face = optics.lens, _face_before_lens(config).reshape(-1, 3)
     in_view = lens.images(face)
     if not in_view.any():
-        raise UserError(
-            f"the target is out of view of {optics.title}",
-            legal="a part of the face in view",
-            fix="move the target towards the axis (offset) or turn it to the camera (tilt)",
-        )
+        fix = "move the target towards the axis (offset) or turn it to the camera (tilt)"
+        raise UserError(f"the target is out of view of {optics.title}", legal="a part of the face in view", fix=fix)
     if not in_view.all():
         return lens.whole
     uv = lens.project(face)

@@ -212,7 +212,7 @@ def test_the_pixels_that_are_simulated_one_by_one_are_those_that_frames_lose():
     valid = np.isfinite(z_m).mean(axis=0)
     summer = unit.at_once
     assert summer is not None
-    on_list = summer.listed[unit.cut]
+    on_list = np.isin(np.arange(summer.linear.z.size), summer.listed).reshape(summer.shape)[unit.cut]
     assert on_list[(valid > 0) & (valid < 1)].all()
     assert not on_list[groups_of(unit)["face"]].any()
     assert on_list.mean() < 0.25

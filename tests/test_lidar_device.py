@@ -91,7 +91,7 @@ def stepped(step_m: float) -> NoiseFreeView:
 def test_smoothing_keeps_a_step_of_30_mm_and_blurs_one_of_4_mm():
     kept = z_of(SimulatedUnit(CAMERA, QUIET, stepped(0.030)))[0]
     blurred = z_of(SimulatedUnit(CAMERA, QUIET, stepped(0.004)))[0]
-    edge = 30 - CAMERA.margin_px
+    edge = 30 - CAMERA.optics.margin_px
     assert kept[:, edge - 1] == pytest.approx(1.0, abs=0.13e-3)
     assert kept[:, edge] == pytest.approx(1.030, abs=0.13e-3)
     taps = CAMERA.smoothing_taps[1]
@@ -154,7 +154,7 @@ def test_five_pixels_in_a_row_are_invalid_and_three_by_three_are_not():
     camera = changed({"code.integration_ns": 1e-3})
     unit = SimulatedUnit(camera, QUIET, mixed(view, other, share))
     frame = next(iter(unit.capture(1, 1).frames()))
-    m = camera.margin_px
+    m = camera.optics.margin_px
     assert (frame.reason[20 - m, 20 - m : 25 - m] == Reason.EDGE).all()
     assert frame.z_m[30 - m : 33 - m, 20 - m : 23 - m] == pytest.approx(1.8, abs=0.13e-3)
     assert (frame.reason != Reason.VALID).sum() == 5

@@ -36,7 +36,7 @@ from scenes.target.thesis import ThesisTargetConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 CAMERA = load_camera("azure_kinect_nfov")
-EMITTER = CAMERA.emitter_position_m
+EMITTER = CAMERA.optics.emitter_m
 WAVE = 2 * np.pi * np.array(CAMERA.frequencies_hz) / SPEED_OF_LIGHT_AIR
 
 
@@ -141,7 +141,7 @@ def test_hole_walls_shadow_the_floor():
     data = CAMERA.to_data()
     data["emitter"]["position_mm"]["value"] = [-100.0, 0.0, 1.0]
     camera = AmcwCamera.from_data(data)
-    emitter = camera.emitter_position_m
+    emitter = camera.optics.emitter_m
     grid = np.linspace(-0.019, 0.019, 41)
     x, y = (a.ravel() for a in np.meshgrid(grid, grid))
     keep = np.hypot(x, y) < 0.0185

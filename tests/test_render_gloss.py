@@ -16,7 +16,7 @@ from scenes.sensor.camera import load_camera
 from scenes.target.mesh import TargetPart
 
 CAMERA = load_camera("azure_kinect_nfov")
-EMITTER = CAMERA.emitter_position_m
+EMITTER = CAMERA.optics.emitter_m
 
 
 def quad(name: str, corners: list[list[float]], albedo: float, gloss: tuple[float, float]) -> TargetPart:

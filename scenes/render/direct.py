@@ -13,21 +13,16 @@ from scipy import ndimage
 from scenes.optics import COARSE, FINE, Beams, Quadrilaterals, wave_numbers
 from scenes.render.scene import LitScene
 
-FINEST = 2048
-"""Sub-rays where that still leaves an error in a hole: a dark wall beside a strip of what lies behind."""
-RAYS_AT_ONCE = 1 << 22
-"""Sub-rays cast at once: 4 million take 0.6 GB."""
+FINEST = 2048  # sub-rays where that leaves an error in a hole: a dark wall beside a strip of what lies behind
+RAYS_AT_ONCE = 1 << 22  # sub-rays cast at once: 4 million take 0.6 GB
 KINK_M, BENT_M = 2e-5, 2e-6
 """A pixel whose corners leave the plane at its centre by more than the first has an edge in it, such as that of a strip
 of tape; up to the second its light follows from that plane, without casting sub-rays."""
-UNSURE_M = 1e-4
-"""Pixels whose direct light may be wrong by more are divided once more."""
-UNEVEN = 0.2
-"""Relative spread of direct light in a footprint from which on a shadow's edge is taken to be in it."""
+UNSURE_M = 1e-4  # pixels whose direct light may be wrong by more are divided once more
+UNEVEN = 0.2  # relative spread of direct light in a footprint from which on a shadow's edge is taken to be in it
 FAST: Any = {"cache": True, "fastmath": {"contract", "reassoc", "nsz"}, "nogil": True}
 """Options of compilation; sums are float64, whose order moves a range by 1e-14 m."""
-COMB_TOLERANCE = 1e-9
-"""Unevenness, relative to the highest frequency, up to which a comb is summed by a recurrence."""
+COMB_TOLERANCE = 1e-9  # unevenness, by the highest frequency, up to which a comb is summed by a recurrence
 Footprint = Quadrilaterals | Beams
 Frequencies = tuple[float, ...]
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -27,24 +26,17 @@ from scenes.target.mesh import Target
 from scenes.target.truth import face_of
 
 BATCHES = 8
-PATHS_A_LANE = 64
-"""Enough that lanes end together although paths differ in length, few enough that a small job fills the machine."""
-NOISE_LINES = 4
-"""Lines of a comb of many that tell what noise does to range: paths are the same for all lines."""
-PER_VERTEX = 2
-"""Low-discrepancy dimensions at each vertex: a direction."""
+PATHS_A_LANE = 64  # enough that lanes end together, few enough that a small job fills the machine
+NOISE_LINES = 4  # lines of a comb of many that tell what noise does to range: paths are the same for all lines
+PER_VERTEX = 2  # low-discrepancy dimensions at each vertex: a direction
 START_DIMENSIONS = 2
 CELLS, PROBES, OFTEN = 16, 2, 0.9
 """Cells along each side of the square of first directions from the face, probes along each side of a cell, and share
 of paths that begin in cells in which a probe met something; the rest begin anywhere, so that nothing is left out."""
-FLOATS_AT_ONCE = 1 << 26
-"""Results held on the device at once: 0.25 GB."""
-FACE_WITHIN_M = 0.001 * MM
-"""The board's vertices so near its undamaged face lie on it: Booleans in double precision leave them within 1 nm."""
-MESH_WITHIN_M = 0.05 * MM
-"""The same of a part from a mesh, whose heights stand on a grid."""
-ABOVE_FACE_M = 1 * MM
-"""Height of the nodes, so that tape does not bury them."""
+FLOATS_AT_ONCE = 1 << 26  # results held on the device at once: 0.25 GB
+FACE_WITHIN_M = 0.001 * MM  # vertices so near the undamaged face lie on it: Booleans leave them within 1 nm
+MESH_WITHIN_M = 0.05 * MM  # the same of a part from a mesh, whose heights stand on a grid
+ABOVE_FACE_M = 1 * MM  # height of the nodes, so that tape does not bury them
 
 
 @dataclass(frozen=True)
@@ -99,7 +91,7 @@ def gather_at_points(
         point, origin, direction, seen = drawn(place, u1, u2)
         return point, origin, direction, seen / dr.gather(mi.Float, density, cell)
 
-    return _gather(lambda longest: _Walk(lit, start, work, True, bright, longest), np.full(len(points_m), samples))
+    return _gather(lit, start, work, np.full(len(points_m), samples), True, bright)
 
 
 def gather_in_pixels(lit: LitScene, rays: OffFace, work: PathWork, samples: int | np.ndarray) -> np.ndarray:
@@ -118,8 +110,7 @@ def gather_in_pixels(lit: LitScene, rays: OffFace, work: PathWork, samples: int 
         slopes = (dr.gather(mi.Float, each, which) for each in (across, down))
         return mi.Point3f(0.0), mi.Point3f(0.0), dr.normalize(mi.Vector3f(*slopes, 1.0)), 1.0
 
-    counts_of_paths = np.broadcast_to(np.asarray(samples), rays.pixel.shape)
-    return _gather(lambda longest: _Walk(lit, start, work, False, None, longest), counts_of_paths)
+    return _gather(lit, start, work, np.broadcast_to(np.asarray(samples), rays.pixel.shape), False)
 
 
 def range_noise_m(batches: np.ndarray, total: np.ndarray, frequencies_hz: tuple[float, ...]) -> np.ndarray:
@@ -132,9 +123,8 @@ def range_noise_m(batches: np.ndarray, total: np.ndarray, frequencies_hz: tuple[
 
 
 def range_change_m(change: np.ndarray, total: np.ndarray, frequencies_hz: tuple[float, ...]) -> np.ndarray:
-    """Return what a small change (..., f, n) of phasors ``total`` (f, n) does to range, (..., n); 0 without light. A
-    change dH turns the phase by Im(dH / H); frequencies are fused with the least-squares weights c f_k / (4 pi sum
-    f^2)."""
+    """Return what a small change (..., f, n) of phasors ``total`` (f, n) does to range, (..., n); 0 without light.
+    Phases turn by Im(dH / H) and are fused with the least-squares weights c f_k / (4 pi sum f^2)."""
     f = np.array(frequencies_hz)[:, None]
     weights = SPEED_OF_LIGHT_AIR * f / (4 * np.pi * (f**2).sum())
     by_light = np.divide(weights, total, out=np.zeros(total.shape, complex), where=np.abs(total) > 0)
@@ -196,12 +186,10 @@ class _Walk:
     """Paths from places, backwards. ``start`` (place, u1, u2): point from which the path's length counts, origin,
     direction and weight of the first ray. ``on_surface``: light that reaches the first hit directly counts (for a start
     at the lens it is the direct part), and all places share one rotation of the low-discrepancy points (modulo 1).
-    ``bright``: as of `gather_at_points`. ``longest``: points a batch at most. What differs from board to board is data
-    and no constant of the kernel, which would be compiled anew for each."""
+    ``bright``: as of `gather_at_points`. ``longest``: points a batch at most. What differs from board to board is data,
+    as a constant of the kernel would compile it anew."""
 
-    def __init__(
-        self, lit: LitScene, start: Any, work: PathWork, on_surface: bool, bright: np.ndarray | None, longest: int
-    ) -> None:
+    def __init__(self, lit: LitScene, start: Any, work: PathWork, on_surface: bool, bright: Any, longest: int) -> None:
         import drjit as dr
 
         self.lit, self.start, self.work, self.on_surface, mi = lit, start, work, on_surface, lit.mi
@@ -287,15 +275,16 @@ class _Walk:
         return u - dr.floor(u)
 
 
-def _gather(walk: Callable[[int], _Walk], samples: np.ndarray) -> np.ndarray:
-    """Walk ``samples`` (n,) paths from each place by ``walk`` (points a batch at most); returns the light
-    (BATCHES, f + 1, n) complex64 of each batch, frequency 0 (intensity) last. Phase counts from the place of gathering
-    on. Units as in `NoiseFreeView`, without the place's albedo where the start was a surface point, with it where the
-    start was the lens. Cosine-weighted directions cancel cos/pi of a Lambertian surface, so each bounce multiplies by
-    its albedo and, where it is glossy, by `LitScene.lobe`."""
+def _gather(
+    lit: LitScene, start: Any, work: PathWork, samples: np.ndarray, on_surface: bool, bright: Any = None
+) -> np.ndarray:
+    """Walk ``samples`` (n,) paths from each place (other arguments: `_Walk`); returns the light (BATCHES, f + 1, n)
+    complex64 of each batch, frequency 0 (intensity) last. Phase counts from the place of gathering on. Units as in
+    `NoiseFreeView`, with the place's albedo where the start was the lens. Cosine-weighted directions cancel cos/pi of a
+    Lambertian surface, so each bounce multiplies by its albedo and, where it is glossy, by `LitScene.lobe`."""
     per_batch = np.maximum(samples // BATCHES, 1)
-    walked = walk(int(per_batch.max()))
-    lines, to_device = len(walked.work.frequencies_hz), walked.lit.mi.UInt32
+    walked = _Walk(lit, start, work, on_surface, bright, int(per_batch.max()))
+    lines, to_device = len(work.frequencies_hz), lit.mi.UInt32
     # lanes for so many paths a batch at each place, and where those of each place and batch begin
     per_pair = np.repeat(-(-per_batch // PATHS_A_LANE), BATCHES)
     begins = np.cumsum(per_pair) - per_pair
@@ -343,9 +332,9 @@ def face_triangles(target: Target) -> list[np.ndarray]:
 def face_light(
     lit: LitScene, target: Target, direct: DirectLight, slopes: np.ndarray, work: PathWork, config: RenderConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return indirect light by way of the face in the pixels that see any of it: mean (f + 1, n), and batches (B, l, n)
-    at the frequencies of `noise_lines`. Pixels in the order of `numpy.nonzero` of ``direct.face[-1]``. What a node
-    would see of a hole is taken as if the face were whole: on a flat face it sees none."""
+    """Return indirect light by way of the face in the pixels that see any of it, in the order of `numpy.nonzero` of
+    ``direct.face[-1]``: mean (f + 1, n), and batches (B, l, n) at the frequencies of `noise_lines`. Nodes see no holes
+    in the face."""
     seen = direct.face[-1].real > 0
     rays = np.concatenate([slopes[seen], np.ones((int(seen.sum()), 1))], axis=-1)
     rays *= (direct.face_range_m[seen] / np.linalg.norm(rays, axis=-1))[..., None]
@@ -373,8 +362,8 @@ def face_light(
 
 def between_nodes(nodes_x: np.ndarray, nodes_y: np.ndarray, x: np.ndarray, y: np.ndarray) -> sparse.csr_array:
     """Return bilinear weights (n, len(nodes_y) len(nodes_x)) of evenly spaced nodes, row by row, at n places between
-    them. Light that left its last surface a distance D away bends over a spacing s by (s/D)^2/8 of itself: 2e-3 at 80
-    mm and 0.7 m, of a part that is itself some per cent of the whole."""
+    them. Light from a surface a distance D away bends over a spacing s by (s/D)^2/8 of itself: 2e-3 at 80 mm and 0.7 m.
+    """
     columns, parts = len(nodes_x), []
     for nodes, values in ((nodes_x, x), (nodes_y, y)):
         place = (values - nodes[0]) / (nodes[1] - nodes[0])
@@ -387,17 +376,14 @@ def between_nodes(nodes_x: np.ndarray, nodes_y: np.ndarray, x: np.ndarray, y: np
     return sparse.csr_array((weight.ravel(), index.ravel(), starts), shape=(len(x), columns * len(nodes_y)))
 
 
-RIM_PX = 3
-"""Pixels of surroundings rendered beyond the board's outline, so that its rim looks as on the whole sensor."""
-NEAR_PX = 3
-"""Pixels beyond the outline up to which edges behind the board are finely divided: a camera's filter mixes these in."""
+RIM_PX = 3  # surroundings rendered beyond the board's outline, so that its rim looks as on the whole sensor
+NEAR_PX = 3  # beyond the outline, where edges behind the board are finely divided: a camera's filter mixes these in
 HOLE_RIM_PX = 1
 NARROW = ("through", "blind", "slot", "gouge", "chip")
 """Kinds of damage that may lie between a pixel's corners and its centre."""
 PILOT_SAMPLES = 128
 """Paths that tell a pixel's noise, within a third; half as many miss the rare bright ones far behind a hole."""
-PILOT_SEED = 1 << 20
-"""Offset that keeps those apart from the ones that count."""
+PILOT_SEED = 1 << 20  # offset that keeps those apart from the ones that count
 
 
 def target_region(target: Target, optics: Optics) -> Region:
@@ -459,9 +445,8 @@ def indirect_light(
     inside: np.ndarray,
     config: RenderConfig,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return indirect phasors (f + 1, h, w) and their noise in metres of range (h, w). By way of the face from its
-    nodes; by way of all else by paths through the pixel's own sub-rays, ``inside`` (h, w) the board's outline with as
-    many as their noise asks for."""
+    """Return indirect phasors (f + 1, h, w) and their noise in metres of range (h, w): of the face from its nodes, of
+    all else by paths through the pixel's sub-rays, as many as their noise asks for ``inside`` (h, w) the outline."""
     frequencies, shape = optics.frequencies_hz, direct.range_m.shape
     indirect = np.zeros((len(frequencies) + 1, direct.range_m.size), complex)
     variance = np.zeros(direct.range_m.size)
@@ -490,8 +475,8 @@ def indirect_light(
 def _samples_inside(
     lit: LitScene, rays: OffFace, total: np.ndarray, work: PathWork, config: RenderConfig
 ) -> int | np.ndarray:
-    """Return how many paths bring a pixel inside the outline down to ``hole_noise_mm``, as a few of them tell. The few
-    are thrown away: kept, they would tie a pixel's light to its own number of paths and bias the mean."""
+    """Return how many paths bring a pixel inside the outline down to ``hole_noise_mm``, as a few of them tell, which
+    are thrown away: kept, they would bias the mean."""
     if config.hole_samples <= PILOT_SAMPLES:
         return config.hole_samples
     pilot = gather_in_pixels(lit, rays, dataclasses.replace(work, seed=work.seed + PILOT_SEED), PILOT_SAMPLES)

@@ -24,14 +24,11 @@ from scenes.sensor.lidar.facts import ScannedLidar
 from scenes.sensor.source import SimulatedUnit
 
 ONLY_NOISE = CameraConfig(effects=NO_EFFECTS.model_copy(update={"noise": True, "ambient": True}))
-HALF_PX = {"amcw_imager": (24, 40), "scanned_lidar": (32, 32), "empirical": (32, 32)}
-"""Half height and width of the plane in pixels, by kind of camera."""
+HALF_PX = {"amcw_imager": (24, 40), "scanned_lidar": (32, 32), "empirical": (32, 32)}  # of the plane, down and across
 RANGE_OF_ELECTRONS = {"amcw_imager": (50.0, 200_000.0), "scanned_lidar": (1e3, 1e5)}
-FRAMES = {"amcw_imager": 200, "scanned_lidar": 100}
-"""Frames of some 3,000 pixels with common noise, which give a gain to 0.5 %."""
+FRAMES = {"amcw_imager": 200, "scanned_lidar": 100}  # of some 3,000 pixels with common noise: a gain to 0.5 %
 
-PhotonCamera = AmcwCamera | ScannedLidar
-"""Cameras whose noise follows from a photon budget."""
+PhotonCamera = AmcwCamera | ScannedLidar  # noise follows from a photon budget
 Camera = TypeVar("Camera", bound=AnyCamera)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
@@ -25,9 +25,7 @@ from scenes.sensor.empirical.facts import EmpiricalCamera
 from scenes.sensor.lidar.facts import ScannedLidar
 
 CAMERA_FOLDER = Path(__file__).resolve().parent.parent / "cameras"
-
-DEEPEST = 5
-"""Cameras that are each ``like`` the next."""
+DEEPEST = 5  # cameras that are each ``like`` the next
 GROUP = "tofpod.cameras"  # its entry points name the path of a camera's file, called as the entry point is
 CAMERAS = PlugIns(
     GROUP,
@@ -68,23 +66,20 @@ class CameraConfig(Config):
     name: str = Field(
         "azure_kinect_nfov",
         description="a file of scenes/cameras/ without its ending, a camera of an installed package, or the path of a "
-        "camera's own .yaml file, from the experiment's folder",
+        ".yaml file, from the experiment's folder",
     )
     unit_seed: int = Field(1, ge=0, description="which unit: its fixed pattern is drawn from this seed")
     effects: EffectsConfig = EffectsConfig()
     fixed_pattern_scale: float = Field(1.0, ge=0, le=100, description="times the file's fixed pattern; 0: off")
     edge_gate: bool = Field(True, description="whether the engine's edge threshold, whose rule is inferred, acts")
-    ambient_uw_cm2_nm: float = Field(
+    ambient_uw_cm2_nm: Annotated[float, Field(ge=0, le=200)] = Field(
         0.04,
-        ge=0,
-        le=200,
         description="irradiance by daylight or lamps at the camera's wavelength, microwatts per square centimetre and "
         "nanometre; 0.04 is a room with 50 lux of daylight, 0.4 at a window (500 lux of sunlight), 80 full sun",
     )
     minutes_since_power_on: float = Field(60.0, ge=0, le=1e5, description="how far the unit has warmed up")
     numbers: dict[str, Any] = Field(
-        default_factory=dict,
-        description="numbers of the camera's file to replace, such as lens.fx_px: 505.1, for one's own unit",
+        {}, description="numbers of the camera's file to replace, such as lens.fx_px: 505.1, for one's own unit"
     )
 
     def __hash__(self) -> int:
@@ -208,10 +203,10 @@ def _completed(source: Source, depth: int = 0) -> Source:
     name = source.data.get("like")
     if name is None:
         return source
-    place = source.place_of(("like",))
     if not isinstance(name, str) or depth == DEEPEST:
         message = "`like` is not the name of a camera" if depth < DEEPEST else f"`like` leads on {DEEPEST} times"
-        raise DeclarationError(source.origin, [Problem(message, place, legal=f"one of {', '.join(camera_names())}")])
+        problem = Problem(message, source.place_of(("like",)), legal=f"one of {', '.join(camera_names())}")
+        raise DeclarationError(source.origin, [problem])
     beside = Path(source.origin).parent / name
     base = _completed(read_yaml(beside if is_camera_path(name) else camera_file(name)), depth + 1)
     found = replace(source, data={key: value for key, value in base.data.items() if key != "modes"})

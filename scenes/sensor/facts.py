@@ -134,10 +134,10 @@ class ModeFacts(Config):
 
 
 class UnitFacts(Config):
-    """Differences of a unit from the nominal camera as a whole, and of its frames from each other. ``offset_mm``:
-    deviation between units of a constant error of range. ``drift_mm`` exp(-t / ``drift_min``): error of range after
-    power-on, greater by ``drift_ramp`` of itself per unit of x/z. ``jump_rate``: share of frames that are displaced as
-    a whole by ``jump_mm`` (its sign by chance); ``jitter_mm``: deviation of a small displacement of every frame."""
+    """Differences of a unit from the nominal camera, and of its frames from each other. ``offset_mm``: deviation
+    between units of a constant error of range. ``drift_mm`` exp(-t / ``drift_min``): error of range after power-on,
+    greater by ``drift_ramp`` of itself per unit of x/z. ``jump_rate``: share of frames displaced as a whole by
+    ``jump_mm`` of either sign; ``jitter_mm``: deviation of a small displacement of every frame."""
 
     frames_per_second: Positive
     offset_mm: NonNegative
@@ -149,11 +149,30 @@ class UnitFacts(Config):
     jitter_mm: NonNegative
 
 
+class SmoothPatternFacts(Config):
+    """Fixed pattern, the same in every frame of a unit: a smooth error of range."""
+
+    smooth_mm: NonNegative
+    smooth_length_px: LengthPx
+
+
 class OutputFacts(Config):
     """Least range that a camera gives, and the step of the stored z."""
 
     min_range_mm: NonNegative
     output_step_mm: Positive
+
+
+class LimitFacts(OutputFacts):
+    """Limits of range."""
+
+    max_range_mm: Positive
+
+    @model_validator(mode="after")
+    def _range_is_left(self) -> Self:
+        if self.min_range_mm.value >= self.max_range_mm.value:
+            raise ValueError("min_range_mm must be less than max_range_mm")
+        return self
 
 
 class ConeFacts(Config):
@@ -218,8 +237,7 @@ def distorted_slope(slope: np.ndarray, distortion: tuple[float, ...]) -> np.ndar
 
 
 def unfolded_slope(distortion: tuple[float, ...]) -> float:
-    """Return the largest distorted slope up to which radial distortion grows with the true one; infinite where it
-    always does within `STEEPEST`."""
+    """Return the largest distorted slope up to which radial distortion grows with the true one, or infinity."""
     distorted = distorted_slope(np.linspace(0.0, STEEPEST, 6001), distortion)
     with np.errstate(invalid="ignore"):
         back = np.flatnonzero(~(np.diff(distorted) > 0))

@@ -13,10 +13,8 @@ import numpy as np
 
 
 class DepthNoise:
-    """Noise of one unit of a camera whose images are (h, w).
-
-    ``table``: the arrays of the camera's file, or its path. ``slopes`` (h, w, 2): x/z and y/z of each pixel; None takes
-    the camera's own nominal lens. ``seed``: which unit."""
+    """Noise of one unit of a camera whose images are (h, w). ``table``: the arrays of the camera's file, or its path.
+    ``slopes`` (h, w, 2): x/z and y/z of each pixel; None takes the camera's own nominal lens. ``seed``: which unit."""
 
     def __init__(self, table, slopes=None, seed=1):  # type: ignore[no-untyped-def]
         self.table = table = _loaded(table)
@@ -30,9 +28,8 @@ class DepthNoise:
         self.pattern_m = table["pattern_m"] * filtered(white, table["pattern_rows"], table["pattern_columns"])
 
     def __call__(self, z_m, intensity, rng):  # type: ignore[no-untyped-def]
-        """Return one frame (h, w) float32, NaN without a return, from the ideal distance along the axis ``z_m`` (h, w)
-        metres and ``intensity`` (h, w): albedo times the cosine of the angle of incidence. ``rng``: a NumPy
-        Generator."""
+        """Return a frame (h, w) float32, NaN without a return, from the ideal distance along the axis ``z_m`` (h, w)
+        metres and ``intensity`` (h, w): albedo times the cosine of the incidence. ``rng``: a NumPy Generator."""
         table, range_m = self.table, np.asarray(z_m, np.float32) * self.stretch
         with np.errstate(divide="ignore", invalid="ignore"):
             level = np.log2(self.falloff * np.asarray(intensity, np.float32) / (range_m * range_m))

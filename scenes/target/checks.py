@@ -13,20 +13,13 @@ from scenes.target.flaws import ChipConfig, FlawConfig, PressedConfig, border, o
 from scenes.target.part import part_of
 from scenes.target.truth import Face, backing_corners_board_m, face_grid_m, face_of, relief_points, widest_rim_m
 
-STEEPEST_SLOPE = 4 / 3
-"""dz/dx and dz/dy of a face, 53 degrees: a round face reaches 0.8 of its radius. Steeper, the size in plan misleads."""
-THICKEST_BEND = 0.5
-"""Thickness over the smallest radius of curvature; the back face folds up at 1."""
-WIDEST_BEND = 0.25
-"""A damage's radius over the smallest radius of curvature at its centre: the truth's volumes are good to its square."""
-SHALLOWEST_BEND = 0.5
-"""A dent's ball's radius over the same: at 1 a face that bends away from the camera has no rim."""
-MOST_TURN = 0.8
-"""Cosine between the face's normals at a flaw's centre and at its rim: depth counts along the first."""
-LEAST_WEB_MM = 0.01
-"""Web between two damages or a damage and the edge: a circle's polygon sticks out by 2.5 um at 1 in."""
-NEAREST_M = 0.05
-"""Least distance of the board from the lens plane."""
+STEEPEST_SLOPE = 4 / 3  # dz/dx and dz/dy of a face, 53 degrees: a round face reaches 0.8 of its radius
+THICKEST_BEND = 0.5  # thickness over the smallest radius of curvature; the back face folds up at 1
+WIDEST_BEND = 0.25  # a damage's radius over the radius of curvature there: the truth's volumes are good to its square
+SHALLOWEST_BEND = 0.5  # the radius of a dent's ball over the same: at 1 a face that bends away has no rim
+MOST_TURN = 0.8  # cosine between the face's normals at a flaw's centre, along which depth counts, and at its rim
+LEAST_WEB_MM = 0.01  # between two damages or a damage and the edge: a circle's polygon sticks out by 2.5 um at 1 in
+NEAREST_M = 0.05  # least distance of the board from the lens plane
 _TURN = np.linspace(0, 2 * np.pi, 64, endpoint=False)
 _CIRCLE = np.column_stack([np.cos(_TURN), np.sin(_TURN)])
 

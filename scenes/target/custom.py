@@ -8,7 +8,7 @@ fields are checked here; what concerns several together (a hole that leaves the 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -20,8 +20,7 @@ from harness.vocabulary.geometry import MM, rotation_xyz_deg
 from harness.vocabulary.meshes import FileUnit, FrontAxis
 from scenes.target.flaws import AnyFlawConfig, Coordinate, FlawConfig, PlacedConfig, PlaceMm
 
-NEAR_NM = 20.0
-"""An albedo holds this far around its wavelength: over it wood and paint change by a per cent or two (a guess)."""
+NEAR_NM = 20.0  # an albedo holds so far around its wavelength: wood and paint change by a per cent or two (a guess)
 Albedo = Annotated[float, Field(ge=0.0, le=1.0)]
 Rgb = tuple[Albedo, Albedo, Albedo]
 Length = Annotated[float, Field(ge=1.0, le=1e4)]
@@ -98,8 +97,7 @@ class PanelConfig(Config):
 class RoughConfig(Config):
     """A flat face with random roughness, as of concrete, and a flat back. Heights are Gaussian; their power spectrum in
     two dimensions is (k^2 + k_outer^2)^-(1 + H), k_outer = 2 pi / ``outer_mm``, up to 2 pi / ``inner_mm``: self-affine
-    between the two lengths (Persson et al., J. Phys.: Condens. Matter 17 (2005) R1). Pores and gravel are not modelled.
-    """
+    between both (Persson et al., J. Phys.: Condens. Matter 17 (2005) R1). Pores and gravel are not modelled."""
 
     kind: Literal["rough"]
     deviation_mm: Annotated[float, Field(gt=0.0, le=20.0)] = Field(0.3, description="standard deviation of the heights")
@@ -164,8 +162,8 @@ class DamageConfig(PlacedConfig):
 
     @property
     def mouth_m(self) -> float:
-        """Radius in metres of what is missing of a flat face."""
-        return self.radius_m
+        """Radius in metres of what is missing of a flat face, a chamfer included."""
+        return self.radius_m + getattr(self, "chamfer_mm", 0.0) * MM
 
     @property
     def reach_mm(self) -> float:
@@ -185,11 +183,6 @@ class DrillConfig(Config):
 class HoleConfig(DrillConfig, DamageConfig):
     """A drilled cylinder, its axis along the face's normal at its centre. A blind hole has a flat bottom."""
 
-    @property
-    def mouth_m(self) -> float:
-        """Radius in metres of what is missing of the face, chamfer included."""
-        return self.radius_m + self.chamfer_mm * MM
-
     @model_validator(mode="after")
     def _depth_where_blind(self) -> Self:
         if self.kind == "blind" and self.depth_mm is None:
@@ -202,12 +195,8 @@ class HoleConfig(DrillConfig, DamageConfig):
 class DentConfig(DamageConfig):
     """A spherical cap: rim diameter and depth as a ball would leave them on a flat face."""
 
+    kind: ClassVar[Literal["dent"]] = "dent"
     depth_mm: Annotated[float, Field(ge=0.04, le=500.0)]
-
-    @property
-    def kind(self) -> Literal["dent"]:
-        """Kind of damage, as `HoleConfig` has it."""
-        return "dent"
 
     @property
     def ball_m(self) -> float:
@@ -316,9 +305,8 @@ class PoseConfig(Config):
 
     @property
     def T_camera_board(self) -> np.ndarray:
-        """4x4: board to camera. The board is turned in its own axes (x, then y, then z), then set before the lens.
-        Positive ``tilt_x_deg`` brings the upper edge nearer, positive ``tilt_y_deg`` the -x edge, positive ``roll_deg``
-        lifts the +x edge."""
+        """4x4: board to camera. The board is turned in its own axes (x, then y, then z). Positive ``tilt_x_deg`` brings
+        the upper edge nearer, positive ``tilt_y_deg`` the -x edge, positive ``roll_deg`` lifts the +x edge."""
         T_camera_board = np.eye(4)
         turned = rotation_xyz_deg(self.tilt_x_deg, self.tilt_y_deg, self.roll_deg)
         T_camera_board[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ turned
@@ -387,12 +375,9 @@ class TargetConfig(Config):
             )
         albedos = min(near, key=lambda albedos: abs(albedos.wavelength_nm - wavelength_nm))
         room = self.room
-        surfaces = {
-            "tape": bool(self.tapes),
-            "backing": self.backing is not None,
-            "floor": room is not None and room.floor_below_lens_m is not None,
-            "back_wall": room is not None and room.back_wall_distance_m is not None,
-        }
+        surfaces: dict[str, Any] = {"tape": self.tapes, "backing": self.backing}
+        if room is not None:
+            surfaces |= {"floor": room.floor_below_lens_m, "back_wall": room.back_wall_distance_m}
         lacking = [name for name, there in surfaces.items() if there and getattr(albedos, name) is None]
         if lacking:
             raise UserError(

@@ -27,12 +27,9 @@ from scenes.target.checks import LEAST_WEB_MM, SHALLOWEST_BEND, WIDEST_BEND, off
 from scenes.target.truth import OUTLINE_STEPS, backing_corners_board_m, face_grid_m, face_of, outline_board_m
 
 Purpose = Literal["learning", "calibration", "hole_free", "damaged"]
-"""Purpose of boards: for detectors to learn on, to set a threshold, to count false calls, to be inspected; each has
-boards of its own."""
-NEAREST_M, FARTHEST_M = 0.1, 10.0
-"""Limits of a pose's distance, jitter included."""
-WIDEST_BACKING_MM = 1e4
-"""Widest backing that a declaration allows."""
+"""For detectors to learn on, to set a threshold, to count false calls, to be inspected: each has boards of its own."""
+NEAREST_M, FARTHEST_M = 0.1, 10.0  # limits of a pose's distance, jitter included
+WIDEST_BACKING_MM = 1e4  # that a declaration allows
 ATTEMPTS, TRIES = 50, 400
 """Boards begun anew, and places tried for each damage: where discs ``apart_mm`` wide are to cover 40 % of the free area
 (random placement reaches 54.7 % at most), one attempt in three or more fills a board."""
@@ -161,36 +158,24 @@ class DrawnTargetConfig(Config):
     board. Limits named ``..._mm`` and ``..._deg`` of the pose are the ends of uniform distributions about 0."""
 
     name: Literal["drawn"] = "drawn"
-    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = Field(
-        default=1, description="of the boards; an experiment's own seed draws the noise, and another keeps the boards"
-    )
+    seed: flaws.Seed = Field(1, description="of the boards; an experiment's own seed draws the noise")
     damage: AnyDrawn
     board: custom.BoardConfig = Field(
-        default_factory=lambda: custom.BoardConfig(
-            width_mm=304.8, height_mm=203.2, thickness_mm=12.7, shape=custom.FlatConfig()
-        ),
+        custom.BoardConfig(width_mm=304.8, height_mm=203.2, thickness_mm=12.7, shape=custom.FlatConfig()),
         description="the thesis' plywood, of 12 x 8 in: as many pixels as its board of 24 x 4.5 in, fewer at the edge",
     )
     apart_mm: Annotated[float, Field(gt=0.0, le=1e4)] = Field(
-        default=40.0,
-        description="least distance of two centres in plan: more than twice a hit radius of 15 mm, so that no finding "
-        "can count for either",
+        40.0, description="least distance of two centres in plan; more than twice a hit radius: no finding counts twice"
     )
     edge_mm: Annotated[float, Field(ge=LEAST_WEB_MM, le=1e4)] = Field(
-        default=15.0,
-        description="least distance of a rim from the board's edge, off which a crop takes 6 mm at 0.7 m and 12 mm at "
-        "1.5 m: what lies there is missed for its place, not for its size",
+        15.0, description="least distance of a rim from the board's edge, off which a crop takes 6 to 12 mm"
     )
     tapes: Annotated[tuple[custom.TapeConfig, ...], Field(max_length=100)] = Field((), description="of all boards")
     distance_m: Annotated[float, Field(ge=NEAREST_M, le=FARTHEST_M)] = 0.7
     distance_jitter_mm: Jitter = Field(default=10.0, description="so that a limit does not hang on a step of range")
-    offset_mm: Annotated[float, Field(ge=0.0, le=5e3)] = Field(
-        default=20.0, description="sideways and upwards: 14 pixels at 0.7 m, so that all parts of a pixel are met"
-    )
-    tilt_deg: Annotated[float, Field(ge=0.0, le=70.0)] = Field(
-        default=8.0, description="about x and about y: as far off frontal as is plausible for a sheet put up by hand"
-    )
-    roll_deg: Annotated[float, Field(ge=0.0, le=90.0)] = Field(default=2.0, description="a board is set down by eye")
+    offset_mm: Annotated[float, Field(ge=0.0, le=5e3)] = Field(20.0, description="sideways and upwards")
+    tilt_deg: Annotated[float, Field(ge=0.0, le=70.0)] = Field(8.0, description="about x and y: a sheet put up by hand")
+    roll_deg: Annotated[float, Field(ge=0.0, le=90.0)] = Field(2.0, description="a board is set down by eye")
     material: custom.ReflectanceConfig = Field(custom.ReflectanceConfig(), description="each board has its own grain")
     backing: custom.BackingConfig | None = Field(
         default=custom.BackingConfig(distance_mm=20.0), description="without a size it fills every hole in every pose"
@@ -291,14 +276,10 @@ class DrawnTargetConfig(Config):
         if isinstance(board.shape, custom.RoughConfig):
             own = {"seed": int(stream("roughness").integers(2**32))}
             board = board.model_copy(update={"shape": board.shape.model_copy(update=own)})
-        config = custom.TargetConfig(
-            board=board,
-            **common,
-            material=custom.MaterialConfig(
-                **self.material.model_dump(), grain_seed=int(stream("grain").integers(2**32))
-            ),
-            pose=self._posed(*within("distance", self.distance_jitter_mm, 1), *pose),
-        )
+        grain_seed = int(stream("grain").integers(2**32))
+        material = custom.MaterialConfig(**self.material.model_dump(), grain_seed=grain_seed)
+        placed = self._posed(*within("distance", self.distance_jitter_mm, 1), *pose)
+        config = custom.TargetConfig(board=board, material=material, pose=placed, **common)
         if self.backing is None or self.backing.size_mm is not None:
             return config
         # a backing that fills every hole: the face's shadow on it from the lens, in the extreme poses
@@ -312,9 +293,8 @@ class DrawnTargetConfig(Config):
         rolls = [self.roll_deg, *(roll for roll in (diagonal_deg, 90 - diagonal_deg) if roll < self.roll_deg)]
         limits = (self.distance_jitter_mm, self.offset_mm, self.offset_mm, self.tilt_deg, self.tilt_deg)
         signed = ((-limit, limit) if limit else (0.0,) for limit in limits)
-        return tuple(
-            self._posed(*c) for c in product(*signed, dict.fromkeys(s * roll for roll in rolls for s in (-1, 1)))
-        )
+        both_rolls = dict.fromkeys(sign * roll for roll in rolls for sign in (-1, 1))
+        return tuple(self._posed(*corner) for corner in product(*signed, both_rolls))
 
     def _places_mm(self, rng: np.random.Generator) -> np.ndarray:
         """Draw (per_board, 2) centres in plan by random sequential placement, uniform on what is free: apart from one
@@ -346,8 +326,7 @@ class DrawnTargetConfig(Config):
         )
 
     def _edge_places_mm(self, rng: np.random.Generator) -> np.ndarray:
-        """Draw (per_board, 3): points on the board's edges in plan, apart from one another and off the corners, each
-        with the edge's angle as a chip has it."""
+        """Draw (per_board, 3): points on the board's edges in plan, apart and off corners, with the edge's angle."""
         half = np.array([self.board.width_mm, self.board.height_mm]) / 2
         corner_mm, places = self.damage.widest_mm / 2 + LEAST_WEB_MM, np.empty((0, 3))
         for _ in range(ATTEMPTS * TRIES):
@@ -378,8 +357,7 @@ def _dent_depths_mm(diameter_mm: float, bend_per_mm: float) -> tuple[float, floa
 
 @lru_cache(maxsize=256)
 def _tightest_per_mm(board: custom.BoardConfig) -> float:
-    """Return a face's largest curvature; 0 where its shape does not reach, which `check_target` tells, and of a rough
-    face, whose back is flat."""
+    """Return a face's largest curvature; 0 of a rough face or a mesh, and where its shape does not reach."""
     if face_of(board).rough or isinstance(board.shape, custom.MeshConfig):
         return 0.0
     x_m, y_m = face_grid_m(board, steps=OUTLINE_STEPS)[..., :2].reshape(-1, 2).T

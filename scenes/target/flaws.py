@@ -29,12 +29,9 @@ Extent = Annotated[float, Field(ge=0.05, le=2e3)]
 Depth = Annotated[float, Field(gt=0.0, le=500.0)]
 Angle = Annotated[float, Field(ge=-180.0, le=180.0)]
 Seed = Annotated[int, Field(ge=0, le=2**63 - 1)]
-ALONG, ACROSS = 96, 24
-"""Cells of an elongated damage's grid; profiles are piecewise linear between them, to 0.1 % of the volume."""
-ROUND = 64
-"""Cells along each side of a round damage's grid: volume within 0.1 %."""
-CHIP_ARC = 0.998
-"""Part of a chip's half-length that its grid spans: at the very tips it would have no width."""
+ALONG, ACROSS = 96, 24  # cells of an elongated damage's grid: volume within 0.1 %
+ROUND = 64  # cells along each side of a round damage's grid: volume within 0.1 %
+CHIP_ARC = 0.998  # part of a chip's half-length that its grid spans: at the very tips it would have no width
 
 
 @dataclass(frozen=True)
@@ -193,9 +190,8 @@ class CorrosionConfig(_FlawConfig):
 
 
 class ChipConfig(_FlawConfig):
-    """Material missing at the board's edge (a chip, a spall): a quarter of an ellipsoid about a point of the edge,
-    which is its centre. ``angle_deg`` is the edge's: 0 top, 90 left, 180 bottom, -90 right. The limit is of its
-    length."""
+    """Material missing at the board's edge (a chip, a spall): a quarter of an ellipsoid about a point of the edge.
+    ``angle_deg`` is the edge's: 0 top, 90 left, 180 bottom, -90 right. The limit is of its length."""
 
     kind: Literal["chip"]
     size_of: ClassVar[str] = "length"

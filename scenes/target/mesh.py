@@ -40,10 +40,8 @@ from scenes.target.truth import (
 if TYPE_CHECKING:
     import trimesh
 
-TEXEL_MM = 0.6
-"""Finer than a pixel's footprint (1.4 mm at 0.7 m for the finest camera in view), coarse enough to make in 40 ms."""
-MAX_TEXELS = 4096
-"""Most texels along a side: a board of metres gets coarser texels instead of gigabytes."""
+TEXEL_MM = 0.6  # finer than a pixel's footprint (1.4 mm at 0.7 m for the finest camera), made in 40 ms
+MAX_TEXELS = 4096  # along a side: a board of metres gets coarser texels instead of gigabytes
 MOST_IMAGE_BYTES = 1 << 28
 LINE_WEIGHT, FIBRE_WEIGHT = 0.8, 0.6
 """Amplitudes of growth lines and fibres in the pattern (their squares add to 1). A guess, as are the lengths below."""
@@ -82,8 +80,7 @@ def reflectance(pattern: np.ndarray, mean: float, contrast: float) -> np.ndarray
 
 
 def image_pattern(file: str) -> np.ndarray:
-    """Return an image's brightness in linear light over its mean, less 1: (rows, columns), `MAX_TEXELS` at most. Raises
-    UserError for what is no image or black."""
+    """Return an image's brightness in linear light over its mean, less 1: (rows, columns), `MAX_TEXELS` at most."""
     import cv2
 
     try:
@@ -116,23 +113,18 @@ def _normalised(values: np.ndarray) -> np.ndarray:
 
 COARSEST_SAGITTA_M, FINEST_SAGITTA_M = 2e-6, 0.1e-6
 """Largest distance of facets from a bent face: well under a camera's noise, finer below shallow dents (depth / 400)."""
-ROUGH_SAGITTA_M = 8e-5
-"""The same of a rough face, at its sharpest crest; elsewhere a tenth of it, far below the roughness itself."""
-TAPE_SINK_M = 0.1e-3
-"""Depth of a strip's underside in the board, so that no two surfaces coincide."""
+ROUGH_SAGITTA_M = 8e-5  # the same at the sharpest crest of a rough face; elsewhere a tenth of it
+TAPE_SINK_M = 0.1e-3  # depth of a strip's underside in the board, so that no two surfaces coincide
 CORNER_M = 4e-6
 """Distance by which the corners of a circle's polygon may stand outside it; sides lie half as far inside, and both have
 the same area. A render's rays take the longer the more sides there are: 2 mm get 28, 1 in 104."""
-RINGS = 48
-"""Steps of a dent's profile from pole to rim: volume short by 1 / (3 RINGS^2) = 0.014 %."""
+RINGS = 48  # steps of a dent's profile from pole to rim: volume short by 1 / (3 RINGS^2) = 0.014 %
 CELL_M, MOST_ALONG = 0.03, 64
 """Longest edge of a damaged board's triangles, and the number of these along its sides from which on they are longer.
 Triangles from the facets of a hole to the board's corners would take rays twice as long to pass, and a renderer in
 float32 misses their plane by the length squared over the width times 1e-7, 0.1 mm at 1 m."""
-SPARE_M = 0.2 * MM
-"""Least distance by which a cutter reaches beyond the face."""
-MAX_CELLS = 1_000_000
-"""Most cells of a bent sheet: some 300 MB."""
+SPARE_M = 0.2 * MM  # least distance by which a cutter reaches beyond the face
+MAX_CELLS = 1_000_000  # of a bent sheet: some 300 MB
 
 
 @dataclass(frozen=True)
@@ -160,9 +152,8 @@ class TargetPart:
 
 @dataclass(frozen=True)
 class Target:
-    """A built target. ``parts``: "board", then "tape_1".., "backing", "floor", "back_wall" as declared. ``truth``:
-    all damage in its order. ``outline_board_m`` (n, 3): the rim of the face, counter-clockwise seen from the camera.
-    ``T_camera_board`` (4, 4)."""
+    """A built target. ``parts``: "board", then "tape_1".., "backing", "floor", "back_wall" as declared. ``truth``: all
+    damage in its order. ``outline_board_m`` (n, 3): the face's rim, counter-clockwise seen from the camera."""
 
     config: TargetConfig
     parts: tuple[TargetPart, ...]
@@ -186,11 +177,10 @@ def build_target(config: TargetConfig) -> Target:
     plan = mesh.vertices[:, :2] / (board.width_mm * MM, board.height_mm * MM)
     mesh.apply_transform(T_camera_board)
     uv = texture_850 = texture_rgb = None
-    if material.texture is not None or material.grain_contrast != 0:
+    if (image := material.texture) is not None or material.grain_contrast != 0:
         uv = np.clip(np.column_stack([0.5 + plan[:, 0], 0.5 - plan[:, 1]]), 0.0, 1.0)
-        pattern, contrast = grain(material, board.width_mm, board.height_mm), material.grain_contrast
-        if material.texture is not None:
-            pattern, contrast = image_pattern(material.texture.file), 1.0
+        pattern = grain(material, board.width_mm, board.height_mm) if image is None else image_pattern(image.file)
+        contrast = material.grain_contrast if image is None else 1.0
         texture_850 = reflectance(pattern, material.albedo_850, contrast)
         texture_rgb = np.stack([reflectance(pattern, mean, contrast) for mean in material.rgb], axis=-1)
     rgb = np.array(material.rgb)
@@ -230,8 +220,7 @@ def board_solid(config: TargetConfig, truth: tuple[Damage, ...]) -> trimesh.Trim
     if isinstance(config.board.shape, MeshConfig):
         body = trimesh.Trimesh(*part_of(config.board.shape), process=False)
     else:
-        sagitta_m = _sagitta_m(config)
-        body = sheet(face, size_m, 0.0, -thickness_m, sagitta_m, flat_back=face.rough)
+        body = sheet(face, size_m, 0.0, -thickness_m, _sagitta_m(config), flat_back=face.rough)
     for damage, item in zip(truth, config.damages, strict=True):
         if isinstance(item, FlawConfig):
             more, less = solids_of(item, face, thickness_m)
@@ -327,7 +316,7 @@ def cutter(damage: Damage, declared: HoleConfig | DentConfig) -> trimesh.Trimesh
 
     depth_m, radius_m = damage.depth_m, declared.radius_m
     # A face or back that bends to a radius of twice the damage's lies 0.27 radius off the tangent plane at the rim.
-    spare_m = 0.2 * MM + 0.5 * radius_m
+    spare_m = SPARE_M + 0.5 * radius_m
     if isinstance(declared, DentConfig):
         # a ball from pole to rim and on above the face, then straight up, then a lid
         ball_m, middle_m = declared.ball_m, declared.ball_m - depth_m

@@ -17,10 +17,8 @@ from scenes.target import custom
 from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.part import MeshTargetConfig
 
-THICKNESS_MM = 12.7
-"""Half an inch (stated)."""
-DIAMETERS_IN = (1 / 16, 1 / 8, 3 / 16, 1 / 4, 5 / 16, 3 / 8, 7 / 16, 1 / 2, 5 / 8, 3 / 4, 1.0)
-"""Holes 1 to 11 (stated, Table I)."""
+THICKNESS_MM = 12.7  # half an inch (stated)
+DIAMETERS_IN = (1 / 16, 1 / 8, 3 / 16, 1 / 4, 5 / 16, 3 / 8, 7 / 16, 1 / 2, 5 / 8, 3 / 4, 1.0)  # stated, Table I
 Degrees = Annotated[float, Field(ge=-70.0, le=70.0)]
 NonNegativeMm = Annotated[float, Field(ge=0.0, le=5e3)]
 

@@ -18,27 +18,22 @@ from scenes.target import custom
 from scenes.target.flaws import FlawConfig, border, closed_grid, outside_m, volume_m3
 from scenes.target.part import front_derivatives, part_of
 
-OUTLINE_STEPS = 64
-"""Points along each side of the outline."""
-LINE_STEP = 8
-"""Columns of a flaw's grid between two points of its centre line."""
-OPEN_FLOOR_M = 3.0
-"""Reach of a floor without a back wall: beyond it, light returns under 1 % of the board's at 0.7 m."""
-ORDERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
-"""Derivatives in x and y, in the order in which a face gives them."""
+OUTLINE_STEPS = 64  # points along each side of the outline
+LINE_STEP = 8  # columns of a flaw's grid between two points of its centre line
+OPEN_FLOOR_M = 3.0  # reach of a floor without a back wall: beyond it, light returns under 1 % of the board's at 0.7 m
+ORDERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # of a face's derivatives in x and y
 _UNIT_CORNERS = np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
 
 
 @dataclass(frozen=True)
 class Face:
     """A smooth height field with z(0, 0) = 0. ``derivatives`` gives z and its derivatives (`ORDERS`), each of the shape
-    of x and y, NaN beyond its reach. Arguments of the methods broadcast."""
+    of x and y, NaN beyond its reach, ``height`` z alone where that is much quicker. Of a ``rough`` face slope and
+    curvature at one place say nothing of the places around it. Arguments of the methods broadcast."""
 
     derivatives: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
     rough: bool = False
-    """Slope and curvature at one place say nothing of the face around it."""
     height: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
-    """Function for z alone, where that is much quicker."""
 
     def _derived(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, ...]:
         return self.derivatives(*np.broadcast_arrays(np.asarray(x_m, float), np.asarray(y_m, float)))
@@ -151,8 +146,7 @@ def face_of(board: custom.BoardConfig) -> Face:
     return Face(polynomial)
 
 
-ROUGH_MARGIN_M, ROUGH_STEPS = 0.02, 4
-"""Margin of a rough face beyond the board, and knots of its spline to its shortest wavelength."""
+ROUGH_MARGIN_M, ROUGH_STEPS = 0.02, 4  # beyond the board; knots of the spline to the shortest wavelength
 
 
 def _rough_face(shape: custom.RoughConfig, size_m: tuple[float, float]) -> Face:

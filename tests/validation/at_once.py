@@ -110,7 +110,7 @@ def main(arguments: list[str]) -> int:
             for group, pixels in (
                 ("even", kind == EVEN),
                 ("uneven", kind == UNEVEN),
-                ("listed", summer.listed[unit.cut]),
+                ("listed", np.isin(np.arange(summer.linear.z.size), summer.listed).reshape(summer.shape)[unit.cut]),
             ):
                 print(f"{name}, {board}, {group} {row(pixels, frames, at_once)}", flush=True)
     return 0

@@ -158,7 +158,7 @@ def simulate(wall: Wall, camera: AmcwCamera, albedo: float, config: CameraConfig
     """As many frames of the wall's plane as were recorded: z in metres, (n, h, w)."""
     lens = camera.nominal_lens
     distance_m, slope_x, slope_y = wall.plane
-    outer = wall.region.grown(camera.margin_px, lens.height, lens.width)
+    outer = wall.region.grown(camera.optics.margin_px, lens.height, lens.width)
     unit = SimulatedUnit(camera, config, plane_view(camera, outer, distance_m, albedo, slope_x, slope_y))
     cut = wall.region.within(unit.region)
     frames = unit.capture(len(wall.z_m), 1, "walls", wall.name, config.unit_seed).frames()

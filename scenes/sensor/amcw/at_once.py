@@ -2,13 +2,12 @@
 
 `at_once` sorts the pixels of a view, once. Where all gates are sure to let a pixel through and noise acts to first
 order, z is a moving sum of one normal a pixel, displaced and rounded in each frame; where a gate is sure to stop it,
-nothing is drawn; all others, at rims mostly, go through the whole chain with the windows that they need. Frames are
-independent, so sums over parts of a capture add up. Not as in a frame: amplitudes have their own noise, independent of
-that of z (in frames their correlation is 0.1 at most); a pixel without a range has, in all its frames, the reason that
-its mean has; variance of second order (2.5 % at most) is put on the centre's noise. tests/validation/at_once.py
-measures the accuracy: the variance of averages of 50 frames of a board is equal to 0.002 (even pixels), 0.005 (uneven)
-and 0.017 (listed). Far behind a hole, where light is dim, the variance of means of 8 frames is 13 to 15 % less than
-that of single frames' means (standard error 3 %); the cause is not known."""
+nothing is drawn; all others, at rims mostly, go through the whole chain. Not as in a frame: amplitudes have their own
+noise, independent of that of z (in frames their correlation is 0.1 at most); a pixel without a range has, in all its
+frames, the reason that its mean has; variance of second order (2.5 % at most) is put on the centre's noise. The
+variance of averages of 50 frames of a board is equal to 0.002 (even pixels), 0.005 (uneven) and 0.017 (listed;
+tests/validation/at_once.py). Far behind a hole, where light is dim, the variance of means of 8 frames is 13 to 15 %
+less than that of single frames' means (standard error 3 %); the cause is not known."""
 
 from __future__ import annotations
 
@@ -123,8 +122,7 @@ def add_linear_frames(  # type: ignore[no-untyped-def]
 ):
     """Add `LANES` frames at the EVEN and UNEVEN pixels of ``linear`` to (n,): z less base, and its square, in steps.
     ``words`` (n lanes,) int8: random bytes, in whose place ``given`` (g, lanes) normals stand where ``given_at`` (n,)
-    is not -1: pixels simulated otherwise share their noise. ``errors`` (lanes,): displacements in steps of half path.
-    """
+    is not -1: pixels simulated otherwise share their noise. ``errors`` (lanes,): displacements in steps."""
     h, w = shape
     side = linear.taps.size
     half = side // 2
@@ -173,9 +171,7 @@ def add_bytes(words: np.ndarray, counted: np.ndarray, total: np.ndarray) -> None
 
 
 MOST_LISTED = 0.25  # share of pixels simulated one by one above which whole frames cost less
-LEAST_DITHER = 0.6
-"""Noise of a sample over the converter's step from which rounding is noise of step^2/12: what the rounding's first
-harmonic leaves of it, exp(-2 pi^2 0.6^2), is below 1e-3."""
+LEAST_DITHER = 0.6  # noise of a sample over the converter's step from which rounding is noise of step^2/12, to 1e-3
 JITTERS = 6.0  # deviations of a frame's displacement that limits of range are kept clear of
 
 
@@ -287,10 +283,8 @@ def _linear(
     by_each /= windows_of(noise.reshape(imager.region.shape), side, 1.0)[at]
     taps = window.space[side // 2] / np.sqrt(window.space[side // 2, side // 2])
     base = np.round(z)
-    return Linear(
-        kind, noise.astype(f4), base.astype(f4), (z - base).astype(f4), by_path.astype(f4), each.astype(f4),
-        more.astype(f4), row, by_each.astype(f4), taps.astype(f4),
-    )  # fmt: skip
+    per_pixel = (values.astype(f4) for values in (noise, base, z - base, by_path, each, more))
+    return Linear(kind, *per_pixel, row, by_each.astype(f4), taps.astype(f4))
 
 
 @dataclass(frozen=True)
@@ -325,13 +319,7 @@ class AtOnce:
 
     @cached_property
     def listed(self) -> np.ndarray:
-        """(h, w) bool: pixels that are simulated one by one."""
-        listed = np.zeros(self.shape, bool)
-        listed.flat[self._asked] = True
-        return listed
-
-    @cached_property
-    def _asked(self) -> np.ndarray:
+        """(p,) flat indices of the pixels that are simulated one by one."""
         return np.asarray(self.list.range[self.list.wanted])
 
     @cached_property
@@ -346,7 +334,7 @@ class AtOnce:
     ) -> FrameTotals:
         """Sum the frames of numbers ``frames`` (t,), which ``errors_m`` (t,) displace. The noise of frames `LANES` k to
         `LANES` (k + 1) - 1 is from ``stream`` (k), whichever of them are asked for."""
-        n, p, shape, step_m = self.linear.z.size, len(self._asked), self.shape, self.imager.camera.z_step_m
+        n, p, shape, step_m = self.linear.z.size, len(self.listed), self.shape, self.imager.camera.z_step_m
         total, squares, sway, given_at = np.zeros(n), np.zeros(n), np.zeros(n, f4), np.full(n, -1, np.int32)
         given_at[self.list.halo] = np.arange(len(self.list.halo))
         sums = np.zeros(p, np.int32), np.zeros(p), np.zeros(p), np.zeros(p), np.zeros((N_REASONS, p), np.uint16)
@@ -368,14 +356,12 @@ class AtOnce:
         amplitude = np.where(certain.always, swaying, 0.0)
         count = np.where(certain.always, len(frames), 0).astype(np.int32)
         reasons = np.zeros((N_REASONS, n), np.uint16)
-        never, at = np.flatnonzero(certain.never), self._asked
+        never, at = np.flatnonzero(certain.never), self.listed
         reasons[certain.reason[never], never] = len(frames)
         reasons[Reason.VALID, certain.always] = len(frames)
         count[at], total[at], squares[at], amplitude[at], reasons[:, at] = sums
-        return FrameTotals(
-            len(frames), step_m, self.linear.base.astype(float).reshape(shape), count.reshape(shape),
-            total.reshape(shape), squares.reshape(shape), amplitude.reshape(shape), reasons.reshape(-1, *shape),
-        )  # fmt: skip
+        images = (each.reshape(shape) for each in (self.linear.base.astype(float), count, total, squares, amplitude))
+        return FrameTotals(len(frames), step_m, *images, reasons.reshape(-1, *shape))
 
     def _add_one_by_one(
         self, errors_m: np.ndarray, counted: np.ndarray, rng: np.random.Generator, sums: tuple[np.ndarray, ...]
@@ -397,7 +383,7 @@ class AtOnce:
         flying = np.zeros((len(wanted), LANES), bool)
         if flying_gate is not None:
             ranging.find_flying(z_m, total, reason, wanted, self.list.near, flying_gate, flying)
-        base, step_m = self.linear.base[self._asked], f4(self.imager.camera.z_step_m)
+        base, step_m = self.linear.base[self.listed], f4(self.imager.camera.z_step_m)
         _add_listed(z_m, reason, total, flying, wanted, counted, 1.0 / n_frequencies, step_m, base, *sums)
         return np.asarray((self.shares[:, :, None] * normals[:, :, 1]).sum(axis=1))
 

@@ -18,12 +18,9 @@ from scenes.sensor.amcw.kernels import FilterSettings
 from scenes.sensor.amcw.linear import DEVIATIONS, Filtered, Light, linearised, unknown_filtered
 
 f4 = np.float32
-MOST_LEFT_OUT = 0.025
-"""Share of the variance that is not of first order, above which a pixel is simulated frame by frame: up to it (phase
-noise of 0.13 rad on a face) the variance is right to 1 %, at half the noise to 0.2 %."""
+MOST_LEFT_OUT = 0.025  # share of variance not of first order, right to 1 % up to it, above which frames are simulated
 STEP_M = 1e-3  # displacement of half a path by which that of z is found
-MOST_TURNED, MOST_SPREAD = 1e3, 1e9
-"""Stand-ins for an unknown deviation: of a phase in radians, of an amplitude in units."""
+MOST_TURNED, MOST_SPREAD = 1e3, 1e9  # for an unknown deviation: of a phase in radians, of an amplitude in units
 
 
 class Certainty(NamedTuple):
@@ -105,7 +102,8 @@ def certainty(
     never = unmeasured | (known & unwraps & too_far)
     always = known & unwraps & (at_worst == ranging.VALID) & ~never
     if engine.flying is not None:
-        always &= ~_may_fly(mean_m, deviation_m, engine.flying, known, unmeasured, shape)
+        images = (each.reshape(shape) for each in (mean_m, DEVIATIONS * deviation_m, known, unmeasured))
+        always &= ~_may_fly(engine.flying, *images)
     of_amplitude = np.sqrt((spread**2).sum(axis=0)) / f
     return Certainty(always, never, mean_m, by_path, deviation_m, amplitude.mean(axis=0), of_amplitude, reason)
 
@@ -124,28 +122,21 @@ def _edge_fails(filtered: Filtered, gates: ranging.Gates) -> np.ndarray:
 
 
 def _may_fly(
-    z_m: np.ndarray,
-    deviation_m: np.ndarray,
-    gate: ranging.FlyingGate,
-    known: np.ndarray,
-    unmeasured: np.ndarray,
-    shape: tuple[int, int],
+    gate: ranging.FlyingGate, z_m: np.ndarray, slack_m: np.ndarray, known: np.ndarray, unmeasured: np.ndarray
 ) -> np.ndarray:
-    """Find pixels (n,) that the gate on the finished image may mark in some frame."""
-    slack_m, z_m = np.nan_to_num(DEVIATIONS * deviation_m), np.nan_to_num(z_m)
+    """Find pixels (h, w), flat, that the gate on the finished image may mark in some frame."""
+    slack_m, z_m = np.nan_to_num(slack_m), np.nan_to_num(z_m)
     measured = known & ~unmeasured
     low, high = np.where(measured, z_m - slack_m, np.inf), np.where(measured, z_m + slack_m, -np.inf)
-    nearest = ndimage.minimum_filter(low.reshape(shape), 3, mode="constant", cval=np.inf).ravel()
-    farthest = ndimage.maximum_filter(high.reshape(shape), 3, mode="constant", cval=-np.inf).ravel()
-    wild = (~known & ~unmeasured).reshape(shape).astype(int)
-    count = ndimage.convolve(wild, np.ones((3, 3), int), mode="constant").ravel()
-    before = z_m + slack_m - nearest > gate.near_m
-    behind = farthest - z_m + slack_m > gate.far_m
-    return np.asarray(before.astype(int) + behind + count >= 2)
+    nearest = ndimage.minimum_filter(low, 3, mode="constant", cval=np.inf)
+    farthest = ndimage.maximum_filter(high, 3, mode="constant", cval=-np.inf)
+    wild = (~known & ~unmeasured).astype(int)
+    count = ndimage.convolve(wild, np.ones((3, 3), int), mode="constant")
+    before, behind = z_m + slack_m - nearest > gate.near_m, farthest - z_m + slack_m > gate.far_m
+    return np.asarray(before.astype(int) + behind + count >= 2).ravel()
 
 
-MOST_EDGE = 0.004
-"""Edge sum up to which a window is even: one neighbour 0.13 rad off (15 mm at 200 MHz) changes its weight by 3 %."""
+MOST_EDGE = 0.004  # edge sum up to which a window is even: a neighbour 0.13 rad off changes its weight by 3 %
 MOST_UNLIKE = 0.005  # difference of c s^2 within a window up to which its noise is even: that share of a weight
 MOST_NOISE = 0.15  # phase noise in radians up to which the table goes, beyond what `certainty` takes
 NOISES = np.linspace(0.0, MOST_NOISE, 33)

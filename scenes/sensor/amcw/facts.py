@@ -17,25 +17,24 @@ from scenes.sensor.facts import (
     CameraFacts,
     ConeFacts,
     Fact,
-    LengthPx,
+    LimitFacts,
     NonNegative,
-    OutputFacts,
     Positive,
     PositiveEach,
     PositiveInt,
     Share,
     ShareEach,
+    SmoothPatternFacts,
     checked,
 )
 
 
 class UnwrapTable(NamedTuple):
-    """Tables by which phases of f = 1, 2 or 3 frequencies become half the light's path, as compiled code takes them.
-
-    ``lattice`` (f,) float32: integers m with f_k = m_k f_0. ``combination`` (f - 1, f) float32: integer rows orthogonal
-    to m; they sum the wrapped phases to whole numbers, which are a key of the wrap counts: ``sizes`` and ``offset`` (f
-    - 1,) int32 of the keys, ``wraps`` (f, keys) float32, -1 where no distance has them. ``metres_per_turn`` (f,)
-    float32. ``unambiguous_m``: R = c / 2 f_0."""
+    """Tables by which phases of f = 1, 2 or 3 frequencies become half the light's path. ``lattice`` (f,) float32:
+    integers m with f_k = m_k f_0. ``combination`` (f - 1, f) float32: integer rows orthogonal to m; they sum the
+    wrapped phases to whole numbers, which are a key of the wrap counts: ``sizes`` and ``offset`` (f - 1,) int32 of the
+    keys, ``wraps`` (f, keys) float32, -1 where no distance has them. ``metres_per_turn`` (f,) float32.
+    ``unambiguous_m``: R = c / 2 f_0."""
 
     lattice: np.ndarray
     combination: np.ndarray
@@ -112,8 +111,7 @@ def _orthogonal_rows(lattice: np.ndarray, reach: int = 16) -> np.ndarray:
 Contrasts = Annotated[Fact[tuple[float, ...]], checked("above 0 and at most 1", lambda value: 0 < value <= 1)]
 Window = Annotated[Fact[int], checked("an odd number from 1 to 31", lambda value: 0 < value < 32 and value % 2 == 1)]
 Phases = Annotated[Fact[int], checked("3 or more, to tell phase, amplitude and offset apart", lambda value: value >= 3)]
-WIDEST_PX = 2128
-"""Longest row, the filter's window included: `kernels.STRIDE`, written again so that declarations compile nothing."""
+WIDEST_PX = 2128  # row with the filter's window: `kernels.STRIDE`, written again so that declarations compile nothing
 
 
 class EmitterFacts(ConeFacts):
@@ -147,8 +145,7 @@ class ScatterFacts(Config):
 
 class ColourFacts(Config):
     """The colour camera beside, onto whose pixels depth images may be aligned: ``turn_deg`` (a rotation vector) and
-    ``shift_mm`` take points of the depth camera's frame to its frame. ``distortion`` as of every lens (k1 k2 p1 p2 k3
-    k4 k5 k6)."""
+    ``shift_mm`` take points of the depth camera's frame to its frame. ``distortion`` as of every lens."""
 
     turn_deg: Fact[tuple[float, float, float]]
     shift_mm: Fact[tuple[float, float, float]]
@@ -166,9 +163,8 @@ class ColourFacts(Config):
 
 
 class ModulationFacts(Config):
-    """Continuous-wave modulation: one value per frequency but for ``phases``. ``contrast``: amplitude of the
-    fundamental by the light's mean. ``wiggling_residual``: what factory calibration and bandwidth leave of square
-    light's harmonics."""
+    """Continuous-wave modulation: one value per frequency but for ``phases``. ``contrast``: of the fundamental's
+    amplitude to the light's mean. ``wiggling_residual``: what calibration and bandwidth leave of square light's harmonics."""
 
     frequencies_hz: PositiveEach
     phases: Phases
@@ -214,11 +210,9 @@ class ConverterFacts(Config):
     full_scale_units: PositiveInt
 
 
-class FixedPatternFacts(Config):
-    """Fixed pattern, the same in every frame of a unit: a smooth and a per-pixel error of range."""
+class FixedPatternFacts(SmoothPatternFacts):
+    """A smooth and a per-pixel error of range."""
 
-    smooth_mm: NonNegative
-    smooth_length_px: LengthPx
     pixel_mm: NonNegative
 
 
@@ -243,9 +237,8 @@ class FlyingPixelFacts(Config):
     most_mm: NonNegative
 
 
-class EngineFacts(OutputFacts):
+class EngineFacts(LimitFacts):
     """The depth engine: phase-space filter, unwrapping, fusion, gates, output. A gate that is left out is none.
-
     ``filter_on``: each phasor counts by its weight alone (``unit_phasors``), or by its amplitude too (``phasors``).
     ``spatial_sigma_px``: Gaussian of the window; None is a box. A centre not brighter than ``dim_amplitude_units`` gets
     weights by distance alone; before a brighter one, dimmer neighbours are dropped where ``drop_dim_neighbours``.
@@ -271,14 +264,11 @@ class EngineFacts(OutputFacts):
     min_amplitude_sum_units: NonNegative
     min_reflectivity_units_mm2: NonNegative | None = None
     min_range_mm: Positive
-    max_range_mm: Positive
     limits_along: Fact[Literal["ray", "axis"]]
     flying_pixels: FlyingPixelFacts | None = None
 
     @model_validator(mode="after")
     def _gates_can_hold(self) -> EngineFacts:
-        if self.min_range_mm.value >= self.max_range_mm.value:
-            raise ValueError("min_range_mm must be less than max_range_mm")
         if self.residual_by_amplitude and not self.lattice_residual_turns:
             raise ValueError("residual_by_amplitude needs lattice_residual_turns, the least that it gives")
         return self
@@ -306,29 +296,19 @@ class AmcwCamera(CameraFacts):
             raise ValueError("engine.amplitude_gains needs one value for each of modulation.frequencies_hz")
         return self
 
-    @cached_property
-    def emitter_position_m(self) -> np.ndarray:
-        """(3,) in the camera's frame."""
-        return np.array(self.emitter.position_mm.value) * MM
-
     @property
     def frequencies_hz(self) -> tuple[float, ...]:
         """Modulation frequencies in the file's order."""
         return self.modulation.frequencies_hz.value
 
-    @property
-    def margin_px(self) -> int:
-        """Pixels beyond a region whose light reaches it through the engine's windows and the lens's blur."""
-        blur_px = int(np.ceil(3 * self.scatter.blur_px.value)) if self.scatter else 0
-        return self.engine.window_px.value // 2 + (1 if self.engine.flying_pixels else 0) + blur_px
-
     @cached_property
     def optics(self) -> Optics:
-        """Optics of this camera for the render."""
+        """Optics for the render; light reaches a pixel through the engine's windows and the lens's blur."""
+        blur_px = int(np.ceil(3 * self.scatter.blur_px.value)) if self.scatter else 0
         return self.optics_with(
             **self.emitter.optics(),
             frequencies_hz=self.frequencies_hz,
-            margin_px=self.margin_px,
+            margin_px=self.engine.window_px.value // 2 + (1 if self.engine.flying_pixels else 0) + blur_px,
             farthest_m=self.engine.max_range_mm.value * MM,
             limits_along=self.engine.limits_along.value,
         )

@@ -6,8 +6,7 @@ gates, the correction for the emitter beside the lens, rounding, the lens' natur
 light and exposures that end early where the camera's file has them. Not modelled: dark current, motion, light that
 changes during a frame, cross-talk between pixels, in-pixel rejection of ambient light, gain switching, the steps in
 which exposures end, errors of phase that differ between frequencies other than harmonics, any post-processing beyond
-this. Tables of a unit's lens, emitter and phase offsets are exact; what real ones leave is the fixed pattern and the
-unit's offset."""
+this. What a unit's tables of lens, emitter and phase offsets leave is the fixed pattern and the unit's offset."""
 
 from __future__ import annotations
 
@@ -61,8 +60,7 @@ def with_harmonics(signal: np.ndarray, phases: int, residual: np.ndarray) -> np.
 
 def scattered(image: np.ndarray, facts: ScatterFacts) -> np.ndarray:
     """Return light (..., h, w) as lens blur and stray light spread it. Beyond the view's region lies the light of its
-    border, as only the region was rendered. The light's fall-off towards the sensor's corners is taken as the same
-    where light comes from and where it goes."""
+    border. Light's fall-off towards the corners is taken as the same where light comes from and where it goes."""
     share = facts.stray_share.value
 
     def spread(light: np.ndarray, sigma_px: float) -> np.ndarray:
@@ -158,8 +156,8 @@ class AmcwImager(UnitModel[AmcwCamera]):
     def _ambient_electrons(self, view: NoiseFreeView, intensity: np.ndarray) -> np.ndarray:
         """Return (h, w): electrons of daylight or lamps in both wells of one exposure; zeros where the effect is off.
         There are as many as the emitter's own, times the ratio of irradiances within the filter's band, for light that
-        falls on the surface as the camera's own does. A pixel that sees several surfaces is taken to get its light from
-        the nearest."""
+        falls as the camera's own does. A pixel that sees several surfaces is taken to get its light from the nearest.
+        """
         config, photons = self.config, self.camera.photons
         if not config.effects.ambient:
             return np.zeros(intensity.shape)
@@ -226,7 +224,7 @@ class AmcwImager(UnitModel[AmcwCamera]):
     @cached_property
     def engine(self) -> ranging.DepthEngine:
         """Everything that decides after the filter."""
-        facts, emitter = self.camera.engine, self.camera.emitter_position_m
+        facts, emitter = self.camera.engine, self.camera.optics.emitter_m
         along, cosine = rays_of(self.slopes, emitter)
         geometry = np.stack([along, np.full_like(along, emitter @ emitter), cosine]).reshape(3, -1).astype(f4)
         edge, lattice, by_amplitude = facts.edge_threshold, facts.lattice_residual_turns, facts.residual_by_amplitude

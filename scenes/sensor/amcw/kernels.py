@@ -1,6 +1,5 @@
-"""Compiled inner loops of the continuous-wave imager up to the filtered phasor: exposure, phase-space filter.
-
-Each loop serves a full image and a list of pixels, of which `LANES` frames are done together. One core, float32."""
+"""Compiled inner loops of the continuous-wave imager up to the filtered phasor: exposure, phase-space filter. The
+filter serves a full image and a list of pixels, of which `LANES` frames are done together. One core, float32."""
 
 from __future__ import annotations
 
@@ -17,12 +16,10 @@ C2, C3, C4, C5 = HALF, f4(1 / 6), f4(1 / 24), f4(1 / 120)
 SMALLEST = f4(1e-30)
 OUTSIDE = f4(-1)  # amplitude of what is beyond the border or saturated: below every floor, so that it is always dropped
 
-STRIDE = 2128
-"""Longest padded row of an image; not a power of two, whose multiples share the cache's lines (a factor of 4 in time
-where memory lands badly)."""
+STRIDE = 2128  # longest padded row of an image; a power of two would share the cache's lines, up to 4 times as slow
 LANES = 56
-"""Frames of a listed pixel that are drawn together, whether they all count or not: 50 frames, the usual number, in one
-go. Loops of 8 n frames become vector code from n = 4 on; 16 frames take a list of single steps, five times as long."""
+"""Frames of a listed pixel that are drawn together, whether they all count or not: 50, the usual number, in one go.
+Loops of 8 n frames become vector code from n = 4 on."""
 BLOCK = 3 * LANES  # numbers of one listed pixel and frequency: re, im and amplitude of all frames
 
 
@@ -30,13 +27,10 @@ BLOCK = 3 * LANES  # numbers of one listed pixel and frequency: re, im and ampli
 def expose(  # type: ignore[no-untyped-def]
     means, sigma, limit, normals, knee, gains, cosines, sines, unit, amplitude, saturated
 ):
-    """Convert samples to unit phasors and amplitudes.
-
-    ``means`` (f, k, n) noise-free samples, ``sigma`` (n,) their deviation and ``limit`` (n,) the largest that fits, in
-    converter units; ``normals`` (f, k, n); ``gains`` (f,); ``cosines`` and ``sines`` (k,) of the phases. Writes
-    ``unit`` (2, f, n), ``amplitude`` (f, n) and ``saturated`` (n,). The difference of two wells, with Poisson shot
-    noise and read noise of both, is taken as a normal, cut off at the limit, then companded. A pixel with a saturated
-    sample has no phasor."""
+    """Convert samples to unit phasors and amplitudes: the fields of `imager.AmcwExposure`, ``normals`` (f, k, n),
+    ``gains`` (f,), ``cosines`` and ``sines`` (k,) of the phases. Writes ``unit`` (2, f, n), ``amplitude`` (f, n) and
+    ``saturated`` (n,). The difference of two wells, with Poisson shot noise and read noise of both, is taken as a
+    normal, cut off at the limit, then companded. A pixel with a saturated sample has no phasor."""
     n_frequencies, n_phases, n = means.shape
     per_knee = ONE / knee
     saturated[:] = 0
@@ -173,10 +167,9 @@ class FilterSettings(NamedTuple):
 
 @numba.njit(**FAST)
 def filter_image(unit, amplitude, settings, filtered, edge):  # type: ignore[no-untyped-def]
-    """Filter the phasors of one frequency, ``unit`` (2, h, w) and ``amplitude`` (h, w), by a joint bilateral filter
-    with weights space exp(-concentration (1 - cos dphi)); the window is clipped at the border. Writes ``filtered`` (3,
-    h, w): phasor (re, im; any length) and amplitude, and ``edge`` (h, w): the sum over kept neighbours of (1 - cos
-    dphi)/2."""
+    """Filter the phasors of one frequency, ``unit`` (2, h, w) and ``amplitude`` (h, w), with weights space
+    exp(-concentration (1 - cos dphi)); the window is clipped at the border. Writes ``filtered`` (3, h, w): phasor (re,
+    im; any length) and amplitude, and ``edge`` (h, w): the sum over kept neighbours of (1 - cos dphi)/2."""
     h, w = amplitude.shape
     side = settings.space.shape[0]
     half = side // 2

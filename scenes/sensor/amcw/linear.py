@@ -22,18 +22,16 @@ from scenes.sensor.normals import FAST
 if TYPE_CHECKING:
     from scenes.sensor.amcw.imager import AmcwExposure
 
-DEVIATIONS = 4.5
-"""Distance from a limit, in deviations, at which it is taken never to be met: 3e-6 a frame, of the few pixels that are
-just so far off."""
+DEVIATIONS = 4.5  # distance from a limit at which it is taken never to be met: 3e-6 a frame of pixels just so far off
 NOISY = 0.35  # phase noise in radians above which a pixel's phase is no longer a normal about its mean
 LITTLE = 0.004  # c s^2 below which (c s^2)^2 does not matter (phase noise of 0.033 rad): half the work
 SMALLEST = 1e-12
 
 
 class Light(NamedTuple):
-    """Each pixel before the filter, all (f, n) float64: ``phasor`` of length 1; ``amplitude`` without noise and
-    ``bright``, its mean with it; ``turn``: deviation of the phase in radians; ``swell``: that of the amplitude, over
-    it."""
+    """Each pixel before the filter, all (f, n) float64: ``phasor`` of length 1; ``amplitude`` without noise,
+    ``bright``, its mean with noise; ``turn``: deviation of the phase in radians; ``swell``: relative one of the
+    amplitude."""
 
     phasor: np.ndarray
     amplitude: np.ndarray

@@ -1,5 +1,4 @@
-"""The continuous-wave imager's engine after its filter: unwrap, fuse, gate, round. Compiled loops, float32, in
-blocks."""
+"""The continuous-wave imager's engine after its filter: unwrap, fuse, gate, round. Compiled loops, float32."""
 
 from __future__ import annotations
 
@@ -20,21 +19,18 @@ ATAN = tuple(map(f4, (-0.0040540580, 0.0218612288, -0.0559098861, 0.0964200441))
 ATAN += tuple(map(f4, (-0.1390853351, 0.1994653599, -0.3332985605, 0.9999993329)))
 """Minimax odd polynomial of the arctangent on 0..1, highest power first (Remez, |error| < 1.2e-7 rad)."""
 BLOCK = 1024
-VALID, SATURATED, LOW_AMPLITUDE, AMPLITUDE_RATIO = map(
-    np.int32, (Reason.VALID, Reason.SATURATED, Reason.LOW_AMPLITUDE, Reason.AMPLITUDE_RATIO)
-)
-UNWRAP, EDGE, OUT_OF_RANGE, OUTSIDE_MASK, LOW_REFLECTIVITY = map(
-    np.int32, (Reason.UNWRAP, Reason.EDGE, Reason.OUT_OF_RANGE, Reason.OUTSIDE_MASK, Reason.LOW_REFLECTIVITY)
-)
+VALID, SATURATED, OUTSIDE_MASK = map(np.int32, (Reason.VALID, Reason.SATURATED, Reason.OUTSIDE_MASK))
+LOW_AMPLITUDE, LOW_REFLECTIVITY = map(np.int32, (Reason.LOW_AMPLITUDE, Reason.LOW_REFLECTIVITY))
+AMPLITUDE_RATIO, UNWRAP = map(np.int32, (Reason.AMPLITUDE_RATIO, Reason.UNWRAP))
+EDGE, OUT_OF_RANGE = map(np.int32, (Reason.EDGE, Reason.OUT_OF_RANGE))
 
 
 class Gates(NamedTuple):
     """Limits of the engine, all float32; a gate that a camera lacks is infinite or 0. ``edge``: sum of (1 - cos
     dphi)/2, in the mean of the frequencies where ``edge_mean`` is 1, else in any. Residual limit in turns:
-    ``residual``, or ``residual_scale`` A^``residual_slope`` of the brightest frequency's amplitude A within
-    ``residual`` and ``residual_most``. ``ratio``: (greatest - least) / greatest amplitude. ``least`` amplitude and
-    ``total`` in units, ``reflectivity`` in units m^2. Limits of range: along the optical axis where ``axial`` is 1,
-    else along the ray."""
+    ``residual``, or ``residual_scale`` A^``residual_slope`` of the greatest amplitude A within ``residual`` and
+    ``residual_most``. ``ratio``: (greatest - least) / greatest amplitude. ``least`` amplitude and ``total`` in units,
+    ``reflectivity`` in units m^2. Range counts along the optical axis where ``axial`` is 1, else along the ray."""
 
     edge: np.float32
     edge_mean: np.float32
@@ -142,9 +138,8 @@ def half_path(turn: np.ndarray, n: int, lattice: UnwrapTable, half: np.ndarray, 
 
 class GateInputs(NamedTuple):
     """Quantities of a pixel that the gates look at: amplitudes; the squared lattice residual, infinite where no wrap
-    counts fit; range, and what is limited, along the ray or the axis. Where noise leaves an interval, each gate is
-    given the end that is worse for it (or better), hence ``greatest`` beside ``brightest`` and ``low`` beside
-    ``high``."""
+    counts fit; range, and what is limited, along the ray or the axis. Where noise leaves an interval, each gate gets
+    the worse (or better) end of it, hence ``greatest`` beside ``brightest`` and ``low`` beside ``high``."""
 
     edge: Any
     least: Any
@@ -193,10 +188,9 @@ def ranges_of(
     """Convert filtered phasors (f, 3, n) and edge sums (f, n) to z in metres, of invalid pixels too, the first gate
     that each pixel fails, and the sum of amplitudes, (n,) each. ``errors_m`` (n,) is added to half the path."""
     n = len(errors_m)
-    z_m, reason, total = np.empty(n, f4), np.empty(n, np.uint8), np.empty(n, f4)
-    parts = engine.geometry, engine.outside_mask, engine.lattice, engine.gates
-    _range_and_gates(filtered, edge, saturated, *parts, errors_m.astype(f4), z_m, reason, total)
-    return z_m, reason, total
+    out = np.empty(n, f4), np.empty(n, np.uint8), np.empty(n, f4)
+    _range_and_gates(filtered, edge, saturated, *engine[:4], errors_m.astype(f4), *out)
+    return out
 
 
 @numba.njit(**FAST)

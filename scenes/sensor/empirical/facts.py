@@ -11,16 +11,12 @@ from pydantic import model_validator
 from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import MM
 from scenes.optics import Optics
-from scenes.sensor.facts import CameraFacts, Fact, NonNegative, OutputFacts, Positive, PositiveEach, ShareEach, checked
+from scenes.sensor.facts import CameraFacts, Fact, LimitFacts, NonNegative, Positive, PositiveEach, ShareEach, checked
 
-CARRIER_HZ = 1e6
-"""Frequency whose phase tells the mean distance over a pixel's footprint, without ambiguity up to 150 m; complex64
-rounds it by 2 um."""
-BLUR_REACH = 3.0
-"""Deviations of the edge's kernel that a region needs as margin: 0.3 % of it lies beyond."""
+CARRIER_HZ = 1e6  # its phase tells a pixel's mean distance, without ambiguity up to 150 m; complex64 rounds by 2 um
+BLUR_REACH = 3.0  # deviations of the edge's kernel that a region needs as margin: 0.3 % of it lies beyond
 
-Taps = Fact[tuple[float, ...]]
-"""Taps of a causal filter; their squares sum to 1."""
+Taps = Fact[tuple[float, ...]]  # of a causal filter; their squares sum to 1
 
 
 class SurfaceLightFacts(Config):
@@ -69,12 +65,6 @@ class EdgeKernelFacts(Config):
     least_step_mm: Positive
 
 
-class LimitFacts(OutputFacts):
-    """Limits of range, along the ray."""
-
-    max_range_mm: Positive
-
-
 class EmpiricalCamera(CameraFacts):
     """Any depth camera, described by what its captures show."""
 
@@ -92,23 +82,18 @@ class EmpiricalCamera(CameraFacts):
             levels, values = (getattr(getattr(self, section), name).value for name in (key, other))
             if not levels or len(levels) != len(values) or list(levels) != sorted(set(levels)):
                 raise ValueError(f"{section}.{key} must increase, and {section}.{other} needs a value for each of them")
-        if self.engine.min_range_mm.value >= self.engine.max_range_mm.value:
-            raise ValueError("engine.min_range_mm must be less than engine.max_range_mm")
         return self
-
-    @property
-    def margin_px(self) -> int:
-        """Pixels beyond a region whose depth reaches it through the edge's kernel."""
-        return int(np.ceil(BLUR_REACH * self.edge.blur_px.value) + np.ceil(self.edge.gap_px.value / 2)) + 1
 
     @cached_property
     def optics(self) -> Optics:
-        """Optics for the render: a source of light in the lens itself, which leaves no shadows."""
+        """Optics for the render: a source of light in the lens itself, which leaves no shadows. Depth reaches a pixel
+        through the edge's kernel."""
+        blur_px, half_gap_px = BLUR_REACH * self.edge.blur_px.value, self.edge.gap_px.value / 2
         return self.optics_with(
             emitter_m=np.zeros(3),
             full_half_angle_deg=89.0,
             cutoff_half_angle_deg=89.9,
             frequencies_hz=(CARRIER_HZ,),
-            margin_px=self.margin_px,
+            margin_px=int(np.ceil(blur_px) + np.ceil(half_gap_px)) + 1,
             farthest_m=self.engine.max_range_mm.value * MM,
         )

@@ -15,16 +15,15 @@ from scenes.sensor.facts import (
     CameraFacts,
     ConeFacts,
     Fact,
-    LengthPx,
     NonNegative,
     OutputFacts,
     Positive,
     Share,
+    SmoothPatternFacts,
     checked,
 )
 
-SMOOTHING_REACH = 2.5
-"""Standard deviations at which the smoothing's weights end: 0.04 of the middle one."""
+SMOOTHING_REACH = 2.5  # deviations at which the smoothing's weights end: 0.04 of the middle one
 NS, MRAD, MW = 1e-9, 1e-3, 1e-3  # seconds in a nanosecond, radians in a milliradian, watts in a milliwatt
 
 
@@ -72,13 +71,6 @@ class LidarPhotonFacts(Config):
     calibration_reach_albedo: Share
 
 
-class RippleFacts(Config):
-    """Fixed pattern, the same in every frame of a unit: smooth ripples of range."""
-
-    smooth_mm: NonNegative
-    smooth_length_px: LengthPx
-
-
 class LidarEngineFacts(OutputFacts):
     """Processing on the device. ``smoothing_px``: standard deviations of the Gaussian weights with which neighbours
     are averaged along columns, then along rows; 0: not at all. ``agree_deviations``: a neighbour joins the mean where
@@ -100,7 +92,7 @@ class ScannedLidar(CameraFacts):
     scan: ScanFacts
     code: CodeFacts
     photons: LidarPhotonFacts
-    fixed_pattern: RippleFacts
+    fixed_pattern: SmoothPatternFacts
     engine: LidarEngineFacts
 
     @model_validator(mode="after")
@@ -114,11 +106,6 @@ class ScannedLidar(CameraFacts):
         if len(self.weights) < 3:
             raise ValueError("code.period_ns must be longer: fewer than three spectral lines are within the band")
         return self
-
-    @property
-    def receiver_m(self) -> np.ndarray:
-        """(3,) the receiver in the camera's frame."""
-        return np.array(self.receiver.position_mm.value) * MM
 
     @property
     def period_s(self) -> float:
@@ -163,11 +150,6 @@ class ScannedLidar(CameraFacts):
         by_beam = irradiance_w_m2 * self.photons.room_albedo.value * self.field_sr / (self.beam.power_mw.value * MW)
         return self.photons.signal_electrons.value * by_beam
 
-    @property
-    def margin_px(self) -> int:
-        """Pixels beyond a region whose light reaches it through the integration and the smoothing."""
-        return int(np.ceil(self.integration_points / 2)) + max(len(taps) // 2 for taps in self.smoothing_taps)
-
     @cached_property
     def smoothing_taps(self) -> tuple[np.ndarray, np.ndarray]:
         """(2 r + 1,) float32 weights of sum 1 along columns and along rows."""
@@ -180,11 +162,13 @@ class ScannedLidar(CameraFacts):
 
     @cached_property
     def optics(self) -> Optics:
-        """Optics for the render: pixels are beams from the origin, and the receiver stands where an emitter would."""
+        """Optics for the render: pixels are beams from the origin, and the receiver stands where an emitter would.
+        Light reaches a pixel through the integration and the smoothing."""
+        smoothed_px = max(len(taps) // 2 for taps in self.smoothing_taps)
         return self.optics_with(
             **self.receiver.optics(),
             frequencies_hz=tuple(float(k / self.period_s) for k in range(1, len(self.weights) + 1)),
             beam_fwhm_rad=self.beam.fwhm_mrad.value * MRAD,
-            margin_px=self.margin_px,
+            margin_px=int(np.ceil(self.integration_points / 2)) + smoothed_px,
             farthest_m=self.unambiguous_m,
         )

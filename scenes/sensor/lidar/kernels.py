@@ -14,10 +14,8 @@ import numpy as np
 from harness.vocabulary.geometry import Reason
 from scenes.sensor.normals import FAST, IN_DOUBLE
 
-SAMPLES_PER_LINE = 4
-"""Samples of the correlation in a period, per spectral line; two would just hold it, four miss no peak."""
-NEWTON_STEPS = 4
-"""Steps from a sample's parabola: three converge to 1e-7 of a sample even where two pulses are about to part."""
+SAMPLES_PER_LINE = 4  # of the correlation in a period, per spectral line; two would just hold it, four miss no peak
+NEWTON_STEPS = 4  # from a sample's parabola: three converge to 1e-7 of a sample even where two pulses nearly part
 NO_PEAK = -1e9  # stand-in for the height of a peak that does not exist
 
 
@@ -173,7 +171,6 @@ def smooth(  # type: ignore[no-untyped-def]
     half_m, share, height, gate_m, taps, along_rows, out_m, out_share, out_height
 ):
     """Average with ``taps`` (2 r + 1,) the neighbours of a column, or of a row with ``along_rows``, that agree.
-
     ``half_m``, ``share``, ``height`` (h + 2 p, w + 2 q), with a border of p and q at least r where the taps reach: half
     path; weight of what agreed so far; strength. ``gate_m`` (h, w): how far a neighbour's half path may differ. Writes
     the mean half path, the weight and the strength of those that agree, (h, w) each."""
@@ -203,12 +200,10 @@ def smooth(  # type: ignore[no-untyped-def]
 def gated(  # type: ignore[no-untyped-def]
     half_m, share, height, everyone, along_m, cosine, saturated, limits, error_m, z_m, reason, strength
 ):
-    """Turn smoothed half paths (h, w) into ranges; gates and rounding.
-
-    ``share``, ``height``: weight and strength of the neighbours that agree; ``everyone``: weight of all within the
-    picture. A pixel whose agreeing neighbours are too small a share is invalid. Half the path s by a receiver at e
-    gives the range r = (4 s^2 - e.e) / (4 s - 2 u.e) along the unit ray u; ``along_m`` is u.e, ``cosine`` u_z.
-    ``limits``: e.e, least strength, least agreeing share, least and greatest range, step."""
+    """Turn smoothed half paths (h, w) into ranges; gates and rounding. ``share``, ``height``: weight and strength of
+    the neighbours that agree; ``everyone``: weight of all within the picture. Half the path s by a receiver at e gives
+    the range r = (4 s^2 - e.e) / (4 s - 2 u.e) along the unit ray u; ``along_m`` is u.e, ``cosine`` u_z. ``limits``:
+    e.e, least strength, least agreeing share, least and greatest range, step."""
     h, w = cosine.shape
     e2, least, alike, nearest, farthest, step = limits
     for v in range(h):

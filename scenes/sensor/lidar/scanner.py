@@ -1,6 +1,6 @@
 """The scanned lidar: the correlation's peaks in each beam to range, with a reason for each invalid pixel.
 
-Modelled: one beam per pixel whose light, with all its paths, meets one detector; the coded pulse's strongest peak; shot
+Modelled: a beam per pixel whose light, by all its paths, meets one detector; the coded pulse's strongest peak; shot
 noise with the avalanche's excess, ambient light and the amplifier's noise on heights and places of peaks; maxima of the
 noise after an average over neighbours; integration over more than one point's time; an error that a sweep shares;
 ripples of a unit; smoothing among agreeing neighbours; confidence threshold, least range, saturation; the receiver
@@ -27,10 +27,8 @@ from scenes.sensor.unit import DecodedFrame, UnitModel, light_of, rays_of, smoot
 
 f4 = np.float32
 BLOCK_ROWS = 16  # rows whose correlations are held at once: 16 rows of 1,024 pixels take 8 MB
-CERTAIN_DEVIATIONS = 10.0
-"""A return this much above the noise is never beaten by a maximum of the noise (chance below 1e-9)."""
-FACTOR_ROWS = 400
-"""Size of the matrix whose Cholesky factor ends in the taps of a moving sum; the taps are good to 0.3 %."""
+CERTAIN_DEVIATIONS = 10.0  # a return so far above the noise is never beaten by its maximum (chance below 1e-9)
+FACTOR_ROWS = 400  # of the matrix whose Cholesky factor ends in the taps of a moving sum, good to 0.3 %
 
 
 class LidarReturns(NamedTuple):
@@ -60,8 +58,9 @@ class LidarScanner(UnitModel[ScannedLidar]):
         self.ambient_electrons = camera.ambient_electrons(config.ambient_uw_cm2_nm) if ambient else 0.0
         self._noise_taps = overlap_taps(camera.integration_points).astype(f4)
         # (2, h, w): the receiver's offset along the ray in metres, the ray's cosine to the axis
-        self._geometry, engine = np.stack(rays_of(slopes, camera.receiver_m)).astype(f4), camera.engine
-        least = camera.receiver_m @ camera.receiver_m, engine.confidence_electrons.value, engine.least_agreeing.value
+        receiver_m, engine = camera.optics.emitter_m, camera.engine
+        self._geometry = np.stack(rays_of(slopes, receiver_m)).astype(f4)
+        least = receiver_m @ receiver_m, engine.confidence_electrons.value, engine.least_agreeing.value
         range_m = engine.min_range_mm.value * MM, camera.unambiguous_m, camera.z_step_m
         self._limits = tuple(map(f4, (*least, *range_m)))
 
