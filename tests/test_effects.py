@@ -10,7 +10,7 @@ from scipy import stats
 
 from harness.vocabulary.geometry import SPEED_OF_LIGHT_AIR, Reason, Region
 from scenes.closed_form import plane_view
-from scenes.sensor.amcw.imager import AmcwImager, ambient_electrons, with_harmonics
+from scenes.sensor.amcw.imager import AmcwImager, with_harmonics
 from scenes.sensor.camera import NO_EFFECTS, CameraConfig, EffectsConfig, camera_of, load_camera
 from scenes.sensor.source import SimulatedUnit
 from scenes.sensor.unit import frame_errors_m, smooth_field
@@ -210,7 +210,7 @@ def test_ambient_electrons_by_hand():
     settings = config(ambient=True).model_copy(update={"ambient_uw_cm2_nm": 2.2})
     for distance_m in (0.7, 2.8):
         unit = unit_of(settings, distance_m, albedo=0.5)
-        electrons = ambient_electrons(unit.camera, settings, unit.view, np.ones(unit.view.range_m.shape))
+        electrons = unit.model.ambient_electrons(unit.view, unit.view.intensity) / unit.model.gathered
         own = unit.camera.photons.signal_electrons.value
         # 0.998: the plane leans by 3 degrees; 5 %: seen up to 6 degrees more aslant, from an emitter beside the lens
         assert electrons == pytest.approx(0.11 * 0.5 * own * 0.998, rel=0.05)
@@ -314,7 +314,7 @@ def test_ambient_light_of_a_mixed_pixel_is_that_of_its_nearest_surface():
     intensity = plain.view.intensity.copy()
     range_m[20, 30], coverage[20, 30], intensity[20, 30] = 2.5, 0.5, intensity[20, 30] / 2
     unit = unit_of(settings, distance_m=0.7, range_m=range_m, coverage=coverage, intensity=intensity)
-    light = ambient_electrons(unit.camera, settings, unit.view, unit.model.gathered)
+    light = unit.model.ambient_electrons(unit.view, intensity)
     assert light[20, 30] == pytest.approx(light[20, 31] / 2, rel=0.02)
 
 

@@ -164,7 +164,7 @@ class ColourFacts(Config):
 
 class ModulationFacts(Config):
     """Continuous-wave modulation: one value per frequency but for ``phases``. ``contrast``: of the fundamental's
-    amplitude to the light's mean. ``wiggling_residual``: what calibration and bandwidth leave of square light's harmonics."""
+    amplitude to the light's mean. ``wiggling_residual``: what calibration and bandwidth leave of harmonics."""
 
     frequencies_hz: PositiveEach
     phases: Phases

@@ -129,7 +129,7 @@ class AmcwImager(UnitModel[AmcwCamera]):
         signal = contrast * electrons * phasor * np.exp(2j * np.pi * turns)
         if self.config.effects.wiggling:
             signal = with_harmonics(signal, phases, np.array(camera.modulation.wiggling_residual.value))
-        both_wells = electrons * intensity + self._ambient_electrons(view, intensity)
+        both_wells = electrons * intensity + self.ambient_electrons(view, intensity)
         # an exposure that ends early is scaled to the full length, and its noise with it
         share = 1.0
         if photons.exposure_ends_electrons is not None:
@@ -153,7 +153,7 @@ class AmcwImager(UnitModel[AmcwCamera]):
             intensity.shape,
         )
 
-    def _ambient_electrons(self, view: NoiseFreeView, intensity: np.ndarray) -> np.ndarray:
+    def ambient_electrons(self, view: NoiseFreeView, intensity: np.ndarray) -> np.ndarray:
         """Return (h, w): electrons of daylight or lamps in both wells of one exposure; zeros where the effect is off.
         There are as many as the emitter's own, times the ratio of irradiances within the filter's band, for light that
         falls as the camera's own does. A pixel that sees several surfaces is taken to get its light from the nearest.
