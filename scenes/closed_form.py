@@ -66,10 +66,9 @@ def image_view(camera: AnyCamera, region: Region, z_m: np.ndarray, light: np.nda
 def layered_view(
     camera: AnyCamera, region: Region, front: Plane, back: Plane, covers: Covers, albedo: float
 ) -> NoiseFreeView:
-    """Return a part of the plane ``front`` before the endless plane ``back``, both Lambertian of one albedo. ``covers``
-    says where the front is. Each pixel sums phasors over its footprint; a point of the back is dark where the way to
-    the emitter passes the front. Surfaces: "front", "back". Left out: the front's thickness and its edge's own face,
-    light between the planes, the emitter's cone."""
+    """Return a part of the plane ``front`` (where it ``covers``) before the endless plane ``back``, both Lambertian of
+    one albedo. Each pixel sums phasors over its footprint; a point of the back is dark where the front hides the
+    emitter. Surfaces: "front", "back". Left out: the front's thickness, light between the planes, the cone."""
     lens, optics, waves = camera.nominal_lens, camera.optics, wave_numbers(camera.optics.frequencies_hz)
     footprint = footprint_of(lens, region, optics.beam_fwhm_rad)
 

@@ -4,9 +4,8 @@ A small board stands where the scan's surface is and is rendered twice: with one
 model turns both renders into frames, with the same draws of noise. What the recorded frames have of their own (noise,
 fixed pattern, texture, surface) is not in the difference, so they keep it.
 
-Not modelled: the surface's bend within the small board (its tangent plane stands for it), texture at the damage, light
-that reaches the damage by way of other surfaces, and a damage that makes pixels quieter: recorded noise is never taken
-away. The recorded range is not rounded a second time."""
+Not modelled: the surface's bend within the small board, texture at the damage, light that reaches it by way of other
+surfaces, and a damage that makes pixels quieter: recorded noise is never taken away. Range is not rounded anew."""
 
 from __future__ import annotations
 
@@ -32,9 +31,8 @@ AROUND_PX = 8  # pixels of the small board beyond those: its rim disturbs both r
 
 @dataclass(frozen=True)
 class Implant:
-    """A damage's difference on a ``region`` (h, w) of the recording's pixels. ``shift_m`` (h, w): change of z, 0 beyond
-    the damage's reach. ``noise_m`` (t, h, w): noise to add to frame t, 0 where the light does not grow weaker.
-    ``lost`` (t, h, w) bool: pixels that the damage makes invalid in frame t."""
+    """A damage's difference on a ``region`` (h, w) of the recording's pixels. ``shift_m`` (h, w): change of z.
+    ``noise_m`` (t, h, w): noise to add to frame t. ``lost`` (t, h, w) bool: what the damage makes invalid there."""
 
     region: Region
     shift_m: np.ndarray

@@ -1,6 +1,5 @@
-"""Cameras as the render needs them: lens, light, the footprints of pixels; and the view that the sensor gets of it.
-
-The view is the seam: slow to make, cached by content; all after it is NumPy and cheap. Slopes are x/z and y/z."""
+"""Cameras as the render needs them: lens, light, footprints of pixels; and the view that the sensor gets of it, which
+is slow to make and cached by content. Slopes are x/z and y/z."""
 
 from __future__ import annotations
 
@@ -21,13 +20,12 @@ FWHM_PER_DEVIATION = 2 * np.sqrt(2 * np.log(2))  # of a Gaussian
 class Optics:
     """The geometry of a camera's light, in the camera's frame. An imager looks through ``lens`` and is lit by a point
     at ``emitter_m`` (3,), of uniform intensity within a cone about the axis with a linear roll-off between two half
-    angles. A scanner sends its beam from the origin and receives at ``emitter_m``: light takes a path alike in both
-    directions (Helmholtz' reciprocity), so it is described as an imager whose pixels are beams and whose emitter is the
-    receiver. ``beam_fwhm_rad``: full width at half maximum of the beam, a round Gaussian in angle about the pixel's
-    central ray; None for an imager, whose pixel is evenly weighted between its corners. ``frequencies_hz``: where
-    phasors are wanted. ``margin_px``: pixels beyond a region whose light reaches it through the camera's own filter.
-    ``wavelength_nm``: at which surfaces need an albedo. The camera gives no range below ``nearest_m`` or beyond
-    ``farthest_m``, counted along its rays or its axis, whatever the light; they change no render."""
+    angles. A scanner sends its beam from the origin and receives at ``emitter_m``: by Helmholtz' reciprocity it is an
+    imager whose pixels are beams and whose emitter is the receiver. ``beam_fwhm_rad``: full width at half maximum of
+    the beam, a round Gaussian in angle about the pixel's central ray; None for an imager, whose pixel is evenly
+    weighted between its corners. ``frequencies_hz``: where phasors are wanted. ``margin_px``: pixels beyond a region
+    whose light reaches it through the camera's own filter. The camera gives no range below ``nearest_m`` or beyond
+    ``farthest_m``, along its rays or its axis; they change no render."""
 
     title: str
     lens: Lens
@@ -107,10 +105,9 @@ class Quadrilaterals:
 
 
 class Beams:
-    """A scanner's beams: round Gaussians in angle about the pixels' central rays, cut nowhere. Fine sub-rays lie on a
-    sunflower's spiral (Vogel, Mathematical Biosciences 44, 1979) at the radii of equal shares, so that a knife edge in
-    any direction takes its share of the Gaussian within 0.02. The coarse grid has the Gaussian's second moments. Angles
-    are taken as tangents: 1e-6 of themselves for milliradians."""
+    """A scanner's beams: round Gaussians in angle about the pixels' central rays. Fine sub-rays lie on a sunflower's
+    spiral (Vogel, Mathematical Biosciences 44, 1979) at the radii of equal shares: a knife edge takes its share of the
+    Gaussian within 0.02. The coarse grid has the Gaussian's second moments. Angles are taken as tangents."""
 
     def __init__(self, lens: Lens, region: Region, deviation_rad: float) -> None:
         self._slopes, self._deviation_rad = lens.region_slopes(region), deviation_rad
@@ -141,9 +138,8 @@ class Beams:
         across = np.cross([0.0, 1.0, 0.0], centre)
         across /= np.linalg.norm(across, axis=-1, keepdims=True)
         down = np.cross(centre, across)
-        x, y, z = (
-            centre[:, k, None] + across[:, k, None] * angles[:, 0] + down[:, k, None] * angles[:, 1] for k in range(3)
-        )
+        aside, below = angles.T
+        x, y, z = (centre[:, k, None] + across[:, k, None] * aside + down[:, k, None] * below for k in range(3))
         return np.stack([x / z, y / z], axis=-1)
 
 
@@ -181,9 +177,7 @@ class RenderConfig(Config):
     bounces: int = Field(10, ge=0, le=32, description="reflections beyond the first; albedo 0.6 leaves 0.4 % after 10")
     face_spacing_mm: float = Field(80.0, gt=0, description="grid of nodes on the face")
     face_samples: int = Field(8192, ge=8, description="paths for each node on the face")
-    hole_noise_mm: float = Field(
-        0.1, gt=0, description="aimed at in pixels inside the board's outline but off its face, as a deviation of range"
-    )
+    hole_noise_mm: float = Field(0.1, gt=0, description="range's deviation, aimed at in the outline but off the face")
     hole_samples: int = Field(8192, ge=8, description="paths for each of those pixels at most")
     rest_samples: int = Field(16, ge=8, description="paths for each pixel around the board")
     seed: int = Field(1, ge=0, le=1_000_000)

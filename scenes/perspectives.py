@@ -1,6 +1,5 @@
-"""Several views of one target: its pose for each, how well that is known beforehand, and whether a camera sees it.
-
-The room moves with the camera, as if the target were turned on a table before a camera that stands still."""
+"""Several views of one target: its pose for each, how well that is known beforehand, and whether a camera sees it. The
+room moves with the camera, as if the target were turned on a table."""
 
 from __future__ import annotations
 
@@ -34,11 +33,9 @@ def check_in_view(config: TargetConfig, optics: Optics) -> None:
             raise UserError(message, legal=legal, fix="change target.pose, or move the damage")
     range_m = face[..., 2] if optics.limits_along == "axis" else np.sqrt((face**2).sum(axis=-1))
     if range_m.max() < optics.nearest_m or range_m.min() > optics.farthest_m:
-        raise UserError(
-            f"the target's face lies {range_m.min():.3f} to {range_m.max():.3f} m from the camera",
-            legal=f"{optics.nearest_m:g} to {optics.farthest_m:g} m for {optics.title}",
-            fix="change target.pose.distance_m (or target.distance_m)",
-        )
+        message = f"the target's face lies {range_m.min():.3f} to {range_m.max():.3f} m from the camera"
+        legal = f"{optics.nearest_m:g} to {optics.farthest_m:g} m for {optics.title}"
+        raise UserError(message, legal=legal, fix="change target.pose.distance_m (or target.distance_m)")
 
 
 def seen_region(config: TargetConfig, optics: Optics) -> Region:
@@ -64,11 +61,9 @@ def _face_before_lens(config: TargetConfig) -> np.ndarray:
     face = transform_points(config.pose.T_camera_board, _face_grid_m(config.board, steps=OUTLINE_STEPS))
     nearest_m = float(face[..., 2].min())
     if nearest_m <= NEAREST_M:
-        raise UserError(
-            f"the target reaches to {nearest_m:.3f} m before the lens",
-            legal=f"all of the face at least {NEAREST_M:g} m in front of the camera",
-            fix="raise target.pose.distance_m (or target.distance_m) or lower its tilt",
-        )
+        legal = f"all of the face at least {NEAREST_M:g} m in front of the camera"
+        fix = "raise target.pose.distance_m (or target.distance_m) or lower its tilt"
+        raise UserError(f"the target reaches to {nearest_m:.3f} m before the lens", legal=legal, fix=fix)
     return face
 
 
@@ -76,9 +71,8 @@ MAX_VIEWS = 200
 
 
 class _Guess(Config):
-    """Error of the nominal pose of every view but the first, the guess from which a registration starts: it is turned
-    by ``guess_error_deg`` about a random axis through the target's centre, and shifted by ``guess_error_mm`` in a
-    random direction."""
+    """Error of the nominal pose of every view but the first, from which a registration starts: turned about a random
+    axis through the target's centre, and shifted in a random direction."""
 
     guess_error_deg: Annotated[float, Field(ge=0.0, le=45.0)] = 3.0
     guess_error_mm: Annotated[float, Field(ge=0.0, le=500.0)] = 10.0

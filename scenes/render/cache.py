@@ -1,5 +1,4 @@
-"""Renders kept by content: the key is everything that can change a number, the file carries its own checksum; and the
-folder of stored renders: what is in it, who uses it, and what goes when it grows too large."""
+"""Renders kept by content, in files with a checksum; what is in their folder, who uses it, and what goes from it."""
 
 from __future__ import annotations
 
@@ -30,12 +29,10 @@ from scenes.target.mesh import build_target
 
 CODE = ("scenes.render.view", "scenes.target.mesh")
 PACKAGES = ("mitsuba", "drjit", "trimesh", "manifold3d", "numba", "numpy", "scipy")
-"""A render's numbers are decided, beside its declaration, by these modules with all that they import and by the
-versions of these packages. The variant (GPU or processor) is left out: it changes them by 1e-6."""
-VIEW_VERSION = 2
-"""Stands in every file. One of another version counts as absent: rendering anew is always possible."""
-MOST_BYTES = 2 << 30
-"""A larger file is none of ours: a sensor of a million pixels at a hundred frequencies gives 1.7 GB."""
+"""Modules, with all that they import, and packages that decide a render's numbers. The variant (GPU or processor) is
+left out: it changes them by 1e-6."""
+VIEW_VERSION = 2  # in every file; one of another version counts as absent
+MOST_BYTES = 2 << 30  # a sensor of a million pixels at a hundred frequencies gives 1.7 GB
 CHECKSUM_BYTES = 16
 ARRAYS = tuple(f.name for f in fields(NoiseFreeView) if f.type == "np.ndarray")
 RENDER_NAME = re.compile(r"[0-9a-f]{16}\.npz")
@@ -143,8 +140,7 @@ def removed(files: Iterable[StoredFile]) -> list[StoredFile]:
 def longest_unused(renders: Iterable[StoredFile], limit_bytes: int, keep: Collection[Path]) -> list[StoredFile]:
     """Choose the renders that go so that all fit into ``limit_bytes``: the longest unused first, never those of
     ``keep`` (by name), so that the limit may still be exceeded."""
-    kept = {path.name for path in keep}
-    renders = sorted(renders, key=lambda file: (file.used_s, file.path.name))
+    kept, renders = {path.name for path in keep}, sorted(renders, key=lambda file: (file.used_s, file.path.name))
     excess, going = sum(file.size_bytes for file in renders) - limit_bytes, []
     for file in renders:
         if excess > 0 and file.path.name not in kept:

@@ -154,9 +154,9 @@ def cast(lit: LitScene, slopes: np.ndarray) -> Hits:
 def _even_moments(  # type: ignore[no-untyped-def]
     slopes, centre, normal, emitter, albedo, texture, uv_of, to_light, to_face
 ):
-    """Sum a pixel's light over sub-rays that meet the plane of its centre: ``slopes`` (n, m, 2); ``centre`` and
-    ``normal`` (n, 3). Writes moments (4, n) of order 0 to 3: of amplitude (1 at the centre, times the albedo) about the
-    centre's path, and of the albedo about its range. ``albedo`` (n,), negative where ``texture`` gives it."""
+    """Sum a pixel's light over sub-rays ``slopes`` (n, m, 2) on the plane of its ``centre`` and ``normal`` (n, 3) into
+    moments (4, n) of order 0 to 3: of amplitude (1 at the centre, times the albedo) about the centre's path, and of the
+    albedo about its range. ``albedo`` (n,), negative where ``texture`` gives it."""
     rows, columns = texture.shape
     n, m, _ = slopes.shape
     for i in range(n):
@@ -193,8 +193,8 @@ def _even_moments(  # type: ignore[no-untyped-def]
 
 
 def _of_moments(moments: np.ndarray, about_m: np.ndarray, frequencies_hz: tuple[float, ...]) -> np.ndarray:
-    """Return phasors (f, n) from moments (4, n) of lengths about ``about_m`` (n,), which differ by little from it: the
-    series of the exponential ends at the third order, 1e-6 of the light at 0.07 rad."""
+    """Return phasors (f, n) from moments (4, n) of lengths about ``about_m`` (n,): a series to the third order, good to
+    1e-6 of the light at 0.07 rad."""
     waves = wave_numbers(frequencies_hz)[:, None]
     zeroth, first, second, third = moments
     series = zeroth - waves**2 * second / 2 + 1j * (waves * first - waves**3 * third / 6)

@@ -37,10 +37,9 @@ def load_mitsuba() -> Any:
         return mi
     if "open3d" in sys.modules:
         # Both wheels bring a libc++.so.1; the first that is loaded serves both, and Open3D's is too old for LLVM.
-        raise UserError(
-            "Mitsuba cannot run: Open3D was imported before it, and its C++ library stands in for the one of LLVM",
-            fix="call scenes.render.scene.load_mitsuba() before importing open3d, or render in a process of its own",
-        )
+        message = "Mitsuba cannot run: Open3D was imported before it, and its C++ library stands in for the one of LLVM"
+        fix = "call scenes.render.scene.load_mitsuba() before importing open3d, or render in a process of its own"
+        raise UserError(message, fix=fix)
     raise UserError("Mitsuba cannot run: no NVIDIA GPU answers and no usable LLVM was found", legal=LEGAL, fix=FIX)
 
 
@@ -80,13 +79,12 @@ def _point_to_llvm() -> UserError | None:
 
 
 LIFT_M = 1e-5
-"""Distance from a surface at which a ray starts. float32 places hits within 1e-6 m in a room of metres; Mitsuba's own
-lift, 0.15 mm at 0.7 m, is a tenth of the smallest hole."""
+"""Distance from a surface at which a ray starts: float32 places hits within 1e-6 m; Mitsuba's own lift is 0.15 mm."""
 
 
 class Met(NamedTuple):
-    """Hits of rays, Dr.Jit arrays: whether there is one, its distance and place, the unit normal on the side from which
-    the ray came, the surface's index, the triangle's, and the direction back along the ray."""
+    """Hits of rays, Dr.Jit arrays: whether there is one, its distance and place, the unit normal towards the ray's
+    origin, the surface's index, the triangle's, and the direction back along the ray."""
 
     valid: Any
     distance: Any
@@ -99,12 +97,12 @@ class Met(NamedTuple):
 
 @dataclass(frozen=True)
 class LitScene:
-    """A target's parts as one Mitsuba mesh, with the emitter described beside it: a point with uniform intensity in a
-    soft-edged cone. Mitsuba supplies the rays' hits alone: one shape without materials needs no virtual calls, so that
-    all scenes share their compiled kernels. By triangle stand ``surface_of`` (index into ``parts``), ``normal_of`` and
-    ``on_face``; by surface ``albedos`` and, where any is glossy, ``gloss``: share and exponent of the lobes. The part
-    ``textured`` has ``texture`` at ``uv_of`` (2, 4), affine in place; -1, None and zeros where all are plain.
-    ``uv_factors``: the same as data, not as constants of a kernel, which would be compiled anew for each board."""
+    """A target's parts as one Mitsuba mesh, and the emitter: a point with uniform intensity in a soft-edged cone.
+    Mitsuba supplies the rays' hits alone: one shape without materials needs no virtual calls, so that all scenes share
+    their compiled kernels. By triangle stand ``surface_of`` (index into ``parts``), ``normal_of`` and ``on_face``; by
+    surface ``albedos`` and, where any is glossy, ``gloss``: share and exponent of the lobes. The part ``textured`` has
+    ``texture`` at ``uv_of`` (2, 4), affine in place; -1, None and zeros where all are plain. ``uv_factors``: the same
+    as data, as constants would compile the kernels anew for each board."""
 
     mi: Any
     scene: Any

@@ -32,7 +32,7 @@ PER_VERTEX = 2  # low-discrepancy dimensions at each vertex: a direction
 START_DIMENSIONS = 2
 CELLS, PROBES, OFTEN = 16, 2, 0.9
 """Cells along each side of the square of first directions from the face, probes along each side of a cell, and share
-of paths that begin in cells in which a probe met something; the rest begin anywhere, so that nothing is left out."""
+of paths that begin in cells in which a probe met something; the rest begin anywhere."""
 FLOATS_AT_ONCE = 1 << 26  # results held on the device at once: 0.25 GB
 FACE_WITHIN_M = 0.001 * MM  # vertices so near the undamaged face lie on it: Booleans leave them within 1 nm
 MESH_WITHIN_M = 0.05 * MM  # the same of a part from a mesh, whose heights stand on a grid
@@ -148,9 +148,9 @@ def _sobol(dimensions: int, longest: int, seed: int) -> np.ndarray:
 def _towards(
     lit: LitScene, bright: tuple[Any, Any, Any], place: Any, normal: Any, turned: Any, u1: Any, u2: Any
 ) -> Any:
-    """Return a direction from a surface and its weight, drawn evenly by its cosine (``turned``: one drawn so) or, from
-    before the rectangle ``bright``, with a chance of a half towards an even point of it: a mixture of both densities
-    (Veach and Guibas' balance heuristic), so that no weight exceeds 2. ``u1`` and ``u2`` in 0..1."""
+    """Return a direction from a surface and its weight, drawn by its cosine (``turned``) or, from before the rectangle
+    ``bright``, with a chance of a half towards an even point of it: a mixture of both densities (Veach and Guibas'
+    balance heuristic), so that no weight exceeds 2. ``u1`` and ``u2`` in 0..1."""
     import drjit as dr
 
     mi = lit.mi
@@ -300,8 +300,8 @@ def _gather(
 
 
 def _added(totals: list[Any], light: Any, length: Any, frequencies_hz: tuple[float, ...]) -> list[Any]:
-    """Add light of a path length to sums of real and imaginary parts, one pair a frequency, intensity last. A comb is
-    followed by multiplying with the phasor of its spacing: 1e-7 a line."""
+    """Add light of a path length to sums of real and imaginary parts by frequency, intensity last; along a comb by
+    multiplying with the phasor of its spacing: 1e-7 a line."""
     import drjit as dr
 
     out, waves, step_hz = [], wave_numbers(frequencies_hz), comb_step(frequencies_hz)
@@ -379,10 +379,8 @@ def between_nodes(nodes_x: np.ndarray, nodes_y: np.ndarray, x: np.ndarray, y: np
 RIM_PX = 3  # surroundings rendered beyond the board's outline, so that its rim looks as on the whole sensor
 NEAR_PX = 3  # beyond the outline, where edges behind the board are finely divided: a camera's filter mixes these in
 HOLE_RIM_PX = 1
-NARROW = ("through", "blind", "slot", "gouge", "chip")
-"""Kinds of damage that may lie between a pixel's corners and its centre."""
-PILOT_SAMPLES = 128
-"""Paths that tell a pixel's noise, within a third; half as many miss the rare bright ones far behind a hole."""
+NARROW = ("through", "blind", "slot", "gouge", "chip")  # may lie between a pixel's corners and its centre
+PILOT_SAMPLES = 128  # paths that tell a pixel's noise, within a third; fewer miss rare bright ones behind a hole
 PILOT_SEED = 1 << 20  # offset that keeps those apart from the ones that count
 
 

@@ -64,9 +64,7 @@ class CameraConfig(Config):
     """Camera of an experiment: its name, the unit and the effects that are on."""
 
     name: str = Field(
-        "azure_kinect_nfov",
-        description="a file of scenes/cameras/ without its ending, a camera of an installed package, or the path of a "
-        ".yaml file, from the experiment's folder",
+        "azure_kinect_nfov", description="of scenes/cameras/ or an installed package, or the path of a .yaml file"
     )
     unit_seed: int = Field(1, ge=0, description="which unit: its fixed pattern is drawn from this seed")
     effects: EffectsConfig = EffectsConfig()
@@ -78,9 +76,7 @@ class CameraConfig(Config):
         "nanometre; 0.04 is a room with 50 lux of daylight, 0.4 at a window (500 lux of sunlight), 80 full sun",
     )
     minutes_since_power_on: float = Field(60.0, ge=0, le=1e5, description="how far the unit has warmed up")
-    numbers: dict[str, Any] = Field(
-        {}, description="numbers of the camera's file to replace, such as lens.fx_px: 505.1, for one's own unit"
-    )
+    numbers: dict[str, Any] = Field({}, description="numbers of the file to replace, such as lens.fx_px: 505.1")
 
     def __hash__(self) -> int:
         # A mapping has no hash of its own, and workers keep by its declaration what they made of a camera.
@@ -131,13 +127,10 @@ def lens_names() -> dict[str, str]:
 def lens_named(name: str) -> OtherLens:
     """Return the nominal lens of a camera or depth mode, with those of its other modes; UserError for other names."""
     camera_name = lens_names().get(name, name)
-    camera = load_camera(camera_name)
-    own = camera.nominal_lens
-    plain = {camera_name: own, **{mode: facts.lens(own) for mode, facts in camera.modes.items()}}
-    lenses = {
-        mode: OtherLens(**vars(lens), note=f"the lens is the nominal one of {mode}", mode=mode, unit_m=camera.z_step_m)
-        for mode, lens in plain.items()
-    }
+    lenses = {}
+    for mode in (camera_name, *load_camera(camera_name).modes):
+        camera, note = load_camera(mode), f"the lens is the nominal one of {mode}"
+        lenses[mode] = OtherLens(**vars(camera.nominal_lens), note=note, mode=mode, unit_m=camera.z_step_m)
     return replace(lenses[name], others=tuple(lenses.values()))
 
 

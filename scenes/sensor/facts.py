@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Annotated, Any, Generic, Literal, Self, TypeVar
 
 import numpy as np
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import MM, Lens, Region
@@ -117,22 +117,6 @@ class LensFacts(Config):
         return Lens(width, height, self.fx_px.value, self.fy_px.value, *centre, (*terms, *(0.0,) * 8)[:8])
 
 
-class ModeFacts(Config):
-    """Another depth mode behind the same lens. ``first_px``: column and row of its first pixel's corner, ``side_px``:
-    the side of its pixels, both in pixels of the file's own mode."""
-
-    width_px: PositiveInt
-    height_px: PositiveInt
-    first_px: Fact[tuple[float, float]]
-    side_px: Positive
-
-    def lens(self, own: Lens) -> Lens:
-        """The mode's lens, where ``own`` is that of the file's own mode."""
-        side, (column, row) = self.side_px.value, self.first_px.value
-        cx, cy = (own.cx + 0.5 - column) / side - 0.5, (own.cy + 0.5 - row) / side - 0.5
-        return Lens(self.width_px.value, self.height_px.value, own.fx / side, own.fy / side, cx, cy, own.distortion)
-
-
 class UnitFacts(Config):
     """Differences of a unit from the nominal camera, and of its frames from each other. ``offset_mm``: deviation
     between units of a constant error of range. ``drift_mm`` exp(-t / ``drift_min``): error of range after power-on,
@@ -203,8 +187,9 @@ class CameraFacts(Config):
     lens: LensFacts
     unit: UnitFacts
     engine: OutputFacts
-    modes: dict[str, ModeFacts] = Field(default_factory=dict, exclude=True)
-    """Other modes by name: only their images are known. No simulation uses them, so that digests leave them out."""
+    modes: Annotated[tuple[str, ...], BeforeValidator(tuple)] = Field((), exclude=True)
+    """Cameras that are other modes of this one; no simulation uses them, so that digests leave them out. A mapping's
+    keys count too, as files have had them."""
 
     @cached_property
     def nominal_lens(self) -> Lens:

@@ -12,12 +12,9 @@ from numba.extending import intrinsic
 FAST: Any = {"cache": True, "fastmath": {"nsz"}, "error_model": "numpy", "nogil": True}
 """Options of all kernels of the cameras: operations are neither reordered nor fused, so that every processor gives the
 same bits. No assumption of finiteness: an unlit pixel may divide by zero and is gated out later."""
-EXACT_SUMS: Any = {**FAST, "fastmath": {"nsz", "reassoc"}}
-"""The same for sums of whole numbers that float32 holds, which are exact in any order and so may be vector code."""
-
+EXACT_SUMS: Any = {**FAST, "fastmath": {"nsz", "reassoc"}}  # of whole numbers that float32 holds, exact in any order
 IN_DOUBLE: Any = {**FAST, "fastmath": {"contract", "reassoc", "arcp", "nsz"}}
 """The same for float64 sums that are rounded to float32 afterwards: their order moves a range by 1e-13 m."""
-
 TWO_PI = np.float32(2.0 * math.pi)
 
 
@@ -58,9 +55,8 @@ def _sincos_turns(v):  # type: ignore[no-untyped-def]
     x = (v - quarter * np.float32(0.25)) * TWO_PI
     x2 = x * x
     sine = x * (np.float32(1) + x2 * (np.float32(-1 / 6) + x2 * (np.float32(1 / 120) + x2 * np.float32(-1 / 5040))))
-    cosine = np.float32(1) + x2 * (
-        np.float32(-0.5) + x2 * (np.float32(1 / 24) + x2 * (np.float32(-1 / 720) + x2 * np.float32(1 / 40320)))
-    )
+    series = np.float32(1 / 24) + x2 * (np.float32(-1 / 720) + x2 * np.float32(1 / 40320))
+    cosine = np.float32(1) + x2 * (np.float32(-0.5) + x2 * series)
     k = np.int32(quarter)
     odd = (k & np.int32(1)) == np.int32(1)
     a = cosine if odd else sine

@@ -35,11 +35,9 @@ def check_target(config: custom.TargetConfig) -> None:
         problems += _overlap_problems([damage for damage in config.damages if not found[damage.id]], board, face)
         problems += _tape_problems(config) + _pose_problems(config)
     if problems:
-        raise UserError(
-            "the target cannot be built:\n" + "\n".join(f"  - {problem}" for problem in problems),
-            legal="damage and tape lie on the board, apart from one another, and no deeper than it is thick",
-            fix="change the numbers named above in the target's declaration",
-        )
+        told = "the target cannot be built:\n" + "\n".join(f"  - {problem}" for problem in problems)
+        legal = "damage and tape lie on the board, apart from one another, and no deeper than it is thick"
+        raise UserError(told, legal=legal, fix="change the numbers named above in the target's declaration")
 
 
 def _name(damage: custom.AnyDamage) -> str:
@@ -65,10 +63,9 @@ def _board_problems(board: custom.BoardConfig) -> list[str]:
         if isinstance(shape, custom.CylinderConfig):
             reach = half_x if shape.straight_along == "y" else half_y
         if shape.radius_mm * 0.8 < reach:
-            return [
-                f"board: a {shape.kind} of radius {shape.radius_mm:g} mm is too small for {_size(board)}, which "
-                f"reaches {reach:g} mm from its middle: the radius must be {reach / 0.8:g} mm or more"
-            ]
+            small = f"a {shape.kind} of radius {shape.radius_mm:g} mm is too small for {_size(board)}"
+            needed = f"the radius must be {reach / 0.8:g} mm or more"
+            return [f"board: {small}, which reaches {reach:g} mm from its middle: {needed}"]
     face = face_of(board)
     x, y = np.meshgrid(np.linspace(-half_x, half_x, 65) * MM, np.linspace(-half_y, half_y, 65) * MM)
     steepest, tightest = (float(np.abs(of(x, y)).max()) for of in (face.slope, face.curvatures))
@@ -79,10 +76,10 @@ def _board_problems(board: custom.BoardConfig) -> list[str]:
         if board.thickness_mm * MM <= 2 * (depth_m := float(-face.height_m(x, y).min())):
             return [f"board: {board.thickness_mm:g} mm is too thin for a rough face of {depth_m / MM:.3g} mm depth"]
     elif board.thickness_mm * MM * tightest > THICKEST_BEND:
-        return [
-            f"board: radius of curvature {1 / tightest / MM:.3g} mm is too small for a thickness of "
-            f"{board.thickness_mm:g} mm; it must be {board.thickness_mm / THICKEST_BEND:g} mm or more"
-        ]
+        small = (
+            f"radius of curvature {1 / tightest / MM:.3g} mm is too small for a thickness of {board.thickness_mm:g} mm"
+        )
+        return [f"board: {small}; it must be {board.thickness_mm / THICKEST_BEND:g} mm or more"]
     return []
 
 

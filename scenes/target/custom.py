@@ -224,9 +224,7 @@ class GlossConfig(Config):
     more light leave than the albedo says. Not modelled: the growth at grazing angles (Fresnel)."""
 
     share: Albedo
-    exponent: float = Field(
-        ge=1.0, le=500.0, description="a lobe 50 degrees wide at half its height has 7, one of 10 degrees 180"
-    )
+    exponent: float = Field(ge=1.0, le=500.0, description="7: 50 degrees wide at half height; 180: 10 degrees")
 
 
 class TextureConfig(_FileConfig):
@@ -241,9 +239,7 @@ class ReflectanceConfig(Config):
 
     albedo_850: Albedo = Field(0.6, description="pale wood: 0.5 to 0.7; no published value for plywood found")
     rgb: Rgb = (0.55, 0.42, 0.28)
-    grain_contrast: float = Field(
-        0.05, ge=0.0, le=0.3, description="standard deviation of the albedo over its mean, before clipping to 0..1"
-    )
+    grain_contrast: float = Field(0.05, ge=0.0, le=0.3, description="the albedo's deviation over its mean, unclipped")
     grain_period_mm: Annotated[float, Field(ge=1.0, le=200.0)] = Field(default=8.0, description="between dark lines")
     gloss: GlossConfig | None = None
     texture: TextureConfig | None = None
@@ -288,9 +284,8 @@ class WavelengthConfig(Config):
     back_wall: Albedo | None = None
 
 
-OtherWavelengths = Annotated[
-    tuple[WavelengthConfig, ...], Field(max_length=20, description="for cameras that do not work near 850 nm")
-]
+_OTHER = Field(max_length=20, description="for cameras that do not work near 850 nm")
+OtherWavelengths = Annotated[tuple[WavelengthConfig, ...], _OTHER]
 
 
 class PoseConfig(Config):
@@ -380,10 +375,8 @@ class TargetConfig(Config):
             surfaces |= {"floor": room.floor_below_lens_m, "back_wall": room.back_wall_distance_m}
         lacking = [name for name, there in surfaces.items() if there and getattr(albedos, name) is None]
         if lacking:
-            raise UserError(
-                f"other_wavelengths: at {albedos.wavelength_nm:g} nm there is no albedo for {', '.join(lacking)}",
-                legal="an albedo for every surface that the target has",
-            )
+            told = f"other_wavelengths: at {albedos.wavelength_nm:g} nm there is no albedo for {', '.join(lacking)}"
+            raise UserError(told, legal="an albedo for every surface that the target has")
         changed: dict[str, Any] = {"material": self.material.model_copy(update={"albedo_850": albedos.board})}
         changed["tapes"] = tuple(tape.model_copy(update={"albedo_850": albedos.tape}) for tape in self.tapes)
         if self.backing is not None:

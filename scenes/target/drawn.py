@@ -27,7 +27,7 @@ from scenes.target.checks import LEAST_WEB_MM, SHALLOWEST_BEND, WIDEST_BEND, off
 from scenes.target.truth import OUTLINE_STEPS, backing_corners_board_m, face_grid_m, face_of, outline_board_m
 
 Purpose = Literal["learning", "calibration", "hole_free", "damaged"]
-"""For detectors to learn on, to set a threshold, to count false calls, to be inspected: each has boards of its own."""
+"""Boards on which detectors learn, thresholds are set, false calls counted, damage inspected: each has its own."""
 NEAREST_M, FARTHEST_M = 0.1, 10.0  # limits of a pose's distance, jitter included
 WIDEST_BACKING_MM = 1e4  # that a declaration allows
 ATTEMPTS, TRIES = 50, 400
@@ -317,13 +317,13 @@ class DrawnTargetConfig(Config):
             best = max(best, len(places))
             if best == count:
                 return places
-        raise UserError(
+        full = (
             f"a board of {board.width_mm:g} x {board.height_mm:g} mm is too full for {count} damages whose centres are "
-            f"{self.apart_mm:g} mm apart and {margin_mm:.4g} mm off its edge: {best} found a place on the "
-            f"{2 * half[0]:g} x {2 * half[1]:g} mm that are left",
-            legal=f"fewer than {best} damages on this board" if best > 1 else None,
-            fix="lower damage.per_board, damage.diameter_mm, apart_mm or edge_mm, or declare a larger board",
         )
+        full += f"{self.apart_mm:g} mm apart and {margin_mm:.4g} mm off its edge: {best} found a place on the "
+        full += f"{2 * half[0]:g} x {2 * half[1]:g} mm that are left"
+        fix = "lower damage.per_board, damage.diameter_mm, apart_mm or edge_mm, or declare a larger board"
+        raise UserError(full, legal=f"fewer than {best} damages on this board" if best > 1 else None, fix=fix)
 
     def _edge_places_mm(self, rng: np.random.Generator) -> np.ndarray:
         """Draw (per_board, 3): points on the board's edges in plan, apart and off corners, with the edge's angle."""

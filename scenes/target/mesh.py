@@ -43,12 +43,9 @@ if TYPE_CHECKING:
 TEXEL_MM = 0.6  # finer than a pixel's footprint (1.4 mm at 0.7 m for the finest camera), made in 40 ms
 MAX_TEXELS = 4096  # along a side: a board of metres gets coarser texels instead of gigabytes
 MOST_IMAGE_BYTES = 1 << 28
-LINE_WEIGHT, FIBRE_WEIGHT = 0.8, 0.6
-"""Amplitudes of growth lines and fibres in the pattern (their squares add to 1). A guess, as are the lengths below."""
-WANDER_MM, WANDER_ACROSS_MM, WANDER_ALONG_MM = 6.0, 60.0, 240.0
-"""Wander of growth lines (standard deviation), and its lengths across and along x."""
-FIBRE_LENGTH_MM, FIBRE_WIDTH_MM = 12.0, 0.5
-"""Correlation lengths of the fibres along and across x."""
+LINE_WEIGHT, FIBRE_WEIGHT = 0.8, 0.6  # of growth lines and fibres in the pattern: guesses, as are the lengths below
+WANDER_MM, WANDER_ACROSS_MM, WANDER_ALONG_MM = 6.0, 60.0, 240.0  # of growth lines: deviation, lengths across, along x
+FIBRE_LENGTH_MM, FIBRE_WIDTH_MM = 12.0, 0.5  # correlation lengths of the fibres along and across x
 
 
 def grain(material: MaterialConfig, width_mm: float, height_mm: float) -> np.ndarray:
@@ -116,13 +113,12 @@ COARSEST_SAGITTA_M, FINEST_SAGITTA_M = 2e-6, 0.1e-6
 ROUGH_SAGITTA_M = 8e-5  # the same at the sharpest crest of a rough face; elsewhere a tenth of it
 TAPE_SINK_M = 0.1e-3  # depth of a strip's underside in the board, so that no two surfaces coincide
 CORNER_M = 4e-6
-"""Distance by which the corners of a circle's polygon may stand outside it; sides lie half as far inside, and both have
-the same area. A render's rays take the longer the more sides there are: 2 mm get 28, 1 in 104."""
+"""Distance by which the corners of a circle's polygon, of the same area, may stand outside it: 28 for 2 mm, 104 for 1
+in. More take a render's rays longer."""
 RINGS = 48  # steps of a dent's profile from pole to rim: volume short by 1 / (3 RINGS^2) = 0.014 %
 CELL_M, MOST_ALONG = 0.03, 64
 """Longest edge of a damaged board's triangles, and the number of these along its sides from which on they are longer.
-Triangles from the facets of a hole to the board's corners would take rays twice as long to pass, and a renderer in
-float32 misses their plane by the length squared over the width times 1e-7, 0.1 mm at 1 m."""
+Longer ones slow rays down, and a renderer in float32 misses their plane, by 0.1 mm at 1 m."""
 SPARE_M = 0.2 * MM  # least distance by which a cutter reaches beyond the face
 MAX_CELLS = 1_000_000  # of a bent sheet: some 300 MB
 
@@ -350,8 +346,8 @@ def cutter(damage: Damage, declared: HoleConfig | DentConfig) -> trimesh.Trimesh
 def subtract(
     body: trimesh.Trimesh, cutters: Sequence[trimesh.Trimesh], added: Sequence[trimesh.Trimesh] = ()
 ) -> trimesh.Trimesh:
-    """Return body and what is added, minus cutters, by Manifold, watertight. Called directly, because trimesh's own
-    wrapper rounds to float32: 30 nm on a board of 0.6 m, 1e-3 of the facets of a 1/16 in hole."""
+    """Return body and what is added, minus cutters, by Manifold, watertight; not by trimesh's wrapper, which rounds to
+    float32: 30 nm on a board of 0.6 m, 1e-3 of the facets of a 1/16 in hole."""
     import manifold3d  # type: ignore[import-not-found]
     import trimesh
 

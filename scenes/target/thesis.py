@@ -42,9 +42,7 @@ class ThesisTargetConfig(Config):
     hole_spacing_mm: Annotated[float, Field(ge=30.0, le=100.0)] = _open(
         50.8, "2 in by the ruler readings of holes 4 to 11; taken to be the same for 1 to 3."
     )
-    board_width_mm: Annotated[float, Field(ge=100.0, le=5e3)] = _open(
-        609.6, "24 in, a stock size; the row needs 20 in."
-    )
+    board_width_mm: Annotated[float, Field(ge=100.0, le=5e3)] = _open(609.6, "24 in, a stock size; the row needs 20.")
     board_height_mm: Annotated[float, Field(ge=30.0, le=5e3)] = _open(114.3, "4.5 in: the row, and tape on both sides.")
     row_offset_y_mm: Annotated[float, Field(ge=-2e3, le=2e3)] = _open(0.0, "The row is centred.")
     distance_m: Annotated[float, Field(ge=0.3, le=5.0)] = _open(
@@ -52,16 +50,12 @@ class ThesisTargetConfig(Config):
     )
     offset_x_mm: custom.Coordinate = _open(0.0, "A board is put before the camera's centre.")
     offset_y_mm: custom.Coordinate = _open(0.0, "A board is put before the camera's centre.")
-    tilt_x_deg: Degrees = _open(
-        3.0, "A sheet put up by hand is never frontal; a frontal one would hide noise under the rounding to 1 mm."
-    )
+    tilt_x_deg: Degrees = _open(3.0, "No sheet put up by hand is frontal; a frontal one would hide noise by rounding.")
     tilt_y_deg: Degrees = _open(4.0, "As tilt_x_deg.")
     roll_deg: Annotated[float, Field(ge=-180.0, le=180.0)] = _open(0.0, "A board is set down level.")
     plywood_albedo_850: custom.Albedo = _open(0.6, "Pale wood: 0.5 to 0.7. No published value for plywood was found.")
     plywood_rgb: custom.Rgb = _open((0.55, 0.42, 0.28), "Pale wood. A guess.")
-    grain_contrast: Annotated[float, Field(ge=0.0, le=0.3)] = _open(
-        0.05, "The albedo's deviation over its mean. A guess."
-    )
+    grain_contrast: Annotated[float, Field(ge=0.0, le=0.3)] = _open(0.05, "Deviation over mean of the albedo. A guess.")
     grain_period_mm: Annotated[float, Field(ge=1.0, le=200.0)] = _open(8.0, "Dark lines of a softwood veneer. A guess.")
     grain_seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = _open(1, "Which board out of all alike.")
     tape_length_mm: custom.Length = _open(40.0, "Four strips, one near each corner, clear of the row.")

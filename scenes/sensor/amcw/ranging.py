@@ -223,9 +223,8 @@ def _range_and_gates(  # type: ignore[no-untyped-def]
             range_m = (FOUR * path * path - geometry[1, i]) / (FOUR * path - TWO * geometry[0, i])
             z = range_m * geometry[2, i]
             limited = z if gates.axial > f4(0) else range_m
-            at = GateInputs(
-                steepest, least, greatest, sum_of_all, residual2[i - start], greatest, range_m, limited, limited
-            )
+            r2 = residual2[i - start]
+            at = GateInputs(steepest, least, greatest, sum_of_all, r2, greatest, range_m, limited, limited)
             code = first_failed(gates, at)
             code = SATURATED if saturated[i] != np.uint8(0) else code
             code = OUTSIDE_MASK if outside_mask[i] else code
