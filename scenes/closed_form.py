@@ -73,8 +73,7 @@ def layered_view(
     footprint = footprint_of(lens, region, optics.beam_fwhm_rad)
 
     def meet(rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return for rays (..., 2): whether they meet the front, where they end (..., 3), the light there, its path in
-        m, and whether they end in the front's shadow."""
+        """Tell whether rays (..., 2) meet the front; where they end, light, path in m, and if in the front's shadow."""
         on_front = covers(rays)
         front_points, front_light, front_path = _lit(rays, front, albedo, optics)
         points, light, path_m = _lit(rays, back, albedo, optics)

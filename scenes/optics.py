@@ -152,8 +152,7 @@ class NoiseFreeView:
     frequency 0. ``indirect_noise_m`` (h, w): one standard deviation of range that the Monte Carlo part leaves in a
     pixel. ``range_m`` (h, w): true distance from the lens along the pixel's central ray, NaN where it meets nothing.
     ``surface`` (h, w) int16: index into ``surface_names`` at the central ray, -1 for nothing. ``coverage`` (h, w):
-    fraction of the footprint on the central ray's surface. ``rgb`` (h, w, 3) float32 albedo, 0..1. ``slopes`` (h, w,
-    2): x/z and y/z of the central rays."""
+    fraction of the footprint on that surface. ``rgb`` (h, w, 3) float32 albedo. ``slopes`` (h, w, 2): x/z, y/z."""
 
     region: Region
     frequencies_hz: tuple[float, ...]

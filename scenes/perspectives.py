@@ -21,8 +21,7 @@ from scenes.target.truth import OUTLINE_STEPS, face_grid_m, face_of
 
 def check_in_view(config: TargetConfig, optics: Optics) -> None:
     """Raise UserError where all of the face, or all damage, is out of the camera's field of view, or all of the face
-    out of its range. A face partly out of view or range is legal: damage out of view is no target, and pixels out of
-    range have none."""
+    out of its range. A face partly out of view or range is legal; damage out of view is no target."""
     face, places = _face_before_lens(config), np.array([damage.centre_m for damage in config.damages]).reshape(-1, 2)
     centres = transform_points(config.pose.T_camera_board, face_of(config.board).point(*places.T))
     if not len(centres) or not optics.lens.images(centres).any():  # where damage is in view, a part of the face is

@@ -34,7 +34,7 @@ FRAMES = 4
 AT = {"id": 1, "centre_mm": (12.0, -6.0)}
 HOLE = {"holes": (custom.HoleConfig(diameter_mm=7.0, **AT),)}
 SLOT = {"flaws": (flaws.SlotConfig(kind="slot", length_mm=30.0, width_mm=6.0, angle_deg=25.0, depth_mm=5.0, **AT),)}
-BUMP = {"flaws": (flaws.PressedConfig(kind="pressed_bump", diameter_mm=25.0, depth_mm=3.0, **AT),)}
+BUMP = {"flaws": (flaws.RoundConfig(kind="pressed_bump", diameter_mm=25.0, depth_mm=3.0, **AT),)}
 
 
 def board(width_mm: float, pose: custom.PoseConfig, **damage: Any) -> custom.TargetConfig:

@@ -29,8 +29,7 @@ from scenes.target.mesh import build_target
 
 CODE = ("scenes.render.view", "scenes.target.mesh")
 PACKAGES = ("mitsuba", "drjit", "trimesh", "manifold3d", "numba", "numpy", "scipy")
-"""Modules, with all that they import, and packages that decide a render's numbers. The variant (GPU or processor) is
-left out: it changes them by 1e-6."""
+"""Modules, with all that they import, and packages that decide a render's numbers; the variant changes 1e-6."""
 VIEW_VERSION = 2  # in every file; one of another version counts as absent
 MOST_BYTES = 2 << 30  # a sensor of a million pixels at a hundred frequencies gives 1.7 GB
 CHECKSUM_BYTES = 16
@@ -44,8 +43,7 @@ RENDERING, LOCK = ".rendering", ".lock"
 
 
 def render_key(target: TargetConfig, optics: Optics, config: RenderConfig) -> str:
-    """Return the digest of what a render depends on: target, the camera's optics, work, and the code. Cameras that
-    differ in noise and engine alone share renders."""
+    """Return the digest of what a render depends on: target, the camera's optics (not its engine), work and code."""
     content = {"target": target.to_data(), "optics": optics.content(), "render": config.to_data()}
     return digest({"code": source_digest(CODE, PACKAGES), **content})
 
@@ -151,8 +149,7 @@ def longest_unused(renders: Iterable[StoredFile], limit_bytes: int, keep: Collec
 
 def trim_cache(folder: Path, limit_bytes: int, keep: Collection[Path] = ()) -> int:
     """Remove the longest unused renders until the rest fits into ``limit_bytes``, never those of ``keep``, and old
-    leftovers of killed processes; nothing where another process uses the folder (`in_use`). Returns how many are left.
-    """
+    leftovers of killed processes; nothing while another process uses the folder. Returns how many are left."""
     with contextlib.suppress(UserError), alone(folder):
         removed([*longest_unused(stored_renders(folder), limit_bytes, keep), *leftovers(folder)])
     return len(stored_renders(folder))
@@ -171,8 +168,7 @@ def in_use(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def alone(folder: Path) -> Iterator[None]:
-    """Let no sweep use this folder while renders are removed. Raises UserError where one does, or where the folder
-    cannot be written."""
+    """Let no sweep use this folder meanwhile. Raises UserError where one does, or the folder cannot be written."""
     with contextlib.ExitStack() as held:
         try:
             file = held.enter_context(opened_lock(folder / LOCK))

@@ -1,5 +1,4 @@
-"""The direct part of a view: emitter to surface to pixel, deterministic, fine where a footprint meets an edge.
-Sub-rays of a footprint have equal weight."""
+"""The direct part of a view: emitter to surface to pixel, deterministic, fine where a footprint meets an edge."""
 
 from __future__ import annotations
 
@@ -84,9 +83,8 @@ def _sum_comb(amplitude: np.ndarray, path_m: np.ndarray, first: float, step: flo
 
 
 class Hits(NamedTuple):
-    """Hits of n rays from the lens, float32: range (NaN where a ray met nothing), path out and back, amplitude of
-    direct light, albedo, surface (int32, -1 for nothing), texture place (n, 2), whether it is the board's undamaged
-    face, and the unit normal (n, 3)."""
+    """Hits of n rays from the lens, float32: range (NaN for nothing), path out and back, amplitude of direct light,
+    albedo, surface (int32, -1 for nothing), texture place (n, 2), whether on the undamaged face, unit normal (n, 3)."""
 
     range_m: np.ndarray
     path_m: np.ndarray
@@ -193,8 +191,7 @@ def _even_moments(  # type: ignore[no-untyped-def]
 
 
 def _of_moments(moments: np.ndarray, about_m: np.ndarray, frequencies_hz: tuple[float, ...]) -> np.ndarray:
-    """Return phasors (f, n) from moments (4, n) of lengths about ``about_m`` (n,): a series to the third order, good to
-    1e-6 of the light at 0.07 rad."""
+    """Return phasors (f, n) from moments (4, n) of lengths about ``about_m`` (n,): a series, 1e-6 off at 0.07 rad."""
     waves = wave_numbers(frequencies_hz)[:, None]
     zeroth, first, second, third = moments
     series = zeroth - waves**2 * second / 2 + 1j * (waves * first - waves**3 * third / 6)
@@ -202,8 +199,7 @@ def _of_moments(moments: np.ndarray, about_m: np.ndarray, frequencies_hz: tuple[
 
 
 class _Sums:
-    """Sums of direct light over a region's pixels, flat, while they are made: fields as of `DirectLight`. What is added
-    to a pixel replaces what was there."""
+    """Direct light of a region's pixels, flat, while it is made: fields as of `DirectLight`. What is added replaces."""
 
     def __init__(self, lit: LitScene, slopes: np.ndarray, footprint: Footprint, frequencies_hz: Frequencies) -> None:
         self.lit, self.footprint, self.frequencies_hz = lit, footprint, frequencies_hz
@@ -234,8 +230,7 @@ class _Sums:
         self._keep_off_face(here[~on], np.ones((int((~on).sum()), rays.shape[1]), bool), rays[~on])
 
     def add_rays(self, here: np.ndarray, rays: np.ndarray, again: np.ndarray | None = None) -> np.ndarray:
-        """Add the light of sub-rays (n, m, 2) of pixels. Returns those of ``again`` (h w,) bool in which too large an
-        error is left: they are to be divided once more."""
+        """Add the light of sub-rays (n, m, 2) of pixels; returns those of ``again`` (h w,) to be divided once more."""
         m = rays.shape[1]
         hits = cast(self.lit, rays.reshape(-1, 2))
         range_m, path_m, amplitude, albedo, surface = (each.reshape(-1, m) for each in hits[:5])

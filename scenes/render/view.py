@@ -95,8 +95,7 @@ def gather_at_points(
 
 
 def gather_in_pixels(lit: LitScene, rays: OffFace, work: PathWork, samples: int | np.ndarray) -> np.ndarray:
-    """Gather indirect light (mean over the listed sub-rays of each pixel, its share of the footprint left out) with
-    ``samples`` paths each, a number or (p,)."""
+    """Gather indirect light, the mean over the listed sub-rays of each pixel, with ``samples`` paths, (p,) or one."""
     import drjit as dr
 
     mi = lit.mi
@@ -186,8 +185,7 @@ class _Walk:
     """Paths from places, backwards. ``start`` (place, u1, u2): point from which the path's length counts, origin,
     direction and weight of the first ray. ``on_surface``: light that reaches the first hit directly counts (for a start
     at the lens it is the direct part), and all places share one rotation of the low-discrepancy points (modulo 1).
-    ``bright``: as of `gather_at_points`. ``longest``: points a batch at most. What differs from board to board is data,
-    as a constant of the kernel would compile it anew."""
+    ``longest``: points a batch at most. What differs from board to board is data: a constant would compile anew."""
 
     def __init__(self, lit: LitScene, start: Any, work: PathWork, on_surface: bool, bright: Any, longest: int) -> None:
         import drjit as dr
@@ -228,8 +226,7 @@ class _Walk:
         throughput: Any,
         totals: list[Any],
     ) -> tuple[Any, ...]:
-        """Go on by a vertex; a lane whose path ends begins its next one. ``before``: the point from which the ray
-        comes; ``length``: of the path up to there."""
+        """Go on by a vertex, or begin the next path. ``length``: up to ``before``, from which the ray comes."""
         import drjit as dr
 
         lit, mi, fresh = self.lit, self.lit.mi, vertex == 0
@@ -300,8 +297,7 @@ def _gather(
 
 
 def _added(totals: list[Any], light: Any, length: Any, frequencies_hz: tuple[float, ...]) -> list[Any]:
-    """Add light of a path length to sums of real and imaginary parts by frequency, intensity last; along a comb by
-    multiplying with the phasor of its spacing: 1e-7 a line."""
+    """Add light of a path length to real and imaginary sums by frequency, intensity last; of a comb by recurrence."""
     import drjit as dr
 
     out, waves, step_hz = [], wave_numbers(frequencies_hz), comb_step(frequencies_hz)
@@ -332,9 +328,8 @@ def face_triangles(target: Target) -> list[np.ndarray]:
 def face_light(
     lit: LitScene, target: Target, direct: DirectLight, slopes: np.ndarray, work: PathWork, config: RenderConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return indirect light by way of the face in the pixels that see any of it, in the order of `numpy.nonzero` of
-    ``direct.face[-1]``: mean (f + 1, n), and batches (B, l, n) at the frequencies of `noise_lines`. Nodes see no holes
-    in the face."""
+    """Return indirect light by way of the face (its holes left out) in the pixels that see any of it, in the order of
+    `numpy.nonzero` of ``direct.face[-1]``: mean (f + 1, n), and batches (B, l, n) at the frequencies `noise_lines`."""
     seen = direct.face[-1].real > 0
     rays = np.concatenate([slopes[seen], np.ones((int(seen.sum()), 1))], axis=-1)
     rays *= (direct.face_range_m[seen] / np.linalg.norm(rays, axis=-1))[..., None]
@@ -361,9 +356,8 @@ def face_light(
 
 
 def between_nodes(nodes_x: np.ndarray, nodes_y: np.ndarray, x: np.ndarray, y: np.ndarray) -> sparse.csr_array:
-    """Return bilinear weights (n, len(nodes_y) len(nodes_x)) of evenly spaced nodes, row by row, at n places between
-    them. Light from a surface a distance D away bends over a spacing s by (s/D)^2/8 of itself: 2e-3 at 80 mm and 0.7 m.
-    """
+    """Return bilinear weights (n, len(nodes_y) len(nodes_x)) of evenly spaced nodes, row by row, at n places: (s/D)^2/8
+    off, s the spacing, D the distance of what shines: 2e-3 at 80 mm and 0.7 m."""
     columns, parts = len(nodes_x), []
     for nodes, values in ((nodes_x, x), (nodes_y, y)):
         place = (values - nodes[0]) / (nodes[1] - nodes[0])
@@ -473,8 +467,7 @@ def indirect_light(
 def _samples_inside(
     lit: LitScene, rays: OffFace, total: np.ndarray, work: PathWork, config: RenderConfig
 ) -> int | np.ndarray:
-    """Return how many paths bring a pixel inside the outline down to ``hole_noise_mm``, as a few of them tell, which
-    are thrown away: kept, they would bias the mean."""
+    """Return how many paths bring a pixel down to ``hole_noise_mm``, as a few tell, which kept would bias the mean."""
     if config.hole_samples <= PILOT_SAMPLES:
         return config.hole_samples
     pilot = gather_in_pixels(lit, rays, dataclasses.replace(work, seed=work.seed + PILOT_SEED), PILOT_SAMPLES)

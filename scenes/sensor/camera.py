@@ -89,8 +89,7 @@ def camera_names() -> tuple[str, ...]:
 
 
 def camera_file(name: str) -> Path:
-    """Return the file of that camera, which a name that ends in ``.yaml`` is the path of. Raises UserError for a name
-    that is unknown or taken twice, or has no file."""
+    """Return the file of a camera, or of a path. Raises UserError for a name unknown, taken twice or without a file."""
     if is_camera_path(name):
         return Path(name)
     offer = CAMERAS.offer(name)

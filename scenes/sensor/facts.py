@@ -188,8 +188,7 @@ class CameraFacts(Config):
     unit: UnitFacts
     engine: OutputFacts
     modes: Annotated[tuple[str, ...], BeforeValidator(tuple)] = Field((), exclude=True)
-    """Cameras that are other modes of this one; no simulation uses them, so that digests leave them out. A mapping's
-    keys count too, as files have had them."""
+    """Cameras that are other modes of this one, or a mapping by their names; no simulation uses them."""
 
     @cached_property
     def nominal_lens(self) -> Lens:

@@ -20,8 +20,7 @@ TWO_PI = np.float32(2.0 * math.pi)
 
 @numba.njit(**FAST)
 def normals_from_bits(bits: np.ndarray, out: np.ndarray) -> None:
-    """Write standard normals (2 n,) float32 from uniform 32-bit words (2 n,) by Box and Muller's transform; relative
-    error below 1e-5, tails to 5.9 deviations."""
+    """Write standard normals (2 n,) float32 from uniform words (2 n,) by Box and Muller, to 1e-5 and 5.9 deviations."""
     n = np.uint64(out.size // 2)
     for i in range(n):
         # the upper 24 bits of a word fill a float32 exactly

@@ -9,7 +9,7 @@ import numpy as np
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, transform_points
 from scenes.target import custom
-from scenes.target.flaws import ChipConfig, FlawConfig, PressedConfig, border, outside_m
+from scenes.target.flaws import ChipConfig, FlawConfig, RoundConfig, border, outside_m
 from scenes.target.part import part_of
 from scenes.target.truth import Face, backing_corners_board_m, face_grid_m, face_of, relief_points, widest_rim_m
 
@@ -99,7 +99,7 @@ def _damage_problems(damage: custom.AnyDamage, board: custom.BoardConfig, face: 
         rim, _, axis, _ = relief_points(damage, face, board.thickness_mm * MM)
         rim = border(rim)
         if isinstance(board.shape, custom.MeshConfig):
-            if isinstance(damage, ChipConfig | PressedConfig):
+            if isinstance(damage, ChipConfig) or (isinstance(damage, RoundConfig) and damage.pressed):
                 return [f"{name}: a part from a mesh has no declared edges and no sheet's back"]
             if np.isnan(face.normal(rim[:, 0], rim[:, 1])).any():
                 return [f"{name}: leaves the part's front"]
@@ -112,8 +112,7 @@ def _damage_problems(damage: custom.AnyDamage, board: custom.BoardConfig, face: 
     if isinstance(damage, custom.DentConfig) and damage.ball_m * tightest > SHALLOWEST_BEND:
         ball = f"{damage.depth_mm:g} mm, a ball of radius {damage.ball_m / MM:.3g} mm"
         return [f"{name}: too shallow ({ball}) for a face bent to a radius of {1 / tightest / MM:.3g} mm there"]
-    stands_or_bends = isinstance(damage, PressedConfig) or damage.kind == "protrusion"
-    if depth_mm is not None and depth_mm >= board.thickness_mm and not stands_or_bends:
+    if depth_mm is not None and depth_mm >= board.thickness_mm and not isinstance(damage, RoundConfig):
         thick = f"the board's thickness {board.thickness_mm:g} mm"
         problems.append(f"{name}: depth {depth_mm:g} mm is not less than {thick}")
     deep_mm = board.thickness_mm if depth_mm is None else depth_mm

@@ -309,21 +309,26 @@ class PoseConfig(Config):
         return T_camera_board
 
 
-class TargetConfig(Config):
-    """A whole target. ``backing`` or ``room`` left out: nothing stands there."""
+class SetUpConfig(Config):
+    """What surrounds a board and where it stands. ``backing`` or ``room`` left out: nothing stands there."""
+
+    flaws: Annotated[tuple[AnyFlawConfig, ...], Field(max_length=500, description="every other kind of damage")] = ()
+    material: MaterialConfig = MaterialConfig()
+    backing: BackingConfig | None = None
+    room: RoomConfig | None = None
+    pose: PoseConfig = PoseConfig()
+    other_wavelengths: OtherWavelengths = ()
+
+
+class TargetConfig(SetUpConfig):
+    """A whole target."""
 
     name: Literal["custom"] = "custom"
     board: BoardConfig
     drill: DrillConfig | None = Field(None, description="one drill for all holes: a single key to vary")
     holes: Annotated[tuple[HoleConfig, ...], Field(max_length=500)] = ()
     dents: Annotated[tuple[DentConfig, ...], Field(max_length=500)] = ()
-    flaws: Annotated[tuple[AnyFlawConfig, ...], Field(max_length=500, description="every other kind of damage")] = ()
     tapes: Annotated[tuple[TapeConfig, ...], Field(max_length=100)] = ()
-    material: MaterialConfig = MaterialConfig()
-    backing: BackingConfig | None = None
-    room: RoomConfig | None = None
-    pose: PoseConfig = PoseConfig()
-    other_wavelengths: OtherWavelengths = ()
 
     @model_validator(mode="before")
     @classmethod

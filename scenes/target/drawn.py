@@ -48,8 +48,7 @@ Jitter = Annotated[float, Field(ge=0.0, le=1e3)]
 
 
 class _Drawn(Config):
-    """Number and sizes of every kind of drawn damage. The range of sizes is parted into ``per_board`` equal parts, and
-    every board has one size from each, uniform within it."""
+    """Number and sizes of drawn damage; every board has a size from each of ``per_board`` equal parts of the range."""
 
     per_board: Annotated[int, Field(ge=1, le=100)]
     sizes: Literal["uniform", "log"] = Field(
@@ -297,8 +296,7 @@ class DrawnTargetConfig(Config):
         return tuple(self._posed(*corner) for corner in product(*signed, both_rolls))
 
     def _places_mm(self, rng: np.random.Generator) -> np.ndarray:
-        """Draw (per_board, 2) centres in plan by random sequential placement, uniform on what is free: apart from one
-        another, off the board's edge and off any tape."""
+        """Draw (per_board, 2) centres in plan by random sequential placement, uniform on what is free."""
         board, count, best, (rim_mm, _, margin_mm) = self.board, self.damage.per_board, 0, self._room_mm()
         half = np.array([board.width_mm, board.height_mm]) / 2 - margin_mm
         for _ in range(ATTEMPTS):
@@ -348,8 +346,7 @@ class DrawnTargetConfig(Config):
 
 
 def _dent_depths_mm(diameter_mm: float, bend_per_mm: float) -> tuple[float, float]:
-    """Return the depths that a dent can have: that of a ball whose radius is `SHALLOWEST_BEND` of the face's radius of
-    curvature (0 on a flat face), and its own radius."""
+    """Return the ends of a dent's depth: of a ball of `SHALLOWEST_BEND` radii of curvature, and the dent's radius."""
     reach = diameter_mm / 2 * bend_per_mm / SHALLOWEST_BEND * (1 + 1e-9)
     least = 1.0 if reach >= 1 else reach / (1 + math.sqrt(1 - reach**2))
     return diameter_mm / 2 * least, diameter_mm / 2

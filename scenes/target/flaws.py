@@ -47,8 +47,7 @@ class Relief:
 
 
 class PlacedConfig(Config):
-    """Declaration that all damage has in common. ``size_of``: the size in plan that a limit is of where it varies;
-    where it does not, the limit is of the depth."""
+    """Declaration that all damage has in common. ``size_of``: the size in plan that a limit is of, where it varies."""
 
     id: Annotated[int, Field(ge=1, le=9999)]
     centre_mm: PlaceMm
@@ -89,8 +88,7 @@ class _FlawConfig(PlacedConfig):
 
 
 class _LongConfig(_FlawConfig):
-    """A damage along a centre line: ``wander_mm`` is the line's standard deviation from a straight one, in waves of a
-    third of its length and longer that ``seed`` draws."""
+    """A damage along a line: ``wander_mm`` is its deviation from a straight one, in waves that ``seed`` draws."""
 
     length_mm: Extent
     width_mm: Extent
@@ -141,19 +139,25 @@ class GougeConfig(_LongConfig):
         return Relief(s, t, self.depth_mm * MM * section * ramp)
 
 
-class PressedConfig(_FlawConfig):
+class RoundConfig(_FlawConfig):
     """A sheet pressed in (``pressed_dent``) or out (``pressed_bump``): front and back move alike, by a raised cosine of
-    the distance from the centre, so that rim and pole are soft. It may be deeper than the sheet is thick."""
+    the distance from the centre; it may be deeper than the sheet is thick. Or something that stands on the face (weld
+    spatter, a rivet's head): a paraboloid, its height ``depth_mm``."""
 
-    kind: Literal["pressed_dent", "pressed_bump"]
+    kind: Literal["pressed_dent", "pressed_bump", "protrusion"]
     diameter_mm: Extent
     depth_mm: Depth
 
+    @property
+    def pressed(self) -> bool:
+        """Tell whether the sheet's back moves too."""
+        return self.kind != "protrusion"
+
     def relief(self) -> Relief:
-        """Return the depth over the dent's frame."""
+        """Return the depth over the frame, negative where it stands out."""
         s, t, ring = _disc(self.diameter_mm * MM / 2)
-        sign = 1.0 if self.kind == "pressed_dent" else -1.0
-        return Relief(s, t, sign * self.depth_mm * MM * (1 + np.cos(np.pi * ring)) / 2)
+        height = (1 + np.cos(np.pi * ring)) / 2 if self.pressed else 1 - ring**2
+        return Relief(s, t, (1.0 if self.kind == "pressed_dent" else -1.0) * self.depth_mm * MM * height)
 
 
 class CorrosionConfig(_FlawConfig):
@@ -208,20 +212,7 @@ class ChipConfig(_FlawConfig):
         return Relief(s, t, self.depth_mm * MM * np.sqrt((1 - u**2) * np.maximum(1 - v**2, 0.0)), open_row=True)
 
 
-class ProtrusionConfig(_FlawConfig):
-    """Something that stands on the face (weld spatter, a rivet's head): a paraboloid."""
-
-    kind: Literal["protrusion"]
-    diameter_mm: Extent
-    depth_mm: Annotated[Depth, Field(description="height over the face")]
-
-    def relief(self) -> Relief:
-        """Return the depth over the protrusion's frame: negative, as it stands out."""
-        s, t, ring = _disc(self.diameter_mm * MM / 2)
-        return Relief(s, t, -self.depth_mm * MM * (1 - ring**2))
-
-
-FlawConfig = SlotConfig | GougeConfig | PressedConfig | CorrosionConfig | ChipConfig | ProtrusionConfig
+FlawConfig = SlotConfig | GougeConfig | RoundConfig | CorrosionConfig | ChipConfig
 AnyFlawConfig = Annotated[FlawConfig, Field(discriminator="kind")]
 
 

@@ -23,7 +23,7 @@ from harness.vocabulary.provenance import RESULTS_VERSION
 from harness.vocabulary.seeds import random_stream
 from scenes.target.checks import check_target
 from scenes.target.custom import DentConfig, HoleConfig, MaterialConfig, MeshConfig, TargetConfig
-from scenes.target.flaws import FlawConfig, PressedConfig, closed_grid
+from scenes.target.flaws import FlawConfig, RoundConfig, closed_grid
 from scenes.target.part import part_of
 from scenes.target.truth import (
     Damage,
@@ -112,9 +112,7 @@ COARSEST_SAGITTA_M, FINEST_SAGITTA_M = 2e-6, 0.1e-6
 """Largest distance of facets from a bent face: well under a camera's noise, finer below shallow dents (depth / 400)."""
 ROUGH_SAGITTA_M = 8e-5  # the same at the sharpest crest of a rough face; elsewhere a tenth of it
 TAPE_SINK_M = 0.1e-3  # depth of a strip's underside in the board, so that no two surfaces coincide
-CORNER_M = 4e-6
-"""Distance by which the corners of a circle's polygon, of the same area, may stand outside it: 28 for 2 mm, 104 for 1
-in. More take a render's rays longer."""
+CORNER_M = 4e-6  # by which corners of a circle's polygon, of the same area, may stand out: 28 for 2 mm, 104 for 1 in
 RINGS = 48  # steps of a dent's profile from pole to rim: volume short by 1 / (3 RINGS^2) = 0.014 %
 CELL_M, MOST_ALONG = 0.03, 64
 """Longest edge of a damaged board's triangles, and the number of these along its sides from which on they are longer.
@@ -291,7 +289,7 @@ def solids_of(item: FlawConfig, face: Face, thickness_m: float) -> tuple[list[tr
         return trimesh.Trimesh(*closed_grid(*(points + height * axis for height in heights)), process=False)
 
     out = bool(depth_m.min() < 0)
-    if not isinstance(item, PressedConfig):
+    if not (isinstance(item, RoundConfig) and item.pressed):
         if out:
             return [between(-depth_m, -min(spare_m, thickness_m / 2))], []
         return [], [between(spare_m, -depth_m - (spare_m if np.isnan(relief.depth_m).any() else 0.0))]

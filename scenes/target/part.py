@@ -18,7 +18,6 @@ import numpy as np
 from pydantic import Field
 from scipy.ndimage import map_coordinates
 
-from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import file_digest
 from harness.vocabulary.geometry import MM
@@ -28,19 +27,14 @@ from scenes.target import custom
 NODES = 1000
 
 
-class MeshTargetConfig(Config):
+class MeshTargetConfig(custom.SetUpConfig):
     """A part from a mesh file, with damage at stated places of its front; the rest as in a whole declaration."""
 
     name: Literal["mesh"]
     file: Annotated[str, Field(min_length=1, max_length=1000, description=".stl, .ply, .obj or .glb")]
     unit: FileUnit = "mm"
     front: FrontAxis = "+z"
-    flaws: Annotated[tuple[custom.AnyFlawConfig, ...], Field(max_length=500)] = ()
     material: custom.MaterialConfig = custom.MaterialConfig(grain_contrast=0.0)
-    backing: custom.BackingConfig | None = None
-    room: custom.RoomConfig | None = None
-    pose: custom.PoseConfig = custom.PoseConfig()
-    other_wavelengths: custom.OtherWavelengths = ()
 
     def declare(self) -> custom.TargetConfig:
         """Return the full declaration. Raises UserError where the file cannot be used."""
@@ -140,8 +134,7 @@ def _volume(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> float
 
 @lru_cache(maxsize=8)
 def front_of(shape: custom.MeshConfig) -> tuple[np.ndarray, float]:
-    """Return the front's heights and slopes (3, rows, columns) on a grid about the origin, NaN where the part is not,
-    and the grid's spacing in metres."""
+    """Return the front's heights and slopes (3, rows, columns) about the origin, NaN beside it, and their spacing."""
     vertices, faces = part_of(shape)
     half = np.abs(vertices[:, :2]).max(axis=0)
     step_m = 2 * float(half.max()) / NODES

@@ -225,8 +225,7 @@ class Damage:
     stands out (``raised``) its height, of what goes through the board's thickness. ``volume_m3`` of holes and dents:
     exact on a flat face, to second order in diameter over radius of curvature on a curved one; of other kinds as
     `scenes.target.flaws` meshes them, of a pressed sheet on its front. Kinds with an outline of their own have it and
-    their centre line in plan (``outline_board_m`` (n, 2), ``line_board_m`` (k, 2); None of round ones), with length,
-    width and ``angle_rad`` from board +x."""
+    their centre line in plan (``outline_board_m`` (n, 2), ``line_board_m`` (k, 2), else None), and their sides."""
 
     id: int
     kind: str
@@ -288,7 +287,8 @@ def truth_of(config: custom.TargetConfig, T_camera_board: np.ndarray) -> tuple[D
         centre, axis, bends = (of(*item.centre_m) for of in (face.point, face.axis, face.curvatures))
         in_camera = transform_points(T_camera_board, centre), rotate_vectors(T_camera_board, axis)
         if isinstance(item, FlawConfig):
-            truth.append(_flaw_truth(item, face, config.board.thickness_mm * MM, (centre, axis, *in_camera)))
+            sizes, outline = _flaw_truth(item, face, config.board.thickness_mm * MM)
+            truth.append(Damage(item.id, item.kind, *sizes, centre, axis, *in_camera, **outline))
             continue
         radius_m = item.radius_m
         depth_m = (config.board.thickness_mm if item.depth_mm is None else item.depth_mm) * MM
@@ -323,30 +323,17 @@ def relief_points(
     return face.point(plan[..., 0], plan[..., 1]), depth_m, axis, across
 
 
-Places = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-
-
-def _flaw_truth(item: FlawConfig, face: Face, thickness_m: float, places: Places) -> Damage:
+def _flaw_truth(item: FlawConfig, face: Face, thickness_m: float) -> tuple[tuple[float, float, float], dict[str, Any]]:
+    """Return size, depth and volume of a flaw, and the fields that kinds with an outline of their own have."""
     points, depth_m, axis, _ = relief_points(item, face, thickness_m)
     plan, moved, raised = points[..., :2], points - depth_m[..., None] * axis, bool(depth_m.min() < 0)
     length_mm, width_mm = item.sides_mm
     deepest_m = thickness_m if item.depth_mm is None else item.depth_mm * MM
     removed_m3 = volume_m3(*(closed_grid(moved, points) if raised else closed_grid(points, moved)))
-    return Damage(
-        item.id,
-        item.kind,
-        item.size_mm * MM,
-        deepest_m,
-        removed_m3,
-        *places,
-        size_of=item.size_of,
-        raised=raised,
-        outline_board_m=border(plan),
-        line_board_m=plan[len(plan) // 2, ::LINE_STEP] if item.size_of != "diameter" else None,
-        length_m=length_mm * MM,
-        width_m=width_mm * MM,
-        angle_rad=item.turn_rad,
-    )
+    line_board_m = plan[len(plan) // 2, ::LINE_STEP] if item.size_of != "diameter" else None
+    outline = {"size_of": item.size_of, "raised": raised, "outline_board_m": border(plan), "line_board_m": line_board_m}
+    outline |= {"length_m": length_mm * MM, "width_m": width_mm * MM, "angle_rad": item.turn_rad}
+    return (item.size_mm * MM, deepest_m, removed_m3), outline
 
 
 def _lens(dent: custom.DentConfig, bend: float) -> tuple[float, float]:

@@ -3,8 +3,8 @@
 Each gate's quantity has a mean and a deviation to first order in the noise (`scenes.sensor.amcw.linear`); a pixel is
 sure where the engine's table of gates (`ranging.first_failed`) says the same of the worst and of the best values within
 `DEVIATIONS`. Where the noise is too much for that, bounds that hold at any noise count. Where a window holds one even
-surface, nearly all of a view, noise takes the same share off the weight of each neighbour and gives it to the centre;
-it hangs on the phase noise only and is read from a table."""
+surface, noise takes the same share off the weight of each neighbour, by the phase noise only: it is read from a table.
+"""
 
 from __future__ import annotations
 
@@ -186,9 +186,8 @@ def fill_even(
     out: Filtered,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fill ``out`` at the ``even`` pixels (n,) bool, from the noise-free ``filtered`` (f, 3, n) and ``edge`` (f, n).
-
-    Return (f, m) each: what one deviation of a neighbour's noise at weight 1 and amplitude 1 moves the phase by, over
-    that deviation, and what one of the centre's does in all."""
+    Returns (f, m) each: by what a neighbour's noise at weight and amplitude 1 moves the phase, over its deviation, and
+    what one deviation of the centre's does in all."""
 
     def summed(values: np.ndarray, space: np.ndarray) -> np.ndarray:
         """Values (f, n) summed over each window with weights ``space``, which are a product of rows and columns."""

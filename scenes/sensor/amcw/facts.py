@@ -33,8 +33,7 @@ class UnwrapTable(NamedTuple):
     """Tables by which phases of f = 1, 2 or 3 frequencies become half the light's path. ``lattice`` (f,) float32:
     integers m with f_k = m_k f_0. ``combination`` (f - 1, f) float32: integer rows orthogonal to m; they sum the
     wrapped phases to whole numbers, which are a key of the wrap counts: ``sizes`` and ``offset`` (f - 1,) int32 of the
-    keys, ``wraps`` (f, keys) float32, -1 where no distance has them. ``metres_per_turn`` (f,) float32.
-    ``unambiguous_m``: R = c / 2 f_0."""
+    keys, ``wraps`` (f, keys) float32, -1 for none. ``metres_per_turn`` (f,) float32. ``unambiguous_m``: c / 2 f_0."""
 
     lattice: np.ndarray
     combination: np.ndarray
@@ -188,8 +187,8 @@ class ModulationFacts(Config):
 class PhotonFacts(Config):
     """The photon budget: one gain, calibrated at one point. ``signal_electrons``: of both wells in one exposure, albedo
     1, facing, on the axis at 1 m. ``full_well_electrons`` of one well (None: only the converter saturates).
-    ``exposure_ends_electrons``: a pixel's exposure ends where both wells hold so many, and its sample is scaled to the
-    full length (None: all pixels are exposed alike)."""
+    ``exposure_ends_electrons``: in both wells, where a pixel's exposure ends, scaled to the full length (None:
+    never)."""
 
     signal_electrons: Positive
     calibration_sigma_mm: Positive

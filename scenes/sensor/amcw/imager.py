@@ -154,10 +154,8 @@ class AmcwImager(UnitModel[AmcwCamera]):
         )
 
     def ambient_electrons(self, view: NoiseFreeView, intensity: np.ndarray) -> np.ndarray:
-        """Return (h, w): electrons of daylight or lamps in both wells of one exposure; zeros where the effect is off.
-        There are as many as the emitter's own, times the ratio of irradiances within the filter's band, for light that
-        falls as the camera's own does. A pixel that sees several surfaces is taken to get its light from the nearest.
-        """
+        """Return (h, w): electrons of daylight or lamps in both wells of one exposure: the emitter's own times the
+        ratio of irradiances within the filter's band, for light that falls alike; at edges, of the nearest surface."""
         config, photons = self.config, self.camera.photons
         if not config.effects.ambient:
             return np.zeros(intensity.shape)

@@ -17,9 +17,7 @@ SMALLEST = f4(1e-30)
 OUTSIDE = f4(-1)  # amplitude of what is beyond the border or saturated: below every floor, so that it is always dropped
 
 STRIDE = 2128  # longest padded row of an image; a power of two would share the cache's lines, up to 4 times as slow
-LANES = 56
-"""Frames of a listed pixel that are drawn together, whether they all count or not: 50, the usual number, in one go.
-Loops of 8 n frames become vector code from n = 4 on."""
+LANES = 56  # frames of a listed pixel that are drawn together; loops of 8 n frames are vector code from n = 4 on
 BLOCK = 3 * LANES  # numbers of one listed pixel and frequency: re, im and amplitude of all frames
 
 
@@ -67,8 +65,8 @@ def expose(  # type: ignore[no-untyped-def]
 
 @numba.njit(**FAST)
 def noisy_phasors(phasor, amplitude, turn, swell, normals, planes):  # type: ignore[no-untyped-def]
-    """Write phasors of pixels (f, g) with noise from ``normals`` (g, f, 2, lanes) into ``planes`` (g, f, 3 lanes): re
-    and im of length 1, and amplitude."""
+    """Write phasors (f, g) with noise from ``normals`` (g, f, 2, lanes) into ``planes`` (g, f, 3 lanes): re, im of
+    length 1, and amplitude."""
     g, n_frequencies, _, _ = normals.shape
     p1, p2 = np.uint64(LANES), np.uint64(2 * LANES)
     for j in range(g):

@@ -5,8 +5,7 @@ the window of s F(t), F = exp(i t - c (1 - cos t)), t = the neighbour's phase le
 by a normal of variance v, so F acts as F + v F''/2 in the mean and, to first order, by its derivative F' + v F'''/2
 (Stein: E[f(x) x] = E[f'(x)] E[x^2]). The centre's noise is in all differences: over it the mean is taken last, of arg
 S, by three nodes. On a face of phase noise s the centre's own noise so counts more than by its weight, by some c s^2 of
-the window's sum, and a neighbour's less by c s^2. Terms of second and third order are left out and estimated; a pixel
-where they count is not for this module."""
+the window's sum, and a neighbour's less by c s^2. Terms of second and third order are left out and estimated."""
 
 from __future__ import annotations
 
@@ -30,8 +29,7 @@ SMALLEST = 1e-12
 
 class Light(NamedTuple):
     """Each pixel before the filter, all (f, n) float64: ``phasor`` of length 1; ``amplitude`` without noise,
-    ``bright``, its mean with noise; ``turn``: deviation of the phase in radians; ``swell``: relative one of the
-    amplitude."""
+    ``bright``: with it; ``turn``: deviation of the phase in radians; ``swell``: of the amplitude, over it."""
 
     phasor: np.ndarray
     amplitude: np.ndarray

@@ -86,8 +86,7 @@ class EmpiricalCamera(CameraFacts):
 
     @cached_property
     def optics(self) -> Optics:
-        """Optics for the render: a source of light in the lens itself, which leaves no shadows. Depth reaches a pixel
-        through the edge's kernel."""
+        """Optics for the render: a source of light in the lens itself, without shadows; the margin of the edge."""
         blur_px, half_gap_px = BLUR_REACH * self.edge.blur_px.value, self.edge.gap_px.value / 2
         return self.optics_with(
             emitter_m=np.zeros(3),

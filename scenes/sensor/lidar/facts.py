@@ -55,8 +55,7 @@ class CodeFacts(Config):
 class LidarPhotonFacts(Config):
     """The photon budget, in primary electrons, before the avalanche, of one point's integration. ``signal_electrons``:
     from albedo 1 facing the camera at 1 m on the axis. ``amplifier_electrons``: standard deviation. ``room_albedo``:
-    mean over the field of view, whose ambient light reaches the one detector. ``calibration_*``: the published points
-    to which the gain and the confidence threshold are fitted."""
+    mean over the field, whose ambient light the detector sees. ``calibration_*``: published points to be fitted."""
 
     signal_electrons: Positive
     excess_noise_factor: Annotated[Fact[float], checked("1 or more", lambda value: value >= 1)]
@@ -73,9 +72,8 @@ class LidarPhotonFacts(Config):
 
 class LidarEngineFacts(OutputFacts):
     """Processing on the device. ``smoothing_px``: standard deviations of the Gaussian weights with which neighbours
-    are averaged along columns, then along rows; 0: not at all. ``agree_deviations``: a neighbour joins the mean where
-    its half path differs by at most so many expected deviations. ``least_agreeing``: share of the weights that must
-    agree. ``confidence_electrons``: least strength."""
+    are averaged along columns, then along rows; 0: not at all. ``agree_deviations``: by which a neighbour's half path
+    may differ. ``least_agreeing``: share of the weights that must agree. ``confidence_electrons``: least strength."""
 
     smoothing_px: Annotated[Fact[tuple[float, float]], checked("from 0 to 6 pixels", lambda value: 0 <= value <= 6)]
     agree_deviations: Positive

@@ -155,8 +155,7 @@ class LidarScanner(UnitModel[ScannedLidar]):
 
 
 def smear_weights(points: float) -> np.ndarray:
-    """Return weights, odd in number and of sum 1, of points about one whose integration spans ``points`` points' time:
-    the light is taken as linear between points."""
+    """Return weights, of sum 1, of points about one whose integration spans ``points``; light between is linear."""
     reach = int(np.ceil(points / 2))
     hat, half = interpolate.BSpline.basis_element([-1, 0, 1]), points / 2
     weights = [hat.integrate(-half - k, half - k, extrapolate=False) for k in range(-reach, reach + 1)]
