@@ -12,11 +12,8 @@ from harness.vocabulary.geometry import Region
 from scenes.optics import NoiseFreeView, Optics, footprint_of, wave_numbers
 from scenes.sensor.camera import AnyCamera
 
-WHITE = 0.8
-"""The colour albedo of closed-form surfaces; no sensor uses it."""
-
-Covers = Callable[[np.ndarray], np.ndarray]
-"""Function of slopes (..., 2) of points on the front plane, from the lens: whether the front is there; not for NaN."""
+WHITE = 0.8  # the colour albedo of closed-form surfaces; no sensor uses it
+Covers = Callable[[np.ndarray], np.ndarray]  # of slopes (..., 2) from the lens: whether the front is there; not for NaN
 
 
 @dataclass(frozen=True)
@@ -60,7 +57,7 @@ def image_view(camera: AnyCamera, region: Region, z_m: np.ndarray, light: np.nda
     amplitude, waves = np.where(np.isfinite(z_m), np.nan_to_num(light), 0.0), wave_numbers(optics.frequencies_hz)
     phasor = np.stack([(amplitude * np.exp(1j * wave * path_m)).sum(axis=0) for wave in waves])
     seen, coverage = np.zeros(region.shape, int), np.ones(region.shape)
-    return _view(optics, region, phasor, amplitude.sum(axis=0), points[0], seen, ("image",), coverage)
+    return _view(optics, region, ("image",), phasor, amplitude.sum(axis=0), points[0], seen, coverage)
 
 
 def layered_view(
@@ -92,7 +89,8 @@ def layered_view(
     phasor, (intensity, share) = np.zeros((len(waves), *region.shape), complex), np.zeros((2, *region.shape))
     pixels = np.ones(region.shape, bool)
     for sub_rays in (footprint.coarse, footprint.fine):  # fine where a footprint or a neighbour's meets an edge
-        on_front, _, light, path_m, shadowed = meet(sub_rays(*np.nonzero(pixels)))
+        rows, cols = np.nonzero(pixels)
+        on_front, _, light, path_m, shadowed = meet(sub_rays(rows, cols))
         for line, wave in enumerate(waves):
             phasor[line, pixels] = (light * np.exp(1j * wave * path_m)).mean(axis=-1)
         intensity[pixels], share[pixels] = light.mean(axis=-1), on_front.mean(axis=-1)
@@ -103,7 +101,7 @@ def layered_view(
             break
     on_front, points, *_ = meet(lens.region_slopes(region))
     surface, coverage = np.where(on_front, 0, 1), np.where(on_front, share, 1 - share)
-    return _view(optics, region, phasor, intensity, points, surface, ("front", "back"), coverage)
+    return _view(optics, region, ("front", "back"), phasor, intensity, points, surface, coverage)
 
 
 def _lit(slopes: np.ndarray, plane: Plane, albedo: float, optics: Optics) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -116,16 +114,8 @@ def _lit(slopes: np.ndarray, plane: Plane, albedo: float, optics: Optics) -> tup
     return points, np.nan_to_num(amplitude), np.nan_to_num(leg_out + np.linalg.norm(points, axis=-1))
 
 
-def _view(
-    optics: Optics,
-    region: Region,
-    phasor: np.ndarray,
-    intensity: np.ndarray,
-    points: np.ndarray,
-    surface: np.ndarray,
-    names: tuple[str, ...],
-    coverage: np.ndarray,
-) -> NoiseFreeView:
+def _view(optics: Optics, region: Region, names: tuple[str, ...], *images: np.ndarray) -> NoiseFreeView:
+    phasor, intensity, points, surface, coverage = images
     range_m = np.linalg.norm(points, axis=-1)
     return NoiseFreeView(
         region=region,

@@ -1,8 +1,7 @@
 """Virtual damage for a real scan: what a camera would have measured of a damage, less what it measures without it.
 
-A small board stands where the scan's surface is and is rendered twice: with one damage and without. The camera's own
-model turns both renders into frames, with the same draws of noise. What the recorded frames have of their own (noise,
-fixed pattern, texture, surface) is not in the difference, so they keep it.
+A small board stands where the scan's surface is and is rendered twice: with one damage and without. The camera's model
+turns both renders into frames with the same draws of noise; the recorded frames keep what they have of their own.
 
 Not modelled: the surface's bend within the small board, texture at the damage, light that reaches it by way of other
 surfaces, and a damage that makes pixels quieter: recorded noise is never taken away. Range is not rounded anew."""

@@ -1,5 +1,4 @@
-"""Cameras as the render needs them: lens, light, footprints of pixels; and the view that the sensor gets of it, which
-is slow to make and cached by content. Slopes are x/z and y/z."""
+"""Cameras as the render needs them (lens, light, footprints), and the view that a sensor gets. Slopes: x/z, y/z."""
 
 from __future__ import annotations
 
@@ -64,27 +63,21 @@ BEAM_REACH = 3.0  # deviations of a beam within which an edge is looked for: 1 %
 GOLDEN = (np.sqrt(5) - 1) / 2
 
 
-def footprint_of(lens: Lens, region: Region, beam_fwhm_rad: float | None) -> Quadrilaterals | Beams:
+def footprint_of(lens: Lens, region: Region, beam_fwhm_rad: float | None) -> Quadrilaterals:
     """Return the footprint of a region's pixels, beams where they have a width."""
     return Beams(lens, region, beam_fwhm_rad / FWHM_PER_DEVIATION) if beam_fwhm_rad else Quadrilaterals(lens, region)
 
 
-def corners_of(lens: Lens, region: Region) -> np.ndarray:
-    """Return the slopes (h + 1, w + 1, 2) of the corners of a region's pixels."""
-    v, u = np.mgrid[region.row0 : region.row1 + 1, region.col0 : region.col1 + 1] - 0.5
-    return lens.slopes(u, v)
-
-
 class Quadrilaterals:
-    """An imager's pixels: the area between a pixel's corners, evenly weighted. Fine sub-rays lie on a golden lattice,
-    so that an edge along rows or columns passes them one by one. Inside a pixel the lens is linear to 1e-7 in slope
-    (0.1 um at 1 m), so slopes are interpolated between its corners."""
+    """An imager's pixels: the area between their corners, evenly weighted; slopes are linear in it, to 1e-7. Fine
+    sub-rays lie on a golden lattice: an edge along rows or columns passes them one by one."""
 
-    reach_px = 0
-    """Pixels around an edge that have a part of it in their footprint, besides the edge's own."""
+    reach_px = 0  # pixels around an edge that have a part of it in their footprint, besides the edge's own
 
     def __init__(self, lens: Lens, region: Region) -> None:
-        self.corner = corners_of(lens, region)
+        # slopes (h + 1, w + 1, 2) of the corners of the region's pixels
+        v, u = np.mgrid[region.row0 : region.row1 + 1, region.col0 : region.col1 + 1] - 0.5
+        self.corner = lens.slopes(u, v)
 
     def coarse(self, rows: np.ndarray, cols: np.ndarray, side: int = COARSE) -> np.ndarray:
         """Return slopes (n, side^2, 2) of the centres of side x side strata of pixels, a grid by rows."""
@@ -104,21 +97,21 @@ class Quadrilaterals:
         return np.moveaxis(factors @ np.stack([np.ones(len(fx)), fx, fy, fx * fy]), 0, -1)
 
 
-class Beams:
+class Beams(Quadrilaterals):
     """A scanner's beams: round Gaussians in angle about the pixels' central rays. Fine sub-rays lie on a sunflower's
     spiral (Vogel, Mathematical Biosciences 44, 1979) at the radii of equal shares: a knife edge takes its share of the
     Gaussian within 0.02. The coarse grid has the Gaussian's second moments. Angles are taken as tangents."""
 
     def __init__(self, lens: Lens, region: Region, deviation_rad: float) -> None:
+        super().__init__(lens, region)
         self._slopes, self._deviation_rad = lens.region_slopes(region), deviation_rad
-        self.corner = corners_of(lens, region)
         # Away from the axis an angle spans more slope, and so more pixels, by 1 + slope^2.
         widest = 1 + float((self._slopes**2).sum(axis=-1).max())
         self.reach_px = 1 + int(np.ceil(BEAM_REACH * deviation_rad * widest * max(lens.fx, lens.fy)))
 
-    def coarse(self, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
-        """Return slopes (n, COARSE^2, 2) of pixels, a grid by rows."""
-        quantile = ndtri((np.arange(COARSE) + 0.5) / COARSE)
+    def coarse(self, rows: np.ndarray, cols: np.ndarray, side: int = COARSE) -> np.ndarray:
+        """Return slopes (n, side^2, 2) of pixels, a grid by rows."""
+        quantile = ndtri((np.arange(side) + 0.5) / side)
         quantile /= np.sqrt((quantile**2).mean())
         y, x = np.meshgrid(quantile, quantile, indexing="ij")
         return self.turned(rows, cols, self._deviation_rad * np.column_stack([x.ravel(), y.ravel()]))

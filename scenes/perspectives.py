@@ -52,12 +52,9 @@ def seen_region(config: TargetConfig, optics: Optics) -> Region:
     return Region(int(low[1]), int(high[1]), int(low[0]), int(high[0]))
 
 
-_face_grid_m = lru_cache(maxsize=100)(face_grid_m)
-
-
 def _face_before_lens(config: TargetConfig) -> np.ndarray:
     """(n, n, 3): the face in the camera's frame. Raises UserError where it reaches behind the lens."""
-    face = transform_points(config.pose.T_camera_board, _face_grid_m(config.board, steps=OUTLINE_STEPS))
+    face = transform_points(config.pose.T_camera_board, face_grid_m(config.board, steps=OUTLINE_STEPS))
     nearest_m = float(face[..., 2].min())
     if nearest_m <= NEAREST_M:
         legal = f"all of the face at least {NEAREST_M:g} m in front of the camera"

@@ -242,7 +242,7 @@ def test_reported_noise_matches_the_spread_over_seeds(thesis_view):
         indirect_light(lit, target, optics, slopes, direct, inside, config.model_copy(update={"seed": seed}))
         for seed in range(8)
     ]
-    backing = direct.surface == lit.names.index("backing")
+    backing = direct.surface == [part.name for part in lit.parts].index("backing")
     seen = backing & (np.abs(direct.phasor[0]) > 0.1)
     shifts = [range_change_m(light[:-1, seen], direct.phasor[:, seen], optics.frequencies_hz) for light, _ in gathered]
     spread = np.sqrt(np.var(shifts, axis=0, ddof=1).mean())

@@ -21,7 +21,7 @@ EMITTER = CAMERA.optics.emitter_m
 
 def quad(name: str, corners: list[list[float]], albedo: float, gloss: tuple[float, float]) -> TargetPart:
     mesh = trimesh.Trimesh(np.array(corners), [[0, 1, 2], [0, 2, 3]], process=False)
-    return TargetPart(name, mesh, None, albedo, None, np.full(3, 0.5), None, gloss)
+    return TargetPart(name, mesh, albedo, np.full(3, 0.5), gloss=gloss)
 
 
 def lobe(gloss: tuple[float, float], normal: np.ndarray, viewer: np.ndarray, light: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from scenes.closed_form import plane_view
 from scenes.sensor.amcw import kernels, ranging
 from scenes.sensor.amcw.facts import unwrap_table
 from scenes.sensor.amcw.imager import AmcwImager
-from scenes.sensor.calibration import calibrated_signal_electrons, temporal_sigma_m, with_jitter_m, with_number
+from scenes.sensor.calibration import calibrated_signal_electrons, temporal_sigma_m, with_number
 from scenes.sensor.camera import NO_EFFECTS, CameraConfig, camera_of, load_camera
 from scenes.sensor.normals import normals_from_bits
 from scenes.sensor.source import SimulatedUnit
@@ -54,7 +54,7 @@ def test_gain_meets_the_calibration_point():
     electrons = calibrated_signal_electrons(CAMERA, frames=60, seed=5)
     assert CAMERA.photons.signal_electrons.value == pytest.approx(electrons, rel=0.03)
     sigma_m = temporal_sigma_m(CAMERA, 1.5, 0.8, 100, seed=6)
-    assert with_jitter_m(CAMERA, sigma_m) == pytest.approx(0.89e-3, rel=0.02)
+    assert np.hypot(sigma_m, 1e-3 * CAMERA.unit.jitter_mm.value) == pytest.approx(0.89e-3, rel=0.02)
 
 
 def test_phase_noise_follows_the_closed_form():

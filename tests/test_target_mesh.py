@@ -268,11 +268,11 @@ def test_facets_stay_close_to_the_face(shape: Any) -> None:
     config = target(shape)
     built = build_target(config)
     mesh = board_solid(config, ())
-    on_face = np.abs(mesh.vertices[:, 2] - built.face_height_m(*mesh.vertices[:, :2].T)) < 1e-9
+    on_face = np.abs(mesh.vertices[:, 2] - face_of(built.config.board).height_m(*mesh.vertices[:, :2].T)) < 1e-9
     corners = mesh.triangles[on_face[mesh.faces].all(axis=1)]
     weights = np.array([[0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5], [1 / 3, 1 / 3, 1 / 3]])
     points = np.einsum("wk,tkc->twc", weights, corners)
-    off = points[..., 2] - built.face_height_m(points[..., 0], points[..., 1])
+    off = points[..., 2] - face_of(built.config.board).height_m(points[..., 0], points[..., 1])
     assert 1e-7 < np.abs(off).max() <= 2e-6
 
 
@@ -281,7 +281,7 @@ def test_outline_runs_round_the_rim(shape: Any) -> None:
     built = build_target(target(shape))
     x, y, z = built.outline_board_m.T
     assert np.allclose(np.maximum(np.abs(x) / 0.15, np.abs(y) / 0.05), 1.0)
-    assert z == pytest.approx(built.face_height_m(x, y), abs=1e-12)
+    assert z == pytest.approx(face_of(built.config.board).height_m(x, y), abs=1e-12)
     area = 0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))
     assert area == pytest.approx(0.3 * 0.1)
 

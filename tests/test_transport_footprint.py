@@ -38,7 +38,7 @@ OPTICS = Optics(
 
 def part(name: str, corners: list[list[float]], albedo: float = 0.5) -> TargetPart:
     mesh = trimesh.Trimesh(np.array(corners), [[0, 1, 2], [0, 2, 3]], process=False)
-    return TargetPart(name, mesh, None, albedo, None, np.full(3, 0.5), None)
+    return TargetPart(name, mesh, albedo, np.full(3, 0.5))
 
 
 def half_plane(angle_rad: float, edge: float) -> TargetPart:

@@ -61,7 +61,7 @@ def assert_agree(ours, theirs, here, largest_error):
 def test_a_corner(histogram):
     def quad(name, corners, albedo):
         mesh = trimesh.Trimesh(np.array(corners, float), [[0, 1, 2], [0, 2, 3]], process=False)
-        return TargetPart(name, mesh, None, albedo, None, np.full(3, 0.5), None)
+        return TargetPart(name, mesh, albedo, np.full(3, 0.5))
 
     wall = quad("wall", [[-1, -1, 1], [1, -1, 1], [1, 0.2, 1], [-1, 0.2, 1]], 0.8)
     floor = quad("floor", [[-1, 0.2, 0], [1, 0.2, 0], [1, 0.2, 1], [-1, 0.2, 1]], 0.6)

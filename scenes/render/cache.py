@@ -35,11 +35,9 @@ MOST_BYTES = 2 << 30  # a sensor of a million pixels at a hundred frequencies gi
 CHECKSUM_BYTES = 16
 ARRAYS = tuple(f.name for f in fields(NoiseFreeView) if f.type == "np.ndarray")
 RENDER_NAME = re.compile(r"[0-9a-f]{16}\.npz")
-LEFTOVER_NAME = re.compile(r"\.[0-9a-f]{16}\.\w+\.part\.npz")
-"""Names that `harness.vocabulary.files.atomic_path` gives a render that is being written: left by killed processes."""
+LEFTOVER_NAME = re.compile(r"\.[0-9a-f]{16}\.\w+\.part\.npz")  # of a render that is being written, by `files`
 LEFTOVER_AFTER_S = 86_400.0  # a render is written in less than a second
-RENDERING, LOCK = ".rendering", ".lock"
-"""Files of which a process locks a byte while it renders a view, and which a sweep holds while it runs."""
+RENDERING, LOCK = ".rendering", ".lock"  # of which a render locks a byte; which a sweep holds while it runs
 
 
 def render_key(target: TargetConfig, optics: Optics, config: RenderConfig) -> str:
@@ -136,8 +134,7 @@ def removed(files: Iterable[StoredFile]) -> list[StoredFile]:
 
 
 def longest_unused(renders: Iterable[StoredFile], limit_bytes: int, keep: Collection[Path]) -> list[StoredFile]:
-    """Choose the renders that go so that all fit into ``limit_bytes``: the longest unused first, never those of
-    ``keep`` (by name), so that the limit may still be exceeded."""
+    """Choose the longest unused renders, never those of ``keep`` (by name), until the rest fits ``limit_bytes``."""
     kept, renders = {path.name for path in keep}, sorted(renders, key=lambda file: (file.used_s, file.path.name))
     excess, going = sum(file.size_bytes for file in renders) - limit_bytes, []
     for file in renders:
@@ -157,8 +154,7 @@ def trim_cache(folder: Path, limit_bytes: int, keep: Collection[Path] = ()) -> i
 
 @contextlib.contextmanager
 def in_use(folder: Path) -> Iterator[None]:
-    """Let nobody remove renders of this folder while a sweep runs; any number of sweeps may use it at once. Nothing is
-    held where the system has no such locks or the folder cannot be written."""
+    """Let nobody remove renders of this folder while any sweep runs, where system and folder allow locks."""
     with contextlib.ExitStack() as held:
         with contextlib.suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 from scipy import ndimage
 
-from scenes.optics import COARSE, FINE, Beams, Quadrilaterals, wave_numbers
+from scenes.optics import COARSE, FINE, Quadrilaterals, wave_numbers
 from scenes.render.scene import LitScene
 
 FINEST = 2048  # sub-rays where that leaves an error in a hole: a dark wall beside a strip of what lies behind
@@ -22,7 +21,6 @@ UNEVEN = 0.2  # relative spread of direct light in a footprint from which on a s
 FAST: Any = {"cache": True, "fastmath": {"contract", "reassoc", "nsz"}, "nogil": True}
 """Options of compilation; sums are float64, whose order moves a range by 1e-14 m."""
 COMB_TOLERANCE = 1e-9  # unevenness, by the highest frequency, up to which a comb is summed by a recurrence
-Footprint = Quadrilaterals | Beams
 Frequencies = tuple[float, ...]
 
 
@@ -96,23 +94,21 @@ class Hits(NamedTuple):
     normal: np.ndarray
 
 
-@dataclass(frozen=True)
-class OffFace:
+class OffFace(NamedTuple):
     """Sub-rays that met something other than the undamaged face. ``pixel`` (p,): flat indices of pixels that have any,
-    ``count`` (p,): how many, ``share`` (p,): of the footprint; ``slopes`` (sum of count, 2) float32, by pixel."""
+    ``counts`` (p,): how many, ``share`` (p,): of the footprint; ``slopes`` (sum of counts, 2) float32, by pixel."""
 
     pixel: np.ndarray
-    count: np.ndarray
+    counts: np.ndarray
     share: np.ndarray
     slopes: np.ndarray
 
     def chosen(self, here: np.ndarray) -> OffFace:
         """Return those of the pixels picked by a mask (p,)."""
-        return OffFace(self.pixel[here], self.count[here], self.share[here], self.slopes[np.repeat(here, self.count)])
+        return OffFace(self.pixel[here], self.counts[here], self.share[here], self.slopes[np.repeat(here, self.counts)])
 
 
-@dataclass(frozen=True)
-class DirectLight:
+class DirectLight(NamedTuple):
     """The direct part on a region, (h, w): phasor (f, h, w), intensity, the central ray's range, surface and texture
     place, the share of the footprint on that surface, and which pixels were finely divided. ``face`` (f + 1, h, w):
     mean over a pixel's sub-rays on the undamaged face of albedo x exp(i 2 pi f range / c), frequency 0 last;
@@ -201,7 +197,9 @@ def _of_moments(moments: np.ndarray, about_m: np.ndarray, frequencies_hz: tuple[
 class _Sums:
     """Direct light of a region's pixels, flat, while it is made: fields as of `DirectLight`. What is added replaces."""
 
-    def __init__(self, lit: LitScene, slopes: np.ndarray, footprint: Footprint, frequencies_hz: Frequencies) -> None:
+    def __init__(
+        self, lit: LitScene, slopes: np.ndarray, footprint: Quadrilaterals, frequencies_hz: Frequencies
+    ) -> None:
         self.lit, self.footprint, self.frequencies_hz = lit, footprint, frequencies_hz
         self.slopes, (h, w), lines = slopes.reshape(-1, 2), slopes.shape[:2], len(frequencies_hz)
         self.rows, self.cols = np.divmod(np.arange(h * w), w)
@@ -261,7 +259,7 @@ class _Sums:
 def direct_light(
     lit: LitScene,
     slopes: np.ndarray,
-    footprint: Footprint,
+    footprint: Quadrilaterals,
     frequencies_hz: Frequencies,
     closely: np.ndarray | None = None,
     roughly: np.ndarray | None = None,
@@ -286,7 +284,6 @@ def direct_light(
     unsure = [sums.add_rays(here, footprint.fine(rows[here], cols[here]), again) for here in edges]
     for here in _chunks(np.concatenate([np.zeros(0, int), *unsure]), FINEST):
         sums.add_rays(here, footprint.fine(rows[here], cols[here], FINEST))
-    off = (np.concatenate([getattr(each, f.name) for each in sums.off_face]) for f in fields(OffFace))
     return DirectLight(
         phasor=sums.phasor.reshape(-1, *shape),
         intensity=sums.intensity.reshape(shape),
@@ -297,7 +294,7 @@ def direct_light(
         fine=fine,
         face=sums.face.reshape(-1, *shape),
         face_range_m=sums.face_range_m.reshape(shape),
-        off_face=OffFace(*off),
+        off_face=OffFace(*map(np.concatenate, zip(*sums.off_face, strict=True))),
     )
 
 

@@ -22,9 +22,7 @@ FIX = "pip install karellen-llvm-core (Linux x86-64), or set DRJIT_LIBLLVM_PATH 
 
 
 def load_mitsuba() -> Any:
-    """Return the mitsuba module with a variant set. Raises UserError that names what to install where none works.
-    Dr.Jit 1.5 aborts the process at the first kernel with LLVM 14 to 16, so the LLVM of the wheel karellen-llvm-core is
-    taken and none of the system; a path in DRJIT_LIBLLVM_PATH has the last word."""
+    """Return the mitsuba module with a variant set. Raises UserError that names what to install where none works."""
     # Dr.Jit looks for LLVM when it is imported, so the path comes first; without a GPU only does it matter.
     missing = _point_to_llvm()
     import mitsuba as mi
@@ -64,8 +62,8 @@ def _has_nvidia_driver() -> bool:
 
 
 def _point_to_llvm() -> UserError | None:
-    """Set DRJIT_LIBLLVM_PATH where it is not set to the wheel's LLVM, because Dr.Jit's own search may pick an older one
-    of the system. Returns the mistake to raise where no LLVM can be used."""
+    """Set DRJIT_LIBLLVM_PATH, where it is not set, to the LLVM of the wheel karellen-llvm-core: Dr.Jit's own search may
+    pick one that aborts the process. Returns the mistake to raise where no LLVM can be used."""
     named = os.environ.get("DRJIT_LIBLLVM_PATH")
     if named:
         message, legal = f"DRJIT_LIBLLVM_PATH names {named}, which does not exist", "the path of LLVM 17 or newer"
@@ -78,8 +76,7 @@ def _point_to_llvm() -> UserError | None:
     return UserError("no LLVM was found that Dr.Jit can use", legal=LEGAL, fix=FIX)
 
 
-LIFT_M = 1e-5
-"""Distance from a surface at which a ray starts: float32 places hits within 1e-6 m; Mitsuba's own lift is 0.15 mm."""
+LIFT_M = 1e-5  # from a surface to where a ray starts: float32 places hits within 1e-6 m; Mitsuba's lift is 0.15 mm
 
 
 class Met(NamedTuple):
@@ -119,11 +116,6 @@ class LitScene:
     texture: Any
     uv_of: np.ndarray
     uv_factors: list[Any]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the surfaces in order."""
-        return tuple(part.name for part in self.parts)
 
     def meet(self, origin: Any, direction: Any) -> Met:
         """Return where rays along unit directions first meet the scene."""

@@ -6,9 +6,7 @@ light is smooth, so it is gathered at the nodes of a coarse grid and interpolate
 
 from __future__ import annotations
 
-import dataclasses
 import time
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -39,8 +37,7 @@ MESH_WITHIN_M = 0.05 * MM  # the same of a part from a mesh, whose heights stand
 ABOVE_FACE_M = 1 * MM  # height of the nodes, so that tape does not bury them
 
 
-@dataclass(frozen=True)
-class PathWork:
+class PathWork(NamedTuple):
     """Settings of the walk: at which frequencies, with how many reflections beyond the first, and from which seed."""
 
     frequencies_hz: tuple[float, ...]
@@ -60,7 +57,7 @@ def gather_at_points(
 
     mi = lit.mi
     columns = [mi.Float(np.ascontiguousarray(each, np.float32)) for each in (*points_m.T, *normals.T)]
-    board = lit.names.index("board") if "board" in lit.names else 0
+    board = next((k for k, part in enumerate(lit.parts) if part.name == "board"), 0)
 
     def drawn(place: Any, u1: Any, u2: Any) -> tuple[Any, Any, Any, Any]:
         x, y, z, nx, ny, nz = (dr.gather(mi.Float, column, place) for column in columns)
@@ -100,8 +97,8 @@ def gather_in_pixels(lit: LitScene, rays: OffFace, work: PathWork, samples: int 
 
     mi = lit.mi
     across, down = (mi.Float(np.ascontiguousarray(each, np.float32)) for each in rays.slopes.T)
-    firsts = mi.UInt32((np.cumsum(rays.count) - rays.count).astype(np.uint32))
-    counts = mi.UInt32(rays.count.astype(np.uint32))
+    firsts = mi.UInt32((np.cumsum(rays.counts) - rays.counts).astype(np.uint32))
+    counts = mi.UInt32(rays.counts.astype(np.uint32))
 
     def start(place: Any, u1: Any, u2: Any) -> tuple[Any, Any, Any, Any]:
         first, count = (dr.gather(mi.UInt32, a, place) for a in (firsts, counts))
@@ -172,15 +169,6 @@ def _towards(
     return direction, dr.select(cosine > 0, dr.select(before, 2 / (1 + ratio), 1), 0)
 
 
-class _Lanes(NamedTuple):
-    """Lanes of a walk, Dr.Jit arrays: each walks ``count`` paths of a place and batch, from number ``first`` on."""
-
-    place: Any
-    batch: Any
-    first: Any
-    count: Any
-
-
 class _Walk:
     """Paths from places, backwards. ``start`` (place, u1, u2): point from which the path's length counts, origin,
     direction and weight of the first ray. ``on_surface``: light that reaches the first hit directly counts (for a start
@@ -197,26 +185,24 @@ class _Walk:
         if bright is not None:
             self.aim = tuple(mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in bright[:3, k])) for k in (0, 1, 3))
 
-    def sums(self, lanes: _Lanes) -> np.ndarray:
-        """Return sums over the paths of lanes: (f + 1, n) complex64, intensity last."""
+    def sums(self, lanes: np.ndarray) -> np.ndarray:
+        """Return sums over the paths of lanes: (f + 1, n) complex64, intensity last. ``lanes`` (4, n) uint32: each
+        walks ``count`` paths of a place and batch, from number ``first`` on."""
         import drjit as dr
 
         mi, lines = self.lit.mi, len(self.work.frequencies_hz)
-        n, kinds = dr.width(lanes.place), (mi.UInt32, mi.UInt32, mi.Point3f, mi.Normal3f, mi.Vector3f, mi.Float)
+        self.place, self.batch, self.first, self.count = map(mi.UInt32, lanes)
+        n, kinds = lanes.shape[1], (mi.UInt32, mi.UInt32, mi.Point3f, mi.Normal3f, mi.Vector3f, mi.Float)
         zeros = [dr.zeros(mi.Float, n) for _ in range(2 * lines + 1)]
         state = (*(dr.zeros(kind, n) for kind in kinds), dr.ones(mi.Float, n), zeros)
 
-        def go_on(*state: Any) -> tuple[Any, ...]:
-            return self._vertex(lanes, *state)
-
-        totals = dr.while_loop(state, lambda sample, *_: sample < lanes.count, go_on, label="walk")[-1]
+        totals = dr.while_loop(state, lambda sample, *_: sample < self.count, self._vertex, label="walk")[-1]
         dr.eval(totals)
         values = [total.numpy() for total in totals]
         return np.stack([*(values[2 * k] + 1j * values[2 * k + 1] for k in range(lines)), values[-1]])
 
     def _vertex(
         self,
-        lanes: _Lanes,
         sample: Any,
         vertex: Any,
         before: Any,
@@ -230,8 +216,8 @@ class _Walk:
         import drjit as dr
 
         lit, mi, fresh = self.lit, self.lit.mi, vertex == 0
-        start = self.start(lanes.place, self._uniform(lanes, sample, 0), self._uniform(lanes, sample, 1))
-        start_point, origin, start_direction, weight = start
+        first = self._uniform(sample, 0), self._uniform(sample, 1)
+        start_point, origin, start_direction, weight = self.start(self.place, *first)
         before = dr.select(fresh, start_point, before)
         origin = dr.select(fresh, origin, before + LIFT_M * before_normal)
         direction = dr.select(fresh, start_direction, direction)
@@ -247,7 +233,7 @@ class _Walk:
 
         more = met & (vertex < self.work.bounces) & (throughput > 0)
         dimension = START_DIMENSIONS + PER_VERTEX * vertex
-        u1, u2 = self._uniform(lanes, sample, dimension), self._uniform(lanes, sample, dimension + 1)
+        u1, u2 = self._uniform(sample, dimension), self._uniform(sample, dimension + 1)
         direction = mi.Frame3f(hit.normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2)))
         if self.aim is not None:
             # the half of the square that the other choice leaves is a square too
@@ -261,13 +247,13 @@ class _Walk:
         sample, vertex = sample + dr.select(more, mi.UInt32(0), 1), dr.select(more, vertex + 1, 0)
         return sample, vertex, hit.place, hit.normal, direction, length, throughput, totals
 
-    def _uniform(self, lanes: _Lanes, sample: Any, dimension: Any) -> Any:
+    def _uniform(self, sample: Any, dimension: Any) -> Any:
         """Return a co-ordinate of the low-discrepancy point of each lane's path, turned by its place's rotation."""
         import drjit as dr
 
-        number = lanes.batch * self.batch_points + lanes.first + sample
+        number = self.batch * self.batch_points + self.first + sample
         u = dr.gather(self.lit.mi.Float, self.table, number * self.dimensions + dimension)
-        rotation = lanes.batch + BATCHES * (0 if self.on_surface else lanes.place)
+        rotation = self.batch + BATCHES * (0 if self.on_surface else self.place)
         u += self.lit.mi.sample_tea_float32(rotation, dimension + self.work.seed * 1024, 4)
         return u - dr.floor(u)
 
@@ -281,7 +267,7 @@ def _gather(
     Lambertian surface, so each bounce multiplies by its albedo and, where it is glossy, by `LitScene.lobe`."""
     per_batch = np.maximum(samples // BATCHES, 1)
     walked = _Walk(lit, start, work, on_surface, bright, int(per_batch.max()))
-    lines, to_device = len(work.frequencies_hz), lit.mi.UInt32
+    lines = len(work.frequencies_hz)
     # lanes for so many paths a batch at each place, and where those of each place and batch begin
     per_pair = np.repeat(-(-per_batch // PATHS_A_LANE), BATCHES)
     begins = np.cumsum(per_pair) - per_pair
@@ -291,7 +277,7 @@ def _gather(
     lanes = np.stack([place, batch, first, np.minimum(per_batch[place] - first, PATHS_A_LANE)]).astype(np.uint32)
     at_once = max(FLOATS_AT_ONCE // (2 * lines + 1), 1)
     chunks = (lanes[:, begin : begin + at_once] for begin in range(0, lanes.shape[1], at_once))
-    sums = np.concatenate([walked.sums(_Lanes(*map(to_device, chunk))) for chunk in chunks], axis=1)
+    sums = np.concatenate([walked.sums(chunk) for chunk in chunks], axis=1)
     by_batch = np.add.reduceat(sums, begins, axis=1).reshape(lines + 1, len(samples), BATCHES) / per_batch[:, None]
     return np.ascontiguousarray(np.moveaxis(by_batch, 2, 0), np.complex64)
 
@@ -320,7 +306,7 @@ def face_triangles(target: Target) -> list[np.ndarray]:
     mesh = target.parts[0].mesh
     board = transform_points(invert(target.T_camera_board), mesh.vertices)
     within_m = MESH_WITHIN_M if target.config.board.shape.kind == "mesh" else FACE_WITHIN_M
-    near = np.abs(board[:, 2] - target.face_height_m(board[:, 0], board[:, 1])) < within_m
+    near = np.abs(board[:, 2] - face_of(target.config.board).height_m(board[:, 0], board[:, 1])) < within_m
     others = (np.full(len(part.mesh.faces), part.name.startswith("tape")) for part in target.parts[1:])
     return [np.asarray(near[mesh.faces].all(axis=1)), *others]
 
@@ -419,7 +405,7 @@ def render_view(target: Target, optics: Optics, config: RenderConfig) -> NoiseFr
         indirect_noise_m=noise_m,
         range_m=direct.range_m,
         surface=direct.surface,
-        surface_names=lit.names,
+        surface_names=tuple(part.name for part in target.parts),
         coverage=direct.coverage,
         rgb=rgb,
         slopes=slopes,
@@ -470,7 +456,7 @@ def _samples_inside(
     """Return how many paths bring a pixel down to ``hole_noise_mm``, as a few tell, which kept would bias the mean."""
     if config.hole_samples <= PILOT_SAMPLES:
         return config.hole_samples
-    pilot = gather_in_pixels(lit, rays, dataclasses.replace(work, seed=work.seed + PILOT_SEED), PILOT_SAMPLES)
+    pilot = gather_in_pixels(lit, rays, work._replace(seed=work.seed + PILOT_SEED), PILOT_SAMPLES)
     batches = rays.share * pilot[:, noise_lines(work.frequencies_hz)]
     total = total + rays.share * pilot.mean(axis=0, dtype=complex)[:-1]
     noise_m = range_noise_m(batches, total, work.frequencies_hz)

@@ -57,11 +57,6 @@ def temporal_sigma_m(camera: AnyCamera, distance_m: float, albedo: float, frames
     return float(np.sqrt(variance.mean()))
 
 
-def with_jitter_m(camera: AnyCamera, sigma_m: float) -> float:
-    """Return the deviation of single pixels with the jitter of whole frames, from that without it, metres."""
-    return float(np.hypot(sigma_m, camera.unit.jitter_mm.value * MM))
-
-
 def calibrated_signal_electrons(camera: PhotonCamera, frames: int | None = None, seed: int = 1) -> float:
     """Return the gain that meets the camera's calibration point, to 0.5 %."""
     photons, count = camera.photons, frames or FRAMES[camera.kind]
@@ -72,14 +67,14 @@ def calibrated_signal_electrons(camera: PhotonCamera, frames: int | None = None,
         trial: PhotonCamera = with_number(camera, "photons", "signal_electrons", float(np.exp(log_electrons)))
         sigma_m = temporal_sigma_m(trial, distance_m, albedo, count, seed)
         # a camera too dim to see the wall at all is as far too noisy as any
-        return with_jitter_m(trial, sigma_m) / wanted - 1 if np.isfinite(sigma_m) else 100.0
+        with_jitter_m = float(np.hypot(sigma_m, camera.unit.jitter_mm.value * MM))
+        return with_jitter_m / wanted - 1 if np.isfinite(sigma_m) else 100.0
 
     return float(np.exp(optimize.brentq(excess, *np.log(RANGE_OF_ELECTRONS[camera.kind]), xtol=1e-3)))
 
 
 def calibrated_numbers(camera: PhotonCamera) -> dict[str, float]:
-    """Return the fitted numbers by their keys in the camera's file: the gain, then of a lidar the confidence threshold
-    at which half of the pixels are valid at the published reach."""
+    """Return the gain, and of a lidar the threshold at which half are valid at the published reach, by their keys."""
     numbers = {"photons.signal_electrons": calibrated_signal_electrons(camera)}
     if isinstance(camera, ScannedLidar):
         fitted = with_number(camera, "photons", "signal_electrons", numbers["photons.signal_electrons"])

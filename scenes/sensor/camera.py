@@ -36,11 +36,8 @@ CAMERAS = PlugIns(
 
 AnyCamera = AmcwCamera | ScannedLidar | EmpiricalCamera
 """Every kind of camera, told apart by ``kind``. All have name, title, nominal_lens, optics, unit, z_step_m."""
-KINDS: dict[str, type[AnyCamera]] = {
-    "amcw_imager": AmcwCamera,
-    "scanned_lidar": ScannedLidar,
-    "empirical": EmpiricalCamera,
-}
+KINDS: dict[str, type[AnyCamera]]
+KINDS = {"amcw_imager": AmcwCamera, "scanned_lidar": ScannedLidar, "empirical": EmpiricalCamera}
 
 
 class EffectsConfig(Config):
@@ -139,8 +136,7 @@ def camera_of(config: CameraConfig) -> AnyCamera:
 
 
 def guessed_precision(camera: AnyCamera) -> str:
-    """Return a sentence on a camera whose precision nobody publishes; empty for others. Noise goes with the root of the
-    gain where shot noise rules."""
+    """Return a sentence on a camera whose precision nobody publishes (shot noise by its gain); empty for others."""
     if isinstance(camera, EmpiricalCamera) or (gain := camera.photons.signal_electrons).range is None:
         return ""
     low, high = (float(np.sqrt(gain.value / end)) for end in reversed(gain.range))

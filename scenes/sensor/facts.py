@@ -64,9 +64,8 @@ Wavelength = Annotated[Fact[float], checked("from 300 to 2000 nanometres", lambd
 
 
 class LensFacts(Config):
-    """The nominal lens; ``distortion`` is k1 k2 p1 p2 [k3 [k4 k5 k6]] of OpenCV's model, or empty for none.
-    ``field_half_angle_deg``: the lens's image is a circle that ends so far from the axis; None: it covers the sensor.
-    Pixels beyond it see nothing, and the distortion may fold there."""
+    """The nominal lens; ``distortion`` is k1 k2 p1 p2 [k3 [k4 k5 k6]] of OpenCV's model, or empty for none. Pixels
+    beyond ``field_half_angle_deg`` see nothing, and distortion may fold there; None: the image covers the sensor."""
 
     width_px: PositiveInt
     height_px: PositiveInt

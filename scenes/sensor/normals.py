@@ -7,6 +7,7 @@ from typing import Any
 
 import numba
 import numpy as np
+from numba import types
 from numba.extending import intrinsic
 
 FAST: Any = {"cache": True, "fastmath": {"nsz"}, "error_model": "numpy", "nogil": True}
@@ -35,7 +36,7 @@ def normals_from_bits(bits: np.ndarray, out: np.ndarray) -> None:
 @numba.njit(inline="always", **FAST)
 def _log(u):  # type: ignore[no-untyped-def]
     """Return the natural logarithm of a positive float32: exponent from the bits, mantissa by an atanh series."""
-    word: Any = float_bits(u)  # type: ignore[call-arg]
+    word: Any = float_bits(u)
     exponent = np.int32(word >> np.uint32(23)) - np.int32(127)
     mantissa = bits_float((word & np.uint32(0x007FFFFF)) | np.uint32(0x3F800000))
     big = mantissa > np.float32(1.41421356)
@@ -65,24 +66,16 @@ def _sincos_turns(v):  # type: ignore[no-untyped-def]
     return a, b
 
 
-@intrinsic
-def float_bits(context, value):  # type: ignore[no-untyped-def]
-    """Return the bits of a float32 as a uint32."""
+def _bits(of: Any, into: Any) -> Any:
+    """Return a compiled function that takes the bits of a number of one type as a number of another."""
 
-    def build(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        return builder.bitcast(args[0], context.get_value_type(numba.types.uint32))
+    def cast(context, value):  # type: ignore[no-untyped-def]
+        return into(of), lambda inner, builder, _, args: builder.bitcast(args[0], inner.get_value_type(into))
 
-    return numba.types.uint32(numba.types.float32), build
+    return intrinsic(cast)
 
 
-@intrinsic
-def bits_float(context, value):  # type: ignore[no-untyped-def]
-    """Return the float32 whose bits are a uint32."""
-
-    def build(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        return builder.bitcast(args[0], context.get_value_type(numba.types.float32))
-
-    return numba.types.float32(numba.types.uint32), build
+float_bits, bits_float = _bits(types.float32, types.uint32), _bits(types.uint32, types.float32)
 
 
 def standard_normals(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:

@@ -65,8 +65,7 @@ def rays_of(slopes: np.ndarray, offset_m: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def smooth_field(white: np.ndarray, length_px: float) -> np.ndarray:
-    """Smooth white noise (h, w) to unit variance and autocorrelation exp(-k^2 / 2 length^2), periodic: by a Gaussian of
-    length / sqrt 2, whose variance falls to the kernel's sum of squares."""
+    """Smooth white noise (h, w) to unit variance and autocorrelation exp(-k^2 / 2 length^2), periodic."""
     s = length_px / np.sqrt(2)
     smooth, power = ndimage.gaussian_filter(white, s, mode="wrap"), []
     for size in white.shape:
@@ -76,8 +75,7 @@ def smooth_field(white: np.ndarray, length_px: float) -> np.ndarray:
 
 
 SPECTRUM, LEAST_POWER, FAINT = 256, 1e-3, 0.05
-"""Frequencies of a filter's spectrum, the least power there relative to the largest, and the share of the largest tap
-below which further taps are left out: correlations are met to 0.015."""
+"""Frequencies of a filter's spectrum, least power there and least tap, over the largest: correlations to 0.015."""
 
 
 def taps_of(correlation: np.ndarray) -> np.ndarray:

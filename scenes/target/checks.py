@@ -9,7 +9,7 @@ import numpy as np
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, transform_points
 from scenes.target import custom
-from scenes.target.flaws import ChipConfig, FlawConfig, RoundConfig, border, outside_m
+from scenes.target.flaws import ChipConfig, FlawConfig, RoundConfig, border, outside_m, turned
 from scenes.target.part import part_of
 from scenes.target.truth import Face, backing_corners_board_m, face_grid_m, face_of, relief_points, widest_rim_m
 
@@ -178,15 +178,9 @@ def _outline_m(damage: custom.AnyDamage, face: Face) -> np.ndarray:
     return damage.centre_m + widest_rim_m(damage, face) * _CIRCLE
 
 
-def _turn(tape: custom.TapeConfig) -> np.ndarray:
-    """Return the 2x2 matrix from a strip's own axes to the board's."""
-    angle = np.deg2rad(tape.angle_deg)
-    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-
-
 def off_tape_mm(tape: custom.TapeConfig, places_mm: np.ndarray) -> np.ndarray:
     """Return the distance in plan of places (n, 2) from a strip, mm; 0 on it."""
-    beyond = np.abs((places_mm - tape.centre_mm) @ _turn(tape)) - np.array(tape.size_mm) / 2
+    beyond = np.abs((places_mm - tape.centre_mm) @ turned(np.deg2rad(tape.angle_deg))) - np.array(tape.size_mm) / 2
     return np.asarray(np.linalg.norm(np.maximum(beyond, 0.0), axis=-1))
 
 
@@ -198,7 +192,8 @@ def _tape_problems(config: custom.TargetConfig) -> list[str]:
     for number, tape in enumerate(config.tapes, start=1):
         (width, height), (x, y) = tape.size_mm, tape.centre_mm
         name = f"tape {number} ({width:g} x {height:g} mm at ({x:g}, {y:g}) mm)"
-        corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * (np.array(tape.size_mm) / 2) @ _turn(tape).T + (x, y)
+        corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * (np.array(tape.size_mm) / 2)
+        corners = corners @ turned(np.deg2rad(tape.angle_deg)).T + (x, y)
         over = float((np.abs(corners) - np.array([config.board.width_mm, config.board.height_mm]) / 2).max())
         if over > 0:
             problems.append(f"{name}: leaves {_size(config.board)} by {over:.3g} mm")

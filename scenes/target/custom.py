@@ -310,7 +310,7 @@ class PoseConfig(Config):
 
 
 class SetUpConfig(Config):
-    """What surrounds a board and where it stands. ``backing`` or ``room`` left out: nothing stands there."""
+    """Surroundings of a board, and its pose. ``backing`` or ``room`` left out: nothing stands there."""
 
     flaws: Annotated[tuple[AnyFlawConfig, ...], Field(max_length=500, description="every other kind of damage")] = ()
     material: MaterialConfig = MaterialConfig()

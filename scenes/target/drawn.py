@@ -26,8 +26,7 @@ from scenes.target import custom, flaws
 from scenes.target.checks import LEAST_WEB_MM, SHALLOWEST_BEND, WIDEST_BEND, off_tape_mm
 from scenes.target.truth import OUTLINE_STEPS, backing_corners_board_m, face_grid_m, face_of, outline_board_m
 
-Purpose = Literal["learning", "calibration", "hole_free", "damaged"]
-"""Boards on which detectors learn, thresholds are set, false calls counted, damage inspected: each has its own."""
+Purpose = Literal["learning", "calibration", "hole_free", "damaged"]  # of boards; each has boards of its own
 NEAREST_M, FARTHEST_M = 0.1, 10.0  # limits of a pose's distance, jitter included
 WIDEST_BACKING_MM = 1e4  # that a declaration allows
 ATTEMPTS, TRIES = 50, 400
@@ -234,9 +233,8 @@ class DrawnTargetConfig(Config):
         return self.drawn("damaged", 0)
 
     def drawn(self, purpose: Purpose, number: int) -> custom.TargetConfig:
-        """Return a board of the family with its damage, ids from 1 in the order of size. Boards that are to be
-        hole-free have damage too: what ``hole_free()`` of the answer leaves out are unflawed sites, placed as damage
-        is. Raises UserError where the board is too full for the damage."""
+        """Return a board of the family with its damage, ids from 1 in the order of size; of a hole-free one call
+        ``hole_free()``: what that leaves out are unflawed sites. Raises UserError where the board is too full."""
 
         def stream(quantity: str) -> np.random.Generator:
             return random_stream(self.seed, "drawn board", purpose, number, quantity)

@@ -161,9 +161,9 @@ class RoundConfig(_FlawConfig):
 
 
 class CorrosionConfig(_FlawConfig):
-    """A corroded patch: an uneven outline of a circle's area, whose radius varies by ``uneven`` (standard deviation
-    over mean), and a rough floor of a stated mean depth, standard deviation and correlation length (Gaussian, cut at
-    the face), rising to the face over the outer tenth of the radius."""
+    """A corroded patch: an uneven outline of a circle's area, whose radius varies by ``uneven`` (deviation over mean),
+    and a rough floor of a mean depth, deviation ``rough_mm`` and correlation length ``grain_mm`` (Gaussian, cut at the
+    face), rising to the face over the outer tenth of the radius."""
 
     kind: Literal["corrosion"]
     diameter_mm: Annotated[Extent, Field(description="of the circle with the patch's area")]
@@ -229,6 +229,11 @@ def _mean(s: np.ndarray, t: np.ndarray, values: np.ndarray) -> float:
     areas = np.abs(across[0] * down[1] - across[1] * down[0])
     middles = (values[1:, 1:] + values[:-1, :-1] + values[1:, :-1] + values[:-1, 1:]) / 4
     return float((areas * middles).sum() / areas.sum())
+
+
+def turned(angle_rad: float) -> np.ndarray:
+    """Return the 2x2 matrix that turns from x towards y."""
+    return np.array([[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]])
 
 
 def border(grid: np.ndarray) -> np.ndarray:

@@ -18,24 +18,14 @@ from scipy.optimize import brentq
 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import bounded_bytes, write_bytes, write_text
-from harness.vocabulary.geometry import MM, transform_points
+from harness.vocabulary.geometry import MM
 from harness.vocabulary.provenance import RESULTS_VERSION
 from harness.vocabulary.seeds import random_stream
 from scenes.target.checks import check_target
 from scenes.target.custom import DentConfig, HoleConfig, MaterialConfig, MeshConfig, TargetConfig
-from scenes.target.flaws import FlawConfig, RoundConfig, closed_grid
+from scenes.target.flaws import FlawConfig, RoundConfig, closed_grid, turned
 from scenes.target.part import part_of
-from scenes.target.truth import (
-    Damage,
-    Face,
-    backing_corners_board_m,
-    face_of,
-    floor_corners_camera_m,
-    outline_board_m,
-    relief_points,
-    truth_of,
-    wall_corners_camera_m,
-)
+from scenes.target.truth import Damage, Face, face_of, outline_board_m, planes_of, relief_points, truth_of
 
 if TYPE_CHECKING:
     import trimesh
@@ -49,8 +39,7 @@ FIBRE_LENGTH_MM, FIBRE_WIDTH_MM = 12.0, 0.5  # correlation lengths of the fibres
 
 
 def grain(material: MaterialConfig, width_mm: float, height_mm: float) -> np.ndarray:
-    """Return the grain of a board's face: (rows, columns) float64 with mean 0 and standard deviation 1. Not modelled:
-    knots, seams of the veneer, a contrast that depends on the wavelength."""
+    """Return a board's grain: (rows, columns) float64, mean 0, deviation 1. Not modelled: knots, seams."""
     texel_mm = max(TEXEL_MM, width_mm / MAX_TEXELS, height_mm / MAX_TEXELS)
     shape = tuple(max(2, round(size / texel_mm)) for size in (height_mm, width_mm))
     stream = random_stream(material.grain_seed, "grain")
@@ -108,8 +97,7 @@ def _normalised(values: np.ndarray) -> np.ndarray:
     return centred / max(float(centred.std()), 1e-12)
 
 
-COARSEST_SAGITTA_M, FINEST_SAGITTA_M = 2e-6, 0.1e-6
-"""Largest distance of facets from a bent face: well under a camera's noise, finer below shallow dents (depth / 400)."""
+COARSEST_SAGITTA_M, FINEST_SAGITTA_M = 2e-6, 0.1e-6  # of facets on a bent face; under shallow dents depth / 400
 ROUGH_SAGITTA_M = 8e-5  # the same at the sharpest crest of a rough face; elsewhere a tenth of it
 TAPE_SINK_M = 0.1e-3  # depth of a strip's underside in the board, so that no two surfaces coincide
 CORNER_M = 4e-6  # by which corners of a circle's polygon, of the same area, may stand out: 28 for 2 mm, 104 for 1 in
@@ -130,11 +118,11 @@ class TargetPart:
 
     name: str
     mesh: trimesh.Trimesh
-    uv: np.ndarray | None
     albedo_850: float
-    texture_850: np.ndarray | None
     rgb: np.ndarray
-    texture_rgb: np.ndarray | None
+    uv: np.ndarray | None = None
+    texture_850: np.ndarray | None = None
+    texture_rgb: np.ndarray | None = None
     gloss: tuple[float, float] = (0.0, 1.0)
 
     def rgb_at(self, uv: np.ndarray) -> np.ndarray:
@@ -155,10 +143,6 @@ class Target:
     T_camera_board: np.ndarray
     outline_board_m: np.ndarray
 
-    def face_height_m(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
-        """Return z of the undamaged face over plan positions, board frame; NaN beyond the reach of a round shape."""
-        return face_of(self.config.board).height_m(x_m, y_m)
-
 
 def build_target(config: TargetConfig) -> Target:
     """Build a declaration. Raises UserError that names every part that does not fit (`scenes.target.checks`)."""
@@ -177,29 +161,18 @@ def build_target(config: TargetConfig) -> Target:
         contrast = material.grain_contrast if image is None else 1.0
         texture_850 = reflectance(pattern, material.albedo_850, contrast)
         texture_rgb = np.stack([reflectance(pattern, mean, contrast) for mean in material.rgb], axis=-1)
-    rgb = np.array(material.rgb)
+    own = material.albedo_850, np.array(material.rgb), uv, texture_850, texture_rgb
     gloss = (material.gloss.share, material.gloss.exponent) if material.gloss else (0.0, 1.0)
-    parts = [TargetPart("board", mesh, uv, material.albedo_850, texture_850, rgb, texture_rgb, gloss)]
-
-    def add(name: str, mesh: trimesh.Trimesh, albedo_850: float, rgb: tuple[float, float, float]) -> None:
-        parts.append(TargetPart(name, mesh, None, albedo_850, None, np.array(rgb), None))
-
-    def add_plane(name: str, corners: np.ndarray, *colours: Any) -> None:
-        add(name, trimesh.Trimesh(vertices=corners, faces=[(0, 1, 2), (0, 2, 3)], process=False), *colours)
-
+    parts = [TargetPart("board", mesh, *own, gloss)]
     for number, tape in enumerate(config.tapes, start=1):
         (width, height), (x, y), top_m = tape.size_mm, tape.centre_mm, tape.thickness_mm * MM
         size_m, at = (width * MM, height * MM), ((x * MM, y * MM), float(np.deg2rad(tape.angle_deg)))
         strip = sheet(face_of(board), size_m, top_m, -TAPE_SINK_M, sagitta_m, *at)
-        add(f"tape_{number}", strip.apply_transform(T_camera_board), tape.albedo_850, tape.rgb)
-    backing, room = config.backing, config.room
-    if backing is not None:
-        corners = transform_points(T_camera_board, backing_corners_board_m(config, backing))
-        add_plane("backing", corners, backing.albedo_850, backing.rgb)
-    if room is not None and room.floor_below_lens_m is not None:
-        add_plane("floor", floor_corners_camera_m(room), room.floor_albedo_850, room.floor_rgb)
-    if room is not None and room.back_wall_distance_m is not None:
-        add_plane("back_wall", wall_corners_camera_m(room), room.back_wall_albedo_850, room.back_wall_rgb)
+        strip.apply_transform(T_camera_board)
+        parts.append(TargetPart(f"tape_{number}", strip, tape.albedo_850, np.array(tape.rgb)))
+    for name, corners, albedo_850, rgb in planes_of(config):
+        plane = trimesh.Trimesh(vertices=corners, faces=[(0, 1, 2), (0, 2, 3)], process=False)
+        parts.append(TargetPart(name, plane, albedo_850, np.array(rgb)))
     return Target(config, tuple(parts), truth, T_camera_board, outline_board_m(board))
 
 
@@ -246,7 +219,7 @@ def sheet(
     plane. Board frame. Raises UserError where the face needs more than MAX_CELLS."""
     import trimesh
 
-    turn = np.array([[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]])
+    turn = turned(angle_rad)
 
     def plan(columns: int, rows: int) -> np.ndarray:
         steps = (np.linspace(-0.5, 0.5, n + 1) * size for n, size in zip((columns, rows), size_m, strict=True))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
@@ -183,6 +183,7 @@ def outline_board_m(board: custom.BoardConfig) -> np.ndarray:
     return face_of(board).point(half_x * x, half_y * y)
 
 
+@lru_cache(maxsize=100)
 def face_grid_m(board: custom.BoardConfig, depth_m: float = 0.0, steps: int = 32) -> np.ndarray:
     """Return (n, n, 3): the face, rim included, moved along its normals by ``depth_m`` into the board; board frame."""
     face, places = face_of(board), np.linspace(-0.5, 0.5, steps + 1)
@@ -203,18 +204,23 @@ def backing_corners_board_m(config: custom.TargetConfig, backing: custom.Backing
     return np.column_stack([_UNIT_CORNERS * size_m, np.full(4, -z_m)])
 
 
-def floor_corners_camera_m(room: custom.RoomConfig) -> np.ndarray:
-    """Return the floor's corners in the camera's frame; it faces up and reaches from the lens to the back wall."""
-    far_m = room.back_wall_distance_m or OPEN_FLOOR_M
-    x, z = room.width_m * _UNIT_CORNERS[:, 0], far_m * (_UNIT_CORNERS[:, 1] + 0.5)
-    return np.column_stack([x, np.full(4, room.floor_below_lens_m, float), z])
-
-
-def wall_corners_camera_m(room: custom.RoomConfig) -> np.ndarray:
-    """Return the back wall's corners in the camera's frame, on the floor (without a floor, centred on the axis)."""
-    foot_m = room.height_m / 2 if room.floor_below_lens_m is None else room.floor_below_lens_m
-    x, up = room.width_m * _UNIT_CORNERS[:, 0], room.height_m * (_UNIT_CORNERS[:, 1] + 0.5)
-    return np.column_stack([x, foot_m - up, np.full(4, room.back_wall_distance_m, float)])
+def planes_of(config: custom.TargetConfig) -> Iterator[tuple[str, np.ndarray, float, custom.Rgb]]:
+    """Yield backing, floor and back wall, as declared: name, corners (4, 3) in the camera's frame, albedo at 850 nm and
+    rgb. The floor reaches to the back wall, which stands on it or, without a floor, is centred on the axis."""
+    backing, room, across, up = config.backing, config.room, _UNIT_CORNERS[:, 0], _UNIT_CORNERS[:, 1] + 0.5
+    if backing is not None:
+        corners = transform_points(config.pose.T_camera_board, backing_corners_board_m(config, backing))
+        yield "backing", corners, backing.albedo_850, backing.rgb
+    if room is None:
+        return
+    floor_m, wall_m, across_m = room.floor_below_lens_m, room.back_wall_distance_m, room.width_m * across
+    if floor_m is not None:
+        corners = np.column_stack([across_m, np.full(4, floor_m), (wall_m or OPEN_FLOOR_M) * up])
+        yield "floor", corners, room.floor_albedo_850, room.floor_rgb
+    if wall_m is not None:
+        foot_m = room.height_m / 2 if floor_m is None else floor_m
+        corners = np.column_stack([across_m, foot_m - room.height_m * up, np.full(4, wall_m)])
+        yield "back_wall", corners, room.back_wall_albedo_850, room.back_wall_rgb
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from scenes.sensor.amcw.imager import AmcwExposure, AmcwImager
 
 f4 = np.float32
+Arrays = tuple[np.ndarray, ...]
 NONE, EVEN, UNEVEN = 0, 1, 2
 
 
@@ -242,7 +243,7 @@ def at_once(imager: AmcwImager, exposure: AmcwExposure, asked: np.ndarray) -> At
     pull = np.broadcast_to(metres, light.turn.shape)
     if window.by_amplitude:
         pull = metres * light.amplitude / np.median(light.amplitude, axis=1, keepdims=True)
-    linear = _linear(imager, light, window, certain, np.flatnonzero(even), of_even, rest, moved, pull)
+    linear = _linear(imager, light, certain, pull, (np.flatnonzero(even), *of_even), (rest, moved))
     listing = _listed(wanted.reshape(shape), space.shape[0], imager.engine.flying is not None)
     halo = Light(*(np.ascontiguousarray(part[:, listing.halo]) for part in light))
     each = (pull[:, listing.halo] * halo.turn).T
@@ -251,40 +252,35 @@ def at_once(imager: AmcwImager, exposure: AmcwExposure, asked: np.ndarray) -> At
 
 
 def _linear(
-    imager: AmcwImager,
-    light: Light,
-    window: FilterSettings,
-    certain: Certainty,
-    even: np.ndarray,
-    of_even: tuple[np.ndarray, np.ndarray],
-    rest: np.ndarray,
-    moved: np.ndarray,
-    pull: np.ndarray,
+    imager: AmcwImager, light: Light, certain: Certainty, pull: np.ndarray, at_even: Arrays, at_rest: Arrays
 ) -> Linear:
-    n, step_m, side = light.turn.shape[1], imager.camera.z_step_m, window.space.shape[0]
+    """Return the linear pixels: even ones with what `fill_even` returns, the rest with what `linearised` returns."""
+    (even, of_each, of_centre), (rest, moved) = at_even, at_rest
+    space, by_amplitude = imager.filter_settings.space.astype(float), imager.filter_settings.by_amplitude
+    n, step_m, side = light.turn.shape[1], imager.camera.z_step_m, space.shape[0]
     metres = imager.engine.lattice.metres_per_turn.astype(float)[:, None] / (2 * np.pi)
-    by_path, always, (of_each, of_centre) = certain.z_by_path, certain.always, of_even
+    by_path, always = certain.z_by_path, certain.always
     z = np.where(always, certain.z_m / step_m, 0.0)
     noise = np.sqrt(((pull * np.minimum(light.turn, 1.0)) ** 2).sum(axis=0))
     kind, row = np.full(n, NONE, np.uint8), np.zeros(n, np.int32)
     each, more = np.zeros(n), np.zeros(n)
     kind[even] = np.where(always[even], EVEN, NONE)
-    carried = light.amplitude[:, even] if window.by_amplitude else 1.0
+    carried = light.amplitude[:, even] if by_amplitude else 1.0
     moves = metres * of_each * carried * light.turn[:, even]
     by_others = np.sqrt((moves**2).sum(axis=0)) * by_path[even] / step_m
     by_own = np.sqrt(((metres * of_centre) ** 2).sum(axis=0)) * by_path[even] / step_m
     each[even] = by_others / noise[even]
-    more[even] = (by_own - window.space[side // 2, side // 2] * by_others) / noise[even]
+    more[even] = (by_own - space[side // 2, side // 2] * by_others) / noise[even]
     kept = always[rest]
     at = rest[kept]
     kind[at], row[at] = UNEVEN, np.arange(len(at))
     pulls = metres[:, :, None] * moved[:, kept]
     by_each = np.copysign(np.sqrt((pulls**2).sum(axis=0)), pulls.sum(axis=0)) * by_path[at, None] / step_m
     by_each /= windows_of(noise.reshape(imager.region.shape), side, 1.0)[at]
-    taps = window.space[side // 2] / np.sqrt(window.space[side // 2, side // 2])
+    taps = space[side // 2] / np.sqrt(space[side // 2, side // 2])
     base = np.round(z)
-    per_pixel = (values.astype(f4) for values in (noise, base, z - base, by_path, each, more))
-    return Linear(kind, *per_pixel, row, by_each.astype(f4), taps.astype(f4))
+    noise, z, by_path, each, more = (values.astype(f4) for values in (noise, z - base, by_path, each, more))
+    return Linear(kind, noise, base.astype(f4), z, by_path, each, more, row, by_each.astype(f4), taps.astype(f4))
 
 
 @dataclass(frozen=True)
@@ -325,9 +321,8 @@ class AtOnce:
     @cached_property
     def _engine(self) -> ranging.DepthEngine:
         """The engine of the listed pixels, once for each lane."""
-        engine, at = self.imager.engine, self.list.range
-        geometry, outside = engine.geometry[:, at], engine.outside_mask[at]
-        return engine._replace(geometry=np.repeat(geometry, LANES, axis=1), outside_mask=np.repeat(outside, LANES))
+        engine, at = self.imager.engine, np.repeat(self.list.range, LANES)
+        return engine._replace(geometry=engine.geometry.take(at, axis=1), outside_mask=engine.outside_mask[at])
 
     def totals(
         self, frames: np.ndarray, errors_m: np.ndarray, stream: Callable[[int], np.random.Generator]
@@ -360,8 +355,9 @@ class AtOnce:
         reasons[certain.reason[never], never] = len(frames)
         reasons[Reason.VALID, certain.always] = len(frames)
         count[at], total[at], squares[at], amplitude[at], reasons[:, at] = sums
-        images = (each.reshape(shape) for each in (self.linear.base.astype(float), count, total, squares, amplitude))
-        return FrameTotals(len(frames), step_m, *images, reasons.reshape(-1, *shape))
+        count, total, squares, amplitude = (each.reshape(shape) for each in (count, total, squares, amplitude))
+        base, reasons = self.linear.base.astype(float).reshape(shape), reasons.reshape(-1, *shape)
+        return FrameTotals(len(frames), step_m, base, count, total, squares, amplitude, reasons)
 
     def _add_one_by_one(
         self, errors_m: np.ndarray, counted: np.ndarray, rng: np.random.Generator, sums: tuple[np.ndarray, ...]

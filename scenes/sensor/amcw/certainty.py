@@ -3,8 +3,7 @@
 Each gate's quantity has a mean and a deviation to first order in the noise (`scenes.sensor.amcw.linear`); a pixel is
 sure where the engine's table of gates (`ranging.first_failed`) says the same of the worst and of the best values within
 `DEVIATIONS`. Where the noise is too much for that, bounds that hold at any noise count. Where a window holds one even
-surface, noise takes the same share off the weight of each neighbour, by the phase noise only: it is read from a table.
-"""
+surface, noise takes the same share off the weight of each neighbour, which is read from a table by the phase noise."""
 
 from __future__ import annotations
 

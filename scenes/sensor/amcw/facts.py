@@ -132,9 +132,8 @@ class EmitterFacts(ConeFacts):
 
 
 class ScatterFacts(Config):
-    """Light that reaches other pixels than its own: ``blur_px``, the standard deviation of a Gaussian as which the lens
-    images a point; of the light that is left, ``stray_share`` is spread by a Gaussian of ``stray_px`` (reflections in
-    lens and sensor). A ghost image at a distance is not modelled."""
+    """Light that reaches other pixels than its own: a Gaussian blur by the lens, deviation ``blur_px``; a share of the
+    light is spread by a Gaussian of ``stray_px`` instead. A ghost image at a distance is not modelled."""
 
     blur_px: NonNegative
     stray_share: Share
@@ -187,8 +186,8 @@ class ModulationFacts(Config):
 class PhotonFacts(Config):
     """The photon budget: one gain, calibrated at one point. ``signal_electrons``: of both wells in one exposure, albedo
     1, facing, on the axis at 1 m. ``full_well_electrons`` of one well (None: only the converter saturates).
-    ``exposure_ends_electrons``: in both wells, where a pixel's exposure ends, scaled to the full length (None:
-    never)."""
+    ``exposure_ends_electrons``: in both wells, where a pixel's exposure ends; its sample is scaled to the full length.
+    """
 
     signal_electrons: Positive
     calibration_sigma_mm: Positive

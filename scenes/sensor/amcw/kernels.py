@@ -45,7 +45,7 @@ def expose(  # type: ignore[no-untyped-def]
                 saturated[i] |= np.uint8(size > limit[i])
                 size = min(size, limit[i])
                 # the step is the power of two at or below size / knee, and 1 below the knee: the bits without mantissa
-                word: Any = float_bits(size * per_knee)  # type: ignore[call-arg]
+                word: Any = float_bits(size * per_knee)
                 step = max(bits_float(word & np.uint32(0x7F800000)), ONE)
                 code = step * np.floor(size / step + HALF)
                 sample = code if sample >= ZERO else -code
@@ -65,8 +65,7 @@ def expose(  # type: ignore[no-untyped-def]
 
 @numba.njit(**FAST)
 def noisy_phasors(phasor, amplitude, turn, swell, normals, planes):  # type: ignore[no-untyped-def]
-    """Write phasors (f, g) with noise from ``normals`` (g, f, 2, lanes) into ``planes`` (g, f, 3 lanes): re, im of
-    length 1, and amplitude."""
+    """Write phasors (f, g) with noise of ``normals`` (g, f, 2, lanes) into ``planes`` (g, f, 3 lanes): re, im, size."""
     g, n_frequencies, _, _ = normals.shape
     p1, p2 = np.uint64(LANES), np.uint64(2 * LANES)
     for j in range(g):
@@ -151,9 +150,8 @@ _filter_row, _filter_frames = _filter_of(STRIDE), _filter_of(LANES)
 
 class FilterSettings(NamedTuple):
     """Settings of the joint bilateral filter, float32 in its kernels: ``space`` (k, k), weights by distance. A centre
-    not brighter than ``dim`` takes all by distance alone, before a brighter one neighbours below ``dim`` are dropped
-    where ``drop_dim``; the edge sum counts such neighbours only where ``dim_edges``. Phasors count by their amplitude
-    as well where ``by_amplitude``; else unit phasors are averaged."""
+    not brighter than ``dim`` takes all by distance alone; before a brighter one neighbours below ``dim`` are dropped
+    where ``drop_dim``, and count in the edge sum where ``dim_edges``. ``by_amplitude``: phasors count by it too."""
 
     space: np.ndarray
     concentration: Any

@@ -29,9 +29,8 @@ class SurfaceLightFacts(Config):
 
 class NoiseLawFacts(Config):
     """Temporal noise of single pixels along the ray, before rounding. ``sigma_mm`` of the recorded surface, facing, at
-    each of ``range_mm``; logarithms are interpolated, and beyond the ends the power ``range_exponent`` holds. A surface
-    of another brightness b, relative to it, has b^-``brightness_exponent`` times as much. ``rows`` and ``columns``:
-    filters down and across, which give neighbours their correlation."""
+    each of ``range_mm``; logarithms are interpolated, beyond the ends the power ``range_exponent`` holds. A surface b
+    times as bright has b^-``brightness_exponent`` times as much. ``rows``, ``columns``: filters down and across."""
 
     range_mm: PositiveEach
     sigma_mm: PositiveEach

@@ -25,8 +25,7 @@ f4 = np.float32
 
 
 class IdealRange(NamedTuple):
-    """A view before noise, (h, w) each: ``range_m`` with the unit's errors, NaN for nothing; ``sigma_m``; ``amplitude``
-    in the recording's units; ``chance`` of no return in a frame."""
+    """A view before noise, (h, w) each; ``amplitude`` in the recording's units, ``chance`` of no return in a frame."""
 
     range_m: np.ndarray
     sigma_m: np.ndarray

@@ -42,9 +42,8 @@ class ScanFacts(Config):
 
 
 class CodeFacts(Config):
-    """The transmitted code and the pulse that its correlation makes. ``correlation_fwhm_ns``: width of its peak, taken
-    as Gaussian. ``band_floor``: the spectrum ends at the last line above this share of its greatest.
-    ``integration_ns``: how much of the return makes one point."""
+    """The code and its correlation's pulse, taken as Gaussian. ``band_floor``: the spectrum ends at the last line above
+    this share of its greatest. ``integration_ns``: how much of the return makes one point."""
 
     period_ns: Positive
     correlation_fwhm_ns: Positive
@@ -160,8 +159,7 @@ class ScannedLidar(CameraFacts):
 
     @cached_property
     def optics(self) -> Optics:
-        """Optics for the render: pixels are beams from the origin, and the receiver stands where an emitter would.
-        Light reaches a pixel through the integration and the smoothing."""
+        """Optics for the render: pixels are beams from the origin, and the receiver stands where an emitter would."""
         smoothed_px = max(len(taps) // 2 for taps in self.smoothing_taps)
         return self.optics_with(
             **self.receiver.optics(),
