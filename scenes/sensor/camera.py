@@ -61,7 +61,7 @@ class CameraConfig(Config):
     """Camera of an experiment: its name, the unit and the effects that are on."""
 
     name: str = Field(
-        "azure_kinect_nfov", description="of scenes/cameras/ or an installed package, or the path of a .yaml file"
+        "azure_kinect_nfov", description="a camera of tofpod or an installed package, or the path of its .yaml"
     )
     unit_seed: int = Field(1, ge=0, description="which unit: its fixed pattern is drawn from this seed")
     effects: EffectsConfig = EffectsConfig()

@@ -25,7 +25,7 @@ Albedo = Annotated[float, Field(ge=0.0, le=1.0)]
 Rgb = tuple[Albedo, Albedo, Albedo]
 Length = Annotated[float, Field(ge=1.0, le=1e4)]
 SizeMm = tuple[Length, Length]
-Chamfer = Annotated[float, Field(ge=0.0, le=100.0, description="leg of 45 degrees that widens the hole at the face")]
+Chamfer = Annotated[float, Field(ge=0.0, le=100.0, description="leg of a 45 degree chamfer at the mouth")]
 
 
 class FlatConfig(Config):
@@ -312,6 +312,7 @@ class PoseConfig(Config):
 class SetUpConfig(Config):
     """Surroundings of a board, and its pose. ``backing`` or ``room`` left out: nothing stands there."""
 
+    name: str
     flaws: Annotated[tuple[AnyFlawConfig, ...], Field(max_length=500, description="every other kind of damage")] = ()
     material: MaterialConfig = MaterialConfig()
     backing: BackingConfig | None = None

@@ -146,7 +146,7 @@ class RoundConfig(_FlawConfig):
 
     kind: Literal["pressed_dent", "pressed_bump", "protrusion"]
     diameter_mm: Extent
-    depth_mm: Depth
+    depth_mm: Annotated[Depth, Field(description="of a protrusion its height over the face")]
 
     @property
     def pressed(self) -> bool:

@@ -38,14 +38,11 @@ class MeshTargetConfig(custom.SetUpConfig):
 
     def declare(self) -> custom.TargetConfig:
         """Return the full declaration. Raises UserError where the file cannot be used."""
-        shape = custom.MeshConfig(kind="mesh", **{key: getattr(self, key) for key in OF_MESH})
+        shape = custom.MeshConfig(kind="mesh", file=self.file, unit=self.unit, front=self.front)
         sizes = np.round(np.ptp(part_of(shape)[0], axis=0), 9) / MM
         board = dict(zip(("width_mm", "height_mm", "thickness_mm"), sizes.tolist(), strict=True))
-        kept: dict[str, Any] = {key: value for key, value in self if key not in (*OF_MESH, "name")}
+        kept: dict[str, Any] = {key: getattr(self, key) for key in custom.SetUpConfig.model_fields if key != "name"}
         return custom.TargetConfig(board=custom.BoardConfig(**board, shape=shape), **kept)
-
-
-OF_MESH = ("file", "unit", "front")
 
 
 @lru_cache(maxsize=8)

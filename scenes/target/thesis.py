@@ -65,9 +65,9 @@ class ThesisTargetConfig(Config):
     tape_thickness_mm: Annotated[float, Field(ge=0.02, le=3.0)] = _open(0.15, "Vinyl tape is 0.13 to 0.18 mm thick.")
     tape_albedo_850: custom.Albedo = _open(0.6, "Red dyes are clear in the near infrared. A guess.")
     tape_rgb: custom.Rgb = _open((0.85, 0.08, 0.08), "Strips have red above mean + 2.6 deviations: redder than wood.")
-    floor_below_lens_m: Annotated[float, Field(ge=0.05, le=10.0)] | None = _open(0.75, "A table's height, by guess.")
+    floor_below_lens_m: Annotated[float, Field(ge=0.05, le=10.0)] | None = _open(0.75, "A table's height, or none.")
     floor_albedo_850: custom.Albedo = _open(0.3, "A guess.")
-    back_wall_distance_m: Annotated[float, Field(ge=0.1, le=20.0)] | None = _open(2.5, "A small laboratory, by guess.")
+    back_wall_distance_m: Annotated[float, Field(ge=0.1, le=20.0)] | None = _open(2.5, "A small laboratory, or none.")
     back_wall_albedo_850: custom.Albedo = _open(0.6, "A painted wall. A guess.")
     other_wavelengths: custom.OtherWavelengths = ()
 

@@ -279,8 +279,8 @@ def _linear(
     by_each /= windows_of(noise.reshape(imager.region.shape), side, 1.0)[at]
     taps = space[side // 2] / np.sqrt(space[side // 2, side // 2])
     base = np.round(z)
-    noise, z, by_path, each, more = (values.astype(f4) for values in (noise, z - base, by_path, each, more))
-    return Linear(kind, noise, base.astype(f4), z, by_path, each, more, row, by_each.astype(f4), taps.astype(f4))
+    own, off, steps, others, rest_of = (values.astype(f4) for values in (noise, z - base, by_path, each, more))
+    return Linear(kind, own, base.astype(f4), off, steps, others, rest_of, row, by_each.astype(f4), taps.astype(f4))
 
 
 @dataclass(frozen=True)
@@ -355,9 +355,10 @@ class AtOnce:
         reasons[certain.reason[never], never] = len(frames)
         reasons[Reason.VALID, certain.always] = len(frames)
         count[at], total[at], squares[at], amplitude[at], reasons[:, at] = sums
-        count, total, squares, amplitude = (each.reshape(shape) for each in (count, total, squares, amplitude))
-        base, reasons = self.linear.base.astype(float).reshape(shape), reasons.reshape(-1, *shape)
-        return FrameTotals(len(frames), step_m, base, count, total, squares, amplitude, reasons)
+        return FrameTotals(
+            len(frames), step_m, self.linear.base.astype(float).reshape(shape), count.reshape(shape),
+            total.reshape(shape), squares.reshape(shape), amplitude.reshape(shape), reasons.reshape(-1, *shape),
+        )  # fmt: skip
 
     def _add_one_by_one(
         self, errors_m: np.ndarray, counted: np.ndarray, rng: np.random.Generator, sums: tuple[np.ndarray, ...]
