@@ -22,6 +22,7 @@ from harness.engine.trial import averages_of
 from harness.vocabulary.geometry import MM, Cloud, Region
 from harness.vocabulary.seeds import random_stream
 from scenes.closed_form import Plane, layered_view, plane_view
+from scenes.sensor.amcw import at_once as sums_of_frames
 from scenes.sensor.amcw import kernels
 from scenes.sensor.amcw.at_once import BEND, SCALE
 from scenes.sensor.amcw.facts import AmcwCamera
@@ -58,6 +59,8 @@ def test_noise_from_bytes_has_the_variance_and_kurtosis_of_a_normal() -> None:
 @pytest.fixture(autouse=True)
 def few_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(averages, "FEWEST_FRAMES", FEWEST_FRAMES)
+    # a limit of cost: with nothing behind the holes 31 % of these small pictures are simulated one by one
+    monkeypatch.setattr(sums_of_frames, "MOST_LISTED", 0.4)
 
 
 def numbers_of(name: str) -> dict[str, float]:
@@ -157,7 +160,7 @@ def test_so_have_those_of_a_dim_and_distant_face(name: str):
     camera = camera_of(config)
     assert isinstance(camera, AmcwCamera)
     outer = REGIONS[name].grown(camera.optics.margin_px, camera.nominal_lens.height, camera.nominal_lens.width)
-    albedo = 0.25
+    albedo = 0.25 if name == "azure_kinect_nfov" else 0.2
     unit = SimulatedUnit(camera, config, plane_view(camera, outer, 1.6, albedo, 0.05, 0.02))
     assert unit.at_once is not None
     knee = float(camera.converter.knee_units.value)
