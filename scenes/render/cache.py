@@ -29,7 +29,7 @@ from scenes.target.mesh import build_target
 
 CODE = ("scenes.render.view", "scenes.target.mesh")
 PACKAGES = ("mitsuba", "drjit", "trimesh", "manifold3d", "numba", "numpy", "scipy")
-"""Modules, with all that they import, and packages that decide a render's numbers; the variant changes 1e-6."""
+"""Modules, with all that they import, and packages that decide a render's numbers; a GPU moves them by 1e-6."""
 VIEW_VERSION = 2  # in every file; one of another version counts as absent
 MOST_BYTES = 2 << 30  # a sensor of a million pixels at a hundred frequencies gives 1.7 GB
 CHECKSUM_BYTES = 16

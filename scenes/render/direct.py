@@ -195,7 +195,7 @@ def _of_moments(moments: np.ndarray, about_m: np.ndarray, frequencies_hz: tuple[
 
 
 class _Sums:
-    """Direct light of a region's pixels, flat, while it is made: fields as of `DirectLight`. What is added replaces."""
+    """Direct light of a region's pixels, flat, while it is made: fields as of `DirectLight`."""
 
     def __init__(
         self, lit: LitScene, slopes: np.ndarray, footprint: Quadrilaterals, frequencies_hz: Frequencies

@@ -17,7 +17,7 @@ from scenes.sensor.amcw.kernels import FilterSettings
 from scenes.sensor.amcw.linear import DEVIATIONS, Filtered, Light, linearised, unknown_filtered
 
 f4 = np.float32
-MOST_LEFT_OUT = 0.025  # share of variance not of first order, right to 1 % up to it, above which frames are simulated
+MOST_LEFT_OUT = 0.025  # variance not of first order above which frames are simulated; below, it is right to 1 %
 STEP_M = 1e-3  # displacement of half a path by which that of z is found
 MOST_TURNED, MOST_SPREAD = 1e3, 1e9  # for an unknown deviation: of a phase in radians, of an amplitude in units
 
