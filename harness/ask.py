@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from harness.evaluation.atlas import LimitSurface
 
 STORED = "atlas.parquet"
-KINDS = {"hole": "through", "through-hole": "through", "blind-hole": "blind"}
+KINDS = {"hole": "through", "through-hole": "through", "blind-hole": "blind", "crack": "slot"}
 BEST = "matched"
 
 
@@ -168,6 +168,8 @@ def _answer(options: argparse.Namespace, surfaces: Sequence[LimitSurface], title
 
 def _chosen(options: argparse.Namespace, surfaces: Sequence[LimitSurface], kind: str) -> list[LimitSurface]:
     """Return the surfaces that a question is about. Raises UserError where a name is not in the atlas."""
+    from harness.vocabulary.declaration.diagnose import nearest
+
     detectors = list(dict.fromkeys(surface.detector for surface in surfaces))
     detector = options.detector or (BEST if BEST in detectors else detectors[0])
     given = (("camera", options.camera or ()), ("kind", [kind]), ("detector", [detector]))
@@ -175,8 +177,12 @@ def _chosen(options: argparse.Namespace, surfaces: Sequence[LimitSurface], kind:
         there = dict.fromkeys(getattr(surface, name) for surface in surfaces)
         if unknown := [one for one in wanted if one not in there]:
             option = "--damage" if name == "kind" else f"--{name}"
-            words = [word for word, kind in KINDS.items() if name == "kind" and kind in there]
-            raise UserError(f"{option} {', '.join(unknown)}: not in the atlas", legal=", ".join((*words, *there)))
+            legal = [*(word for word, kind in KINDS.items() if name == "kind" and kind in there), *there]
+            near = nearest(unknown[0], (*legal, *(KINDS if name == "kind" else ())))
+            meant = f"; did you mean {near!r}?" if near and near != unknown[0] else ""
+            said = f"{option} {', '.join(unknown)}: not in the atlas{meant}"
+            fix = "run a study of damage that is not in the atlas, such as tofpod sweep crack"
+            raise UserError(said, legal=", ".join(legal), fix=fix if name == "kind" else None)
     cameras = options.camera or [surface.camera for surface in surfaces]
     return [one for one in surfaces if one.kind == kind and one.detector == detector and one.camera in cameras]
 

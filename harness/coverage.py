@@ -70,7 +70,7 @@ def _pose(text: str) -> Pose:
 def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0 (also where a goal is not reached), 2 on a mistake of the user, 130 after Ctrl-C."""
     from harness.ask import length_m
-    from harness.engine.coverage import declared, survey
+    from harness.engine.coverage import declared, refuse_size, survey
     from harness.engine.tables import write_tables
     from harness.engine.work import EngineOptions, engine_of, locked
     from harness.experiment.load import load_experiment, resolved_yaml
@@ -94,6 +94,8 @@ def main(options: argparse.Namespace, command: str) -> int:
         raise UserError(said, fix="choose one by --set, such as sweep={} and the values of its axes")
     asked = options.goal or options.size
     size_mm = length_m("--goal" if options.goal else "--size", asked) / MM if asked else None
+    for point in experiment.points if size_mm else ():
+        refuse_size(point.config, size_mm)
     given, further = _poses(options, declared(experiment.config)[1].distance_m)
     folder, cache = options.out or options.results / "coverage" / name, options.results / ".cache" / "renders"
     write_text(folder / EXPERIMENT.name, resolved_yaml(experiment))
