@@ -11,8 +11,7 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
 
 CAMERA_FILE = "my_camera.yaml"
-REPEATED = 0.15
-"""Relative error of the simulated noise from which on the camera file counts as wrong."""
+REPEATED = 0.15  # Relative error of the simulated noise from which on the camera file counts as wrong
 
 
 def _options(parser: argparse.ArgumentParser) -> None:

@@ -29,8 +29,7 @@ from harness.vocabulary.program import program
 if TYPE_CHECKING:
     from harness.evaluation.study.record import StudyRecord
 
-BASELINES = shipped("baselines")
-"""Folder of the committed baselines, one ``<name of the experiment>.json`` each."""
+BASELINES = shipped("baselines")  # Folder of the committed baselines, one ``<name of the experiment>.json`` each
 
 
 def _options(parser: argparse.ArgumentParser) -> None:

@@ -19,10 +19,8 @@ if TYPE_CHECKING:
 
 TILTS_DEG, GOAL_TILTS_DEG = (-40.0, -20.0, 0.0, 20.0, 40.0), (-30.0, 0.0, 30.0)
 """Tilts about x and about y among which poses are suggested, and among which a goal is sought."""
-GOAL_DISTANCES = (0.7, 1.0, 1.4)
-"""Distances, over the experiment's own, at which a goal is sought."""
-MOST_POSES, MOVE_S = 6, 10.0
-"""Poses of one way to a goal at most, and seconds to move the camera between two of them."""
+GOAL_DISTANCES = (0.7, 1.0, 1.4)  # Distances, over the experiment's own, at which a goal is sought
+MOST_POSES, MOVE_S = 6, 10.0  # Poses of one way to a goal at most, and seconds to move the camera between two of them
 
 
 def _options(parser: argparse.ArgumentParser) -> None:

@@ -18,16 +18,11 @@ if TYPE_CHECKING:
 LINKS = ("logit", "probit", "cloglog", "loglog")
 FILES = ("design.json", "design.png", "design.html")
 TARGETS = (30, 40, 60, 120)
-MOST_STUDIES = 100_000
-"""Simulated studies are kept in memory."""
-LEAST, MOST = 10, 10_000
-"""Targets of a study: as many rows as python -m harness.pod asks for; nobody makes more."""
-FURTHEST = 2.0
-"""Times the largest size inspected: a90 beyond it is no plan's guess."""
-LEAST_SHARE = 0.1
-"""Share of a50 for the smallest size: a curve against the size itself may begin to rise below 0."""
-OWNERS = {"set_up": "study", "board_m2": "false_calls_per_m2"}
-"""Options that mean nothing without another."""
+MOST_STUDIES = 100_000  # Simulated studies are kept in memory
+LEAST, MOST = 10, 10_000  # Targets of a study: as many rows as python -m harness.pod asks for; nobody makes more
+FURTHEST = 2.0  # Times the largest size inspected: a90 beyond it is no plan's guess
+LEAST_SHARE = 0.1  # Share of a50 for the smallest size: a curve against the size itself may begin to rise below 0
+OWNERS = {"set_up": "study", "board_m2": "false_calls_per_m2"}  # Options that mean nothing without another
 
 
 def _options(parser: argparse.ArgumentParser) -> None:

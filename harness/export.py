@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from scenes.target.custom import TargetConfig
 
 FORMATS = ("tum", "ros2", "mcap")
-REPEAT = 0
-"""The trial whose noise is exported: the same frames as an experiment's first repeat."""
+REPEAT = 0  # The trial whose noise is exported: the same frames as an experiment's first repeat
 
 
 def _options(parser: argparse.ArgumentParser) -> None:

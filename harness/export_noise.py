@@ -21,15 +21,13 @@ from harness.vocabulary.program import program
 if TYPE_CHECKING:
     from scenes.sensor.camera import AnyCamera
 
-ALBEDO = 0.6
-"""Albedo of the planes; beyond the range of the camera, darker and brighter planes stand for distance."""
+ALBEDO = 0.6  # Albedo of the planes; beyond the range of the camera, darker and brighter planes stand for distance
 DARKEST = 0.02
 MEASURED, PER_OCTAVE = 2, 16
 """Brightnesses that are measured in each octave, and entries of the table, between which it takes the nearest."""
 FRAMES, FRAMES_OF_CORRELATION = 40, 100
 """Frames of 3,000 pixels whose noise is common in squares of 25: they give a deviation to 1 %."""
-LONGEST_LAG = 12
-"""Pixels to which the correlation of neighbours is followed."""
+LONGEST_LAG = 12  # Pixels to which the correlation of neighbours is followed
 
 
 def _options(parser: argparse.ArgumentParser) -> None:

@@ -23,8 +23,7 @@ MARK_MM, DRILLS_MM, SEED = 32.0, 0.5, 1
 CLEAR_MM, EDGE_MM = 6.0, 18.0
 """White around a mark, without which a code cannot be read, and between marks and holes; and least distance of a hole's
 rim from the board's edge, for which the automatic crop would take it."""
-HIT_SHARE = 0.4
-"""Hit radius as a share of the distance between holes, so that no finding can count for two."""
+HIT_SHARE = 0.4  # Hit radius as a share of the distance between holes, so that no finding can count for two
 
 
 def _options(parser: argparse.ArgumentParser) -> None:

@@ -31,10 +31,8 @@ if TYPE_CHECKING:
     from harness.evaluation.study.limit import SetUpLimit
 
 ENDINGS = (".npy", ".tiff", ".tif")
-JUDGED = ("validation", "test")
-"""Splits of which every board needs a map."""
-LINK_M = 0.010
-"""Longest step within a finding, as in `detectors.score_map`."""
+JUDGED = ("validation", "test")  # Splits of which every board needs a map
+LINK_M = 0.010  # Longest step within a finding, as in `detectors.score_map`
 PRO_LIMIT = 0.3
 MOST_NAMED = 3
 JUDGED_BY = ("inspected", "board_xy_m", "damage")

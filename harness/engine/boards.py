@@ -35,8 +35,7 @@ from scenes.sensor.source import SimulatedUnit
 from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.truth import truth_of
 
-DATASET_VERSION = 1
-"""Stands in ``dataset.json``; raised when a file's meaning changes."""
+DATASET_VERSION = 1  # Stands in ``dataset.json``; raised when a file's meaning changes
 INDEX, TRUTH, CLOUD = "dataset.json", "truth.json", "cloud.npz"
 SPLITS: tuple[tuple[str, Role, float], ...] = (
     ("train", "learning", 0.3),
@@ -45,12 +44,9 @@ SPLITS: tuple[tuple[str, Role, float], ...] = (
     ("test", "damaged", 0.4),
 )
 """Split, purpose of its boards, and share of all boards of a category."""
-FEWEST = 10
-"""Boards of a category, with which every split has one."""
-INSET_PX = 4
-"""Rim of the board that is not inspected: as far as the cameras' windows and edges reach, and a pixel more."""
-BRIGHTEST = 0.995
-"""Quantile of a picture's intensity that pictures show as white."""
+FEWEST = 10  # Boards of a category, with which every split has one
+INSET_PX = 4  # Rim of the board that is not inspected: as far as the cameras' windows and edges reach, and a pixel more
+BRIGHTEST = 0.995  # Quantile of a picture's intensity that pictures show as white
 AGAIN = "run the command that wrote the data set again"
 
 

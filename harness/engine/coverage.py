@@ -36,21 +36,16 @@ from scenes.target.custom import BoardConfig, PoseConfig
 from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.truth import Damage, face_of
 
-BOARDS, LOOKS = 40, 3
-"""Damaged boards on which strength and hits are learnt, and averages in which each is inspected."""
-STEEPEST_DEG = 60.0
-"""Tilt about either axis of these boards, at most."""
+BOARDS, LOOKS = 40, 3  # Damaged boards on which strength and hits are learnt, and averages in which each is inspected
+STEEPEST_DEG = 60.0  # Tilt about either axis of these boards, at most
 DRAWS, AROUND_PX, NEAR_PX = 2, 31, 15
 """Averages from which noise is taken; the side of the square over which that of a pixel is, as far as boards move over
 the unit's pattern; and of that in which missing pixels count."""
 MOST_PATCHES = 3000
-SAME_MM = 1e-6
-"""Sizes that differ by less are one: then the size of damage is its depth."""
-ON_FACE_M = 5 * MM
-"""A patch is seen where the view's own z agrees with its z by this, or by two pixels along the slope."""
+SAME_MM = 1e-6  # Sizes that differ by less are one: then the size of damage is its depth
+ON_FACE_M = 5 * MM  # A patch is seen where the view's own z agrees with its z by this, or by two pixels along the slope
 
-Pose = tuple[float, float, float]
-"""Distance in metres, tilts of the part about its x and y in degrees."""
+Pose = tuple[float, float, float]  # Distance in metres, tilts of the part about its x and y in degrees
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,16 +24,11 @@ from harness.vocabulary.seeds import random_stream
 from scenes.sensor.camera import CameraConfig, EffectsConfig, camera_of
 from scenes.sensor.source import SimulatedUnit
 
-UNITS_A_BOARD = 10
-"""Units, drawn anew for every board, whose noise is taken there."""
-SMOOTHED_PX = 61
-"""Side of the square over which a pixel's variance is averaged."""
-DEGREE = 3
-"""Degree of the undamaged surface, as the thesis fits it."""
-FEWEST_PIXELS = 1000
-"""Undamaged pixels without which a board tells too little of the noise."""
-FINE_MM = 1e-4
-"""Rounding step of the noise-free camera."""
+UNITS_A_BOARD = 10  # Units, drawn anew for every board, whose noise is taken there
+SMOOTHED_PX = 61  # Side of the square over which a pixel's variance is averaged
+DEGREE = 3  # Degree of the undamaged surface, as the thesis fits it
+FEWEST_PIXELS = 1000  # Undamaged pixels without which a board tells too little of the noise
+FINE_MM = 1e-4  # Rounding step of the noise-free camera
 REACH_PX = 8
 """Pixels beyond a damage's outline to which its signature reaches: what the camera's window and rims smear out."""
 

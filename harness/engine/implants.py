@@ -37,12 +37,9 @@ from scenes.target.truth import truth_of
 
 MOST_HOLE_FREE, MOST_SETTING = 20, 5
 """Averages of the undamaged recording on which false calls are counted, and that set a threshold, at most."""
-MOST_EMPTY = 200
-"""Placements in a row without a place for any damage, after which there is none."""
-NORMAL_PX = 4
-"""Half the side of the square of the surface whose plane is taken as the tangent plane."""
-TELLING_DEG = 5.0
-"""Steeper by so much than where damage is placed, the rim of what is judged has a limit of its own."""
+MOST_EMPTY = 200  # Placements in a row without a place for any damage, after which there is none
+NORMAL_PX = 4  # Half the side of the square of the surface whose plane is taken as the tangent plane
+TELLING_DEG = 5.0  # Steeper by so much than where damage is placed, the rim of what is judged has a limit of its own
 VARIANT = "main"
 
 

@@ -25,8 +25,7 @@ from scenes.target.truth import Damage
 
 Rows = dict[str, list[dict[str, Any]]]  # rows by table
 STUDY_TABLES = ("sites", "findings", "operating", "pixels")
-SMEARED_PX = 2
-"""Pixels by which an outline is grown before findings are laid over it: half of a camera's window."""
+SMEARED_PX = 2  # Pixels by which an outline is grown before findings are laid over it: half of a camera's window
 STEPS_PER_OCTAVE = 4
 FINDING_OCTAVES = (-2, 3)
 """Other thresholds for findings, about the one in use: under a quarter of it most of a noisy face is one finding."""

@@ -258,8 +258,7 @@ def _group(points: tuple[Point, ...], cache: Path, folder: Path) -> Group:
     return replace(group, learning=(Batch("learning", tuple(renders.values()), set_ups),))
 
 
-_drawn = lru_cache(maxsize=4096)(DrawnTargetConfig.drawn)
-"""Cameras, frames and detectors look at the same boards."""
+_drawn = lru_cache(maxsize=4096)(DrawnTargetConfig.drawn)  # Cameras, frames and detectors look at the same boards
 
 
 def unit_of(camera: CameraConfig, seed: int, role: Role, number: int) -> CameraConfig:

@@ -18,8 +18,7 @@ from harness.vocabulary.files import shipped
 from harness.vocabulary.provenance import check_version, stamp_of, stamped
 from scenes.sensor.camera import CameraConfig, camera_names, is_camera_path, load_camera, numbers_of_lens
 
-EXPERIMENT_VERSION = 1
-"""Version of the resolved experiment in a result folder; raised when a key changes its meaning."""
+EXPERIMENT_VERSION = 1  # Version of the resolved experiment in a result folder; raised when a key changes its meaning
 STAMP_KIND = "experiment"
 RESERVED = {"con", "prn", "aux", "nul", *(f"{port}{number}" for port in ("com", "lpt") for number in range(10))}
 """Devices on Windows: no folder of results can be called so there."""

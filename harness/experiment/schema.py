@@ -36,8 +36,7 @@ if TYPE_CHECKING:
 MAX_FRAMES = 10_000
 MAX_REPEATS = 100_000
 MAX_BOARDS = 10_000
-DEFAULT_RATE_PER_M2 = 1.0
-"""False calls per square metre that a study's threshold is calibrated to."""
+DEFAULT_RATE_PER_M2 = 1.0  # False calls per square metre that a study's threshold is calibrated to
 
 Repeats = Annotated[int, Field(ge=1, le=MAX_REPEATS)]
 Frames = Annotated[int, Field(ge=1, le=MAX_FRAMES)]
@@ -236,8 +235,7 @@ def declared_of(data: Any) -> shape.Declared:
     return shape.Declared(ExperimentConfig, data, splices_of(data))
 
 
-MAIN = "main"
-"""The only set-up of an experiment whose only axis, if any, is the number of frames."""
+MAIN = "main"  # The only set-up of an experiment whose only axis, if any, is the number of frames
 NO_NUMBERS = ("name", "title", "repeats", "study", "sweep", "draws", "switches", "sensitivity")
 """Keys that decide which trials are run, not what a trial gives."""
 

@@ -22,8 +22,7 @@ from harness.vocabulary.path_names import differing, names_of, on_one_line, valu
 from harness.vocabulary.seeds import canonical_json, random_stream
 
 OPTION = "--set"
-NOT_VARIED = ("sweep", "sensitivity")
-"""Keys that hold dotted paths themselves."""
+NOT_VARIED = ("sweep", "sensitivity")  # Keys that hold dotted paths themselves
 
 
 class PathError(UserError):
@@ -114,13 +113,10 @@ def overridden(source: Source, overrides: Sequence[str], declared_of: shape.Decl
     return source, problems
 
 
-MAX_POINTS = 10_000
-"""More than a machine works through in a week; beyond it an axis was mistyped."""
-MAX_SHOWN = 20
-"""Problems of combinations are found one point at a time and look alike."""
+MAX_POINTS = 10_000  # More than a machine works through in a week; beyond it an axis was mistyped
+MAX_SHOWN = 20  # Problems of combinations are found one point at a time and look alike
 FRAMES = "capture.frames"
-SWITCHES = "switches"
-"""Key of the file that names a mapping of switches."""
+SWITCHES = "switches"  # Key of the file that names a mapping of switches
 FIXED = ("name", "title", "repeats", "study", "sweep", "draws", SWITCHES, "sensitivity")
 """Keys that are the same for all points."""
 

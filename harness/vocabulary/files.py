@@ -29,14 +29,12 @@ ARRAYS_BYTES = 4 << 30
 """All arrays that are unpacked from one ``.npz`` or ``.mat``: 5,800 frames of an Azure Kinect in 16 bits."""
 READING_BYTES = 5 << 30
 """Memory that a library may take while it reads one file: `ARRAYS_BYTES`, and what unpacking them needs beside."""
-PICTURE_BYTES = 512 << 20
-"""A picture's file: what `FRAME_PIXELS` of 48 bits need without compression, and more."""
+PICTURE_BYTES = 512 << 20  # A picture's file: what `FRAME_PIXELS` of 48 bits need without compression, and more
 RECORD_BYTES = 256 << 20
 """A study's record: three million inspections. As Python's values it is some 10 times as large."""
 TEXT_BYTES = 16 << 20
 """A file of settings, poses, a calibration, or a bag's description: those written by programs have some kB."""
-TABLE_BYTES = 256 << 20
-"""A table of inspections: five million rows."""
+TABLE_BYTES = 256 << 20  # A table of inspections: five million rows
 RAISE = "if the file is to be so large, raise the limit in harness/vocabulary/files.py"
 
 

@@ -13,12 +13,9 @@ from typing import Any
 
 UNITS = {"_mrad": "mrad", "_deg": "°", "_mm": "mm", "_nm": "nm", "_px": "px", "_hz": "Hz", "_m": "m"}
 """Endings of keys that name a unit, longer ones first."""
-CHOICES = ("name", "kind", "method")
-"""Keys that say which of several; what it is of stands before them."""
-NAMED = ("camera", "detector", "damage")
-"""Axes whose values say by themselves what they are."""
-LONGEST = 60
-"""Characters of a value that a table can show."""
+CHOICES = ("name", "kind", "method")  # Keys that say which of several; what it is of stands before them
+NAMED = ("camera", "detector", "damage")  # Axes whose values say by themselves what they are
+LONGEST = 60  # Characters of a value that a table can show
 
 
 def names_of(paths: Iterable[str]) -> dict[str, str]:

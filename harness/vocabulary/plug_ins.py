@@ -13,8 +13,7 @@ from typing import Any
 
 from harness.vocabulary.errors import UserError
 
-OWN = "tofpod"
-"""The package that the built-in ones come from, as it is told."""
+OWN = "tofpod"  # The package that the built-in ones come from, as it is told
 
 
 @dataclass(frozen=True)

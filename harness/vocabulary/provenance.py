@@ -63,8 +63,7 @@ def record(command: str) -> dict[str, Any]:
 
 RESULTS_VERSION = 1
 """Stands in every file of a result folder that has no version of its own; raised when the tables' meaning changes."""
-GENERATOR = f"tofpod results {RESULTS_VERSION}"
-"""Stands in pages."""
+GENERATOR = f"tofpod results {RESULTS_VERSION}"  # Stands in pages
 STAMP = re.compile(r"#\s*tofpod (\w+)(.*)")
 
 
@@ -103,8 +102,7 @@ def stamp_of(text: str, kind: str) -> object:
 
 
 ROOT = Path(__file__).resolve().parents[2]
-OWN = ("detectors", "harness", "scenes")
-"""The project's packages."""
+OWN = ("detectors", "harness", "scenes")  # The project's packages
 IMPORT = re.compile(
     r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n#]+)|import[ \t]+([^\n#]+))", re.MULTILINE
 )

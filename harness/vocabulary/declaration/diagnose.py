@@ -25,10 +25,8 @@ from harness.vocabulary.declaration.yaml_source import (
 )
 from harness.vocabulary.errors import UserError
 
-YES_AND_NO = {"yes": "true", "on": "true", "no": "false", "off": "false"}
-"""Booleans of YAML 1.1, text in YAML 1.2."""
-LEAST_HELD = 3
-"""Letters of a word that is looked for within others: fewer are in too many."""
+YES_AND_NO = {"yes": "true", "on": "true", "no": "false", "off": "false"}  # Booleans of YAML 1.1, text in YAML 1.2
+LEAST_HELD = 3  # Letters of a word that is looked for within others: fewer are in too many
 WORDS = {"Input should be": "it should be", "an object": "a mapping", "valid array": "list", "valid tuple": "list"}
 WORDS |= {"valid string": "text", "valid boolean": "true or false", " in strict mode": ""}
 WORDS |= {"be a true": "be true", "be a text": "be text"}

@@ -16,8 +16,7 @@ from pydantic.fields import FieldInfo
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration.yaml_source import KeyPath
 
-LONGEST_NOTE = 100
-"""Characters of a field's description that a message repeats; longer ones are essays, not limits."""
+LONGEST_NOTE = 100  # Characters of a field's description that a message repeats; longer ones are essays, not limits
 BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 Splices = Mapping[KeyPath, type[Config]]
 

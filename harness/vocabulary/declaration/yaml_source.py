@@ -23,10 +23,8 @@ from ruamel.yaml.reader import ReaderError
 
 from harness.vocabulary.errors import UserError
 
-SHOWN_COLUMNS = 110
-"""Characters of a source line that a message shows; longer lines are cut around the caret."""
-MAX_PROBLEMS = 100
-"""Most problems that a message lists, and that are looked for in a single mapping."""
+SHOWN_COLUMNS = 110  # Characters of a source line that a message shows; longer lines are cut around the caret
+MAX_PROBLEMS = 100  # Most problems that a message lists, and that are looked for in a single mapping
 
 
 @dataclass(frozen=True)
@@ -103,14 +101,10 @@ def in_order(problems: Iterable[Problem]) -> tuple[Problem, ...]:
     return tuple(sorted(unique, key=position))
 
 
-KeyPath = tuple[str | int, ...]
-"""Position of a value in the data: keys of mappings and indices of lists."""
-MAX_BYTES = 500_000
-"""An experiment written by hand has a few kB; the parser needs up to 20 s for a megabyte."""
-MAX_NODES = 50_000
-"""Values, aliases followed: what bounds an alias bomb."""
-MAX_DEPTH = 40
-"""Nesting; the schema needs 8."""
+KeyPath = tuple[str | int, ...]  # Position of a value in the data: keys of mappings and indices of lists
+MAX_BYTES = 500_000  # An experiment written by hand has a few kB; the parser needs up to 20 s for a megabyte
+MAX_NODES = 50_000  # Values, aliases followed: what bounds an alias bomb
+MAX_DEPTH = 40  # Nesting; the schema needs 8
 _TAG = "tag:yaml.org,2002:"
 _OTHER_VERSION = re.compile(r"^%YAML[ \t]+(?!1\.2\b).*", re.MULTILINE)
 
