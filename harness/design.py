@@ -39,14 +39,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--targets", type=int, nargs="+", default=list(TARGETS), metavar="N", help="default: 30 40 60 120")
     goal = "the a90/95 wanted: recommend the fewest targets that are sure of it"
     add("--goal", type=float, metavar="SIZE", help=goal)
-    add("--pod", type=float, default=0.9, help="the 90 of a90/95 (default: 0.9)")
-    add("--confidence", type=float, default=0.95, help="the 95 of a90/95 (default: 0.95)")
     add("--studies", type=int, default=200, metavar="N", help="simulated for each plan (default: 200)")
-    add("--seed", type=int, default=1, help="of the simulated studies (default: 1)")
     put = parser.add_argument_group("hole-free boards").add_argument
     put("--false-calls-per-m2", type=float, metavar="RATE", help="wanted rate: how much has to be inspected for it")
     put("--board-m2", type=float, metavar="AREA", help="face of one hole-free board (default: the study's)")
-    add("--json", action="store_true", help="print JSON instead of the table")
     add("--out", type=Path, metavar="DIR", help=f"write {', '.join(FILES)} there as well")
 
 
@@ -74,33 +70,21 @@ def main(options: argparse.Namespace, command: str) -> int:
 
     from harness.report.design import design_data, design_html, design_parts, save_design_png
     from harness.tables.text import show
+    from harness.vocabulary.files import write_text
     from harness.vocabulary.provenance import RESULTS_VERSION
 
     _refuse_what_does_not_belong(options)
-    if options.study is not None:
-        guess = _from_study(options)
-    else:
-        from harness.evaluation.pod.design import curve_through
-
-        curve = curve_through(options.a50, options.a90, options.link or "logit", log_size=bool(options.log))
-        guess = GuessedCurve(curve, "as told", tuple(options.sizes))
+    guess = _guess(options)
     _check(options, guess)
     design = _designed(options, guess)
-    told = {"results_version": RESULTS_VERSION, **design_data(design), "command": command}
-    data_text = json.dumps(told, indent=2, allow_nan=False)
-    if options.json:
-        print(data_text)
-    else:
-        show(design_parts(design))
+    show(design_parts(design))
     if options.out is not None:
-        from harness.vocabulary.files import write_text
-
         data, picture, page = (options.out / name for name in FILES)
-        write_text(data, data_text + "\n")
+        told = {"results_version": RESULTS_VERSION, **design_data(design), "command": command}
+        write_text(data, json.dumps(told, indent=2, allow_nan=False) + "\n")
         save_design_png(picture, design)
         write_text(page, design_html(design, command))
-        # On stdout it would be no JSON any more.
-        print(f"wrote {data}, {picture.name}, {page.name}", file=sys.stderr)
+        print(f"wrote {data}, {picture.name}, {page.name}")
     return 0
 
 
@@ -119,13 +103,16 @@ def _refuse_what_does_not_belong(options: argparse.Namespace) -> None:
             raise UserError(f"{_flag(name)} belongs to {_flag(owner)}", fix=f"add {_flag(owner)}, or leave it out")
 
 
-def _from_study(options: argparse.Namespace) -> GuessedCurve:
-    """The curve of the named set-up, or of the only one, and the sizes that the study inspected, widened to the curve's
-    whole rise where they do not hold its a50 or its a90."""
-    from harness.evaluation.pod.design import RISE
+def _guess(options: argparse.Namespace) -> GuessedCurve:
+    """Return the curve that was told, or that of a study's set-up with the sizes that it inspected, widened to the
+    curve's whole rise where they do not hold its a50 or its a90."""
+    from harness.evaluation.pod.design import RISE, curve_through
     from harness.evaluation.study.limit import limit_of
     from harness.evaluation.study.record import read_record, set_up_named
 
+    if options.study is None:
+        curve = curve_through(options.a50, options.a90, options.link or "logit", log_size=bool(options.log))
+        return GuessedCurve(curve, "as told", tuple(options.sizes))
     study = read_record(options.study)
     record = set_up_named(study, options.set_up)
     limit = limit_of(record)
@@ -140,9 +127,7 @@ def _from_study(options: argparse.Namespace) -> GuessedCurve:
     else:
         a50, a90 = curve.size_at(0.5), curve.size_at(0.9)
         if not a50 > 0 or a90 > FURTHEST * high:
-            said = (
-                f"the curve {origin} has a50 = {a50:.4g} and a90 = {a90:.4g} mm, and the study inspected {low:.4g} to"
-            )
+            said = f"the curve {origin} has a50 = {a50:.4g} and a90 = {a90:.4g} mm; the study inspected {low:.4g} to"
             fix = "run the study with damage of other sizes, or tell a guess: --a50 SIZE --a90 SIZE --sizes FROM TO"
             raise UserError(f"{said} {high:.4g} mm: it says too little about the rise of the curve", fix=fix)
         if not low < a50:
@@ -164,18 +149,16 @@ def _check(options: argparse.Namespace, guess: GuessedCurve) -> None:
         (low < a50 < high, f"--sizes {low:g} {high:g} do not hold a50 = {a50:.4g}", f"FROM < {a50:.4g} < TO"),
         (not guess.curve.log_size or low > 0, "--sizes from 0 under a logarithm", "FROM above 0"),
         (wrong is None, f"--targets {wrong}", f"{LEAST} to {MOST}; MIL-HDBK-1823A asks for 60 at least"),
-        (0 < options.pod < 1, f"--pod {options.pod:g}", "0 < pod < 1"),
-        (0.5 < options.confidence < 1, f"--confidence {options.confidence:g}", "0.5 < confidence < 1"),
         (LEAST <= options.studies <= MOST_STUDIES, f"--studies {options.studies}", f"{LEAST} to {MOST_STUDIES}"),
     )
     for holds, said, legal in rules:
         if not holds:
             raise UserError(said, legal=legal)
-    a_pod = guess.curve.size_at(options.pod)
-    if options.goal is not None and not options.goal > a_pod:
-        legal = f"more than {a_pod:.4g}"
+    a90 = guess.curve.size_at(0.9)
+    if options.goal is not None and not options.goal > a90:
         fix = "no study can be sure to demonstrate less than the truth: improve the detector, or want less"
-        raise UserError(f"--goal {options.goal:g} is not above the guess's own {a_pod:.4g}", legal=legal, fix=fix)
+        said = f"--goal {options.goal:g} is not above the guess's own {a90:.4g}"
+        raise UserError(said, legal=f"more than {a90:.4g}", fix=fix)
     if options.false_calls_per_m2 is not None and options.board_m2 is None and guess.board_m2 is None:
         raise UserError("--false-calls-per-m2 needs --board-m2: boards of which face?", legal="square metres")
 
@@ -184,12 +167,11 @@ def _designed(options: argparse.Namespace, guess: GuessedCurve) -> StudyDesign:
     from harness.evaluation.pod import design as plan
     from harness.report.design import StudyDesign
 
-    asked = {name: getattr(options, name) for name in ("pod", "confidence", "studies", "seed")}
     area = guess.board_m2 if options.board_m2 is None else options.board_m2
     wanted = options.false_calls_per_m2
-    # Its mistakes come before the simulation's minute; `_check` has asked for the area.
-    free = plan.hole_free(wanted, area or 0.0, options.confidence) if wanted is not None else None
-    plans = plan.design(guess.curve, sorted(set(options.targets)), guess.sizes, **asked)
+    # its mistakes come before the simulation's minute; `_check` has asked for the area
+    free = plan.hole_free(wanted, area or 0.0) if wanted is not None else None
+    plans = plan.design(guess.curve, sorted(set(options.targets)), guess.sizes, studies=options.studies, seed=1)
     recommended = plan.recommend(plans, options.goal)
     unit, found = "mm" if options.unit is None else options.unit, (plans, recommended, options.goal, free)
     return StudyDesign(guess.curve, guess.origin, unit, guess.sizes, *found)

@@ -154,22 +154,14 @@ def seconds_text(stamp_ns: int) -> str:
 
 def calibration_text(lens: Lens) -> str:
     """Return the pinhole as RTAB-Map's calibration file (OpenCV's YAML with ROS' names)."""
-
-    def matrix(name: str, values: np.ndarray) -> tuple[str, ...]:
-        data = ", ".join(map(repr, values.astype(float).ravel().tolist()))
-        return f"{name}:", f"   rows: {values.shape[0]}", f"   cols: {values.shape[1]}", f"   data: [ {data} ]"
-
-    lines = (
-        *("%YAML:1.0", "---", "camera_name: rtabmap_calib"),
-        *(f"image_width: {lens.width}", f"image_height: {lens.height}"),
-        *matrix("camera_matrix", lens.matrix),
-        "distortion_model: plumb_bob",
-        *matrix("distortion_coefficients", np.zeros((1, 5))),
-        *matrix("rectification_matrix", np.eye(3)),
-        *matrix("projection_matrix", np.concatenate([lens.matrix, np.zeros((3, 1))], axis=1)),
-        *matrix("local_transform", OPTICAL_ROTATION),
-    )
-    return "\n".join((*lines, ""))
+    storage = cv2.FileStorage(".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    facts: dict[str, Any] = {"camera_name": "rtabmap_calib", "image_width": lens.width, "image_height": lens.height}
+    facts |= {"camera_matrix": lens.matrix, "distortion_model": "plumb_bob"}
+    facts |= {"distortion_coefficients": np.zeros((1, 5)), "rectification_matrix": np.eye(3)}
+    facts |= {"projection_matrix": np.pad(lens.matrix, ((0, 0), (0, 1))), "local_transform": OPTICAL_ROTATION * 1.0}
+    for name, value in facts.items():
+        storage.write(name, value)
+    return str(storage.releaseAndGetString())
 
 
 # ---------------------------------------------------------------- ROS 2 bags
@@ -271,7 +263,7 @@ def _info_message(types: dict[str, Any], lens: Lens, header: Any) -> Any:
         d=np.array(lens.distortion if distorted else (0.0,) * 5),
         k=lens.matrix.ravel(),
         r=np.eye(3).ravel(),
-        p=np.concatenate([lens.matrix, np.zeros((3, 1))], axis=1).ravel(),
+        p=np.pad(lens.matrix, ((0, 0), (0, 1))).ravel(),
         binning_x=0,
         binning_y=0,
         roi=region,

@@ -52,18 +52,15 @@ def main(options: argparse.Namespace, command: str) -> int:
             print(f"{folder}: {counts['copied'] - before} trials copied")
     print(f"{goal.folder}: {counts['copied']} trials copied, {counts['known']} were there")
     if damaged:
-        some = ", ".join(damaged[:3])
-        print(f"{len(damaged)} damaged or older records left out, to be run again: {some}", file=sys.stderr)
+        told = f"{len(damaged)} damaged or older records left out, to be run again"
+        print(f"{told}: {', '.join(damaged[:3])}", file=sys.stderr)
     if counts["alike"]:
         alike = f"{counts['alike']} trials differ in last digits, as unlike processors make them"
         print(f"{alike}; the first copied was kept")
     if different:
-        some = ", ".join(different[:3])
-        print(
-            f"{len(different)} trials have different results in different folders, the first copied was kept: "
-            f"{some}. The machines do not compute alike (other processors, or versions?)",
-            file=sys.stderr,
-        )
+        told = f"{len(different)} trials have different results in different folders, the first copied was kept"
+        why = "The machines do not compute alike (other processors, or versions?)"
+        print(f"{told}: {', '.join(different[:3])}. {why}", file=sys.stderr)
         return 1
     out = into.parent.parent
     print(f"next: the sweep's command without --shard, with --out {out}: it runs what is missing and writes the report")

@@ -106,22 +106,21 @@ def _found(predictions: Path, dataset: Path, samples: list[str]) -> dict[str, Pa
     for path in sorted(predictions.rglob("*")) if predictions.is_dir() else ():
         if path.suffix.lower() in ENDINGS:
             files.setdefault(path.relative_to(predictions).with_suffix("").as_posix(), []).append(path)
-    faults = {
-        "missing": sorted(wanted - files.keys()),
-        "of no board of validation or test": sorted(files.keys() - wanted),
-        "there twice": sorted(name for name, found in files.items() if len(found) > 1),
-        "not as they must be": [],
-    }
-    for name in sorted(wanted & files.keys()):
-        (inspected,) = read_arrays(dataset, name, "inspected")
-        if fault := _fault(files[name][0], inspected):
-            faults["not as they must be"].append(f"{name} ({fault})")
-    said = [
-        f"{len(names)} maps are {what}: {', '.join(names[:MOST_NAMED])}{', ...' * (len(names) > MOST_NAMED)}"
-        for what, names in faults.items()
-        if names
-    ]
-    if said:
+    faults: dict[str, list[str]] = {}
+    for name in sorted(wanted | files.keys()):
+        if name not in files:
+            faults.setdefault("missing", []).append(name)
+        elif name not in wanted:
+            faults.setdefault("of no board of validation or test", []).append(name)
+        elif len(files[name]) > 1:
+            faults.setdefault("there twice", []).append(name)
+        elif fault := _fault(files[name][0], *read_arrays(dataset, name, "inspected")):
+            faults.setdefault("not as they must be", []).append(f"{name} ({fault})")
+    if faults:
+        said = [
+            f"{len(names)} maps are {what}: {', '.join(names[:MOST_NAMED])}{', ...' * (len(names) > MOST_NAMED)}"
+            for what, names in faults.items()
+        ]
         legal = "for each board of validation and test one .npy or .tiff of real numbers, of the pictures' size"
         raise UserError(f"{predictions}: {'; '.join(said)}", legal=legal, fix="write maps for all boards anew")
     return {name: files[name][0] for name in wanted}

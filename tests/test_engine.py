@@ -91,7 +91,7 @@ def test_provenance_is_stored(finished):
     assert said["seed"] == 3
     assert said["command"].startswith("python -m harness.sweep ")
     assert said["versions"]["mitsuba"]
-    assert set(said) >= {"commit", "dirty", "machine", "indirect_noise_mm", "failures", "seconds"}
+    assert set(said) >= {"commit", "dirty", "machine", "failures", "seconds"}
     import pyarrow.parquet as pq
 
     inside = json.loads(pq.read_schema(results(finished) / "trials.parquet").metadata[b"tofpod"])

@@ -54,8 +54,7 @@ class Answers:
 class LocalEngine:
     """``jobs`` processes for trials, and up to two for renders, which alone load Mitsuba. ``limits`` are a trial's;
     renders have no memory limit, as Dr.Jit reserves more than it uses. ``code``: modules that decide the numbers of
-    a stage; a process that starts after one of their sources was edited is refused, because its results would be stored
-    as those of the code that this process runs."""
+    a stage; a process that starts after one of their sources was edited is refused: it would compute other results."""
 
     def __init__(self, jobs: int, limits: Limits, code: Mapping[Stage, Code] | None = None) -> None:
         self.code = dict(code or {})
@@ -157,16 +156,14 @@ class _Worker(threading.Thread):
     def run(self) -> None:
         while (taken := self._engine.next_job(self)) is not None:
             job, limits, answers = taken
-            said: tuple[Job, Ended] | UserError
             try:
-                said = job, self._carried_out(job, limits, answers)
+                answers.ended.put((job, self._carried_out(job, limits, answers)))
             except UserError as mistake:
-                said = mistake
                 self.end()
+                answers.ended.put(mistake)
             except Exception as error:  # a bug here must not leave the driver waiting
                 why = "".join(traceback.format_exception(error))[-TRACEBACK_CHARACTERS:]
-                said = job, Ended("failed", why=why, is_bug=True)
-            answers.ended.put(said)
+                answers.ended.put((job, Ended("failed", why=why, is_bug=True)))
         self.end()
 
     def _carried_out(self, job: Job, limits: Limits, answers: Answers) -> Ended:
@@ -189,8 +186,8 @@ class _Worker(threading.Thread):
         engine = self._engine
         self._pipe, theirs = multiprocessing.get_context("spawn").Pipe()
         arguments = (theirs, self._label, self.stage, str(self._said), engine.code.get(self.stage))
+        process = multiprocessing.get_context("spawn").Process(target=serve, args=arguments, daemon=True)
         with _spawning():
-            process = multiprocessing.get_context("spawn").Process(target=serve, args=arguments, daemon=True)
             process.start()
         self._process = process
         theirs.close()
@@ -246,8 +243,7 @@ class _Worker(threading.Thread):
 
     def strike(self) -> None:
         """Begin to end the process, without waiting for it; from any thread."""
-        process = self._process
-        if process is not None:
+        if (process := self._process) is not None:
             process.kill()
 
     def end(self) -> None:
@@ -262,13 +258,14 @@ class _Worker(threading.Thread):
 @contextlib.contextmanager
 def _one_thread() -> Iterator[None]:
     """Hold the environment in which a process starts that computes in one thread; libraries read it as they load."""
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    before = os.environ.copy()
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     try:
         yield
     finally:
-        for name, value in before.items():
-            os.environ.pop(name, None) if value is None else os.environ.update({name: value})
+        for name in ONE_THREAD:
+            os.environ.pop(name, None)
+            os.environ.update({name: before[name]} if name in before else {})
 
 
 @contextlib.contextmanager

@@ -62,12 +62,11 @@ class Calibration:
         found: dict[str, float] = {}
         failures: list[Failure] = []
         for point in self._group.points:
-            quiet = self._quiet.get(point.digest, {})
-            threshold, why = None, "no hole-free run ended"
-            if point.digest in self.unlearned:
-                failures.append(Failure(f"threshold of {point.label}", "its detector has learned nothing"))
-                continue
+            quiet, threshold = self._quiet.get(point.digest, {}), None
+            why = "no hole-free run ended"
             try:
+                if point.digest in self.unlearned:
+                    raise UserError("its detector has learned nothing")
                 threshold = threshold_of(point, [quiet[key] for key in sorted(quiet)])
             except UserError as error:
                 why = str(error)
@@ -199,9 +198,8 @@ def _draw(plan: SweepPlan, outcome: Outcome, engine: JobEngine, there: set[Path]
     """Add the pictures of all groups that were judged, but for studies, whose limits decide what is shown."""
     groups = [group for group in plan.groups if not group.is_study]
     groups = [group for group in groups if any(point.digest in outcome.thresholds for point in group.points)]
-    failures = render_missing(
-        (job for group in groups for job in group.damaged.renders if job.path not in there), engine
-    )
+    missing = (job for group in groups for job in group.damaged.renders if job.path not in there)
+    failures = render_missing(missing, engine)
     outcome.failures += failures
     lost = {failure.what for failure in failures}
     jobs = [
@@ -277,18 +275,15 @@ class _Run:
         self._shard, self._retry_failed = shard, retry_failed
         self._renders = {job.path: job for job in plan.renders}
         self._calibrations = [Calibration(group) for group in plan.groups]
+        # by group, thresholds that agree with those in use, at which other shards have judged
         self._others: list[list[dict[str, float]]] = [[] for _ in plan.groups]
-        """Thresholds, by group, that agree with those in use, at which other shards have judged."""
-        self._died: Counter[str] = Counter()
-        """Number of times that the process of a render or of a calibrating trial died."""
+        self._died: Counter[str] = Counter()  # deaths of the process of a render or of a calibrating trial
         self._queue: deque[_Trial] = deque()
-        self._waiting: dict[Path, list[tuple[PlanPart, list[_Trial]]]] = {}
-        """Parts with their trials, by the views that they wait for."""
+        self._waiting: dict[Path, list[tuple[PlanPart, list[_Trial]]]] = {}  # parts by the views that they wait for
         self._ahead = self._begun = 0  # trials that are open and not begun, and those under way
         self._lost: dict[Path, str] = {}
-        self._asked: set[Path] = set()
-        """Views that were wanted so far; those still to be rendered are ``_wanted``, those wanted later ``_later``."""
-        self._wanted: deque[Path] = deque()
+        self._asked: set[Path] = set()  # views that were wanted so far
+        self._wanted: deque[Path] = deque()  # views still to be rendered, and those that are wanted later
         self._later: deque[Path] = deque()
 
     def carry_out(self, parts: Iterable[PlanPart]) -> None:
@@ -336,8 +331,7 @@ class _Run:
     def take_learned(self) -> None:
         """Write what detectors have learned into files, from which trials read it."""
         for group, calibration in zip(self._groups, self._calibrations, strict=True):
-            for point, file in group.learned.items():
-                path = Path(file)
+            for point, path in ((point, Path(file)) for point, file in group.learned.items()):
                 entry = self._journal.read(path.stem)
                 if entry is None or entry.record is None:
                     calibration.unlearned.add(point)
@@ -413,10 +407,9 @@ class _Run:
         for thresholds in self._others[part.group]:
             elsewhere = group.trials(part.batch, thresholds, part.repeats)
             for trial, (key, judged) in zip(found, elsewhere, strict=True):
-                if self._journal.state(trial.key) != "done" and self._journal.state(key) == "done":
-                    entry = self._journal.read(key)
-                    if entry is not None:
-                        self._journal.write(trial.key, refiled(entry, judged, trial.task))
+                is_new = self._journal.state(trial.key) != "done" and self._journal.state(key) == "done"
+                if is_new and (entry := self._journal.read(key)) is not None:
+                    self._journal.write(trial.key, refiled(entry, judged, trial.task))
         return found
 
     def _found(self, trial: _Trial) -> bool:

@@ -11,7 +11,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from harness.engine.estimate import progress_display
@@ -29,7 +28,6 @@ from harness.tables.text import Grid, show
 from harness.tables.trials import ResultTables
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import RECORD_BYTES, bounded_bytes, strict_json, write_text
-from harness.vocabulary.geometry import MM
 from harness.vocabulary.path_names import in_words, names_of
 from harness.vocabulary.provenance import RESULTS_VERSION, check_version, record, source_digest
 from harness.vocabulary.seeds import digest
@@ -37,7 +35,6 @@ from scenes.render.cache import in_use, read_view, trim_cache
 from scenes.sensor.camera import camera_of, guessed_precision
 
 MOST_FAILURES = 200  # failures that are listed; the journal has all
-MOST_VIEWS = 64  # views whose render noise is measured: evenly taken from all, 4 MB each
 
 
 def run_study(experiment: Experiment, out: Path, options: EngineOptions, command: str) -> int:
@@ -60,9 +57,10 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
                 retry = options.retry_failed
                 outcome = run_plan(plan, journal, engine, report, shard=options.shard, retry_failed=retry)
             if not options.shard.is_whole:
-                trials = outcome.trials
-                counts = f"{trials.done} trials done, {trials.found} found, {trials.failed} not ended well"
-                print(f"shard {options.shard}: {counts}")
+                done = outcome.trials
+                print(
+                    f"shard {options.shard}: {done.done} trials done, {done.found} found, {done.failed} not ended well"
+                )
                 _tell_failures(outcome)
                 print(f"journal: {folder / 'journal'}")
                 print("when all shards have run: python -m harness.merge, then the same command without --shard")
@@ -203,31 +201,19 @@ def _counts(outcome: Outcome) -> dict[str, int]:
 
 
 def _tell_failures(outcome: Outcome) -> None:
-    counts = _counts(outcome)
-    if counts:
+    if counts := _counts(outcome):
         said = ", ".join(f"{count} {state}" for state, count in counts.items())
+        again = "the same command, with --retry-failed, runs them again" if set(counts) - {"skipped"} else ""
         print(f"{said}: {_reasons(outcome)}", file=sys.stderr)
-    if set(counts) - {"skipped"}:
-        print("the same command with --retry-failed runs again what failed, crashed or timed out", file=sys.stderr)
-    if "skipped" in counts:
-        print("the same command runs again what was skipped", file=sys.stderr)
+        print(again or "the same command runs again what was skipped", file=sys.stderr)
 
 
 def _provenance(
     experiment: Experiment, plan: SweepPlan, outcome: Outcome, tables: ResultTables, origin: dict[str, Any]
 ) -> dict[str, Any]:
-    """Everything that a reader needs to repeat the numbers or to doubt them. ``indirect_noise_mm``: of the renders."""
-    set_ups = [group for group in plan.groups if any(not point.is_variation for point in group.points)]
-    paths = [path for group in set_ups or plan.groups[:1] for path in group.damaged.paths]
-    found = (read_view(path) for path in paths[:: -(-len(paths) // MOST_VIEWS)])
-    views = [view for view in found if view is not None]
-    noise: dict[str, float] = {}
-    for view in views:
-        for index, name in enumerate(view.surface_names):
-            here = view.surface == index
-            if here.any():
-                noise_mm = round(float(np.median(view.indirect_noise_m[here])) / MM, 4)
-                noise[name] = max(noise.get(name, 0.0), noise_mm)
+    """Everything that a reader needs to repeat the numbers or to doubt them."""
+    views = (read_view(job.path) for job in plan.renders)
+    variant = next((view.variant for view in views if view is not None), None)
     runs, renders, trials = tables.runs, outcome.renders, outcome.trials
     sources = [point.config.simulated.camera for point in experiment.points]
     cameras = {source.name: camera_of(source) for source in sources}
@@ -238,7 +224,7 @@ def _provenance(
         "experiment": experiment.config.name,
         "digest": experiment.digest,
         "seed": experiment.config.seed,
-        "mitsuba_variant": views[0].variant if views else None,
+        "mitsuba_variant": variant,
         "seconds": {
             "renders (not cached)": round(renders.seconds, 1),
             "frames (all workers, resumed trials too)": round(float(runs["seconds_frames"].sum()), 1),
@@ -247,7 +233,6 @@ def _provenance(
         "renders": {"done": renders.done, "cached": renders.found, "failed": renders.failed},
         "trials": {"done": trials.done, "resumed": trials.found, "failed": trials.failed},
         "peak_mb": outcome.peak_mb,
-        "indirect_noise_mm": noise,
         "warnings": [text for text in guesses if text],
         "failures": [
             {"what": one.what, "state": one.state, "why": one.why} for one in outcome.failures[:MOST_FAILURES]
@@ -318,7 +303,6 @@ def _set_up(point: Point, group: Group, tables: ResultTables, failed: int) -> Se
         detector_version=detector_version(config),
         calibration_runs=len(calibrating),
         failed=failed,
-        # the damage and the size of every damaged board, wherever and before whichever camera it stands
         targets_digest=digest(targets),
         frames_digest=digest([*decided_by, config.repeats, None if study is None else study.units]),
         units=1 if study is None else study.units or 1,
