@@ -179,8 +179,7 @@ def sweep(experiment: str | Path, *changes: str, out: str | Path = "results", jo
 
 
 def table(folder: str | Path, name: str) -> pd.DataFrame:
-    """Read a table of a folder of results; `results/README.md` explains them. Raises UserError where it has none of
-    that name."""
+    """Read a table of a folder of results (`results/README.md` explains them). Raises UserError where it has none."""
     import pandas as pd
 
     tables = {path.stem: path for path in sorted(Path(folder).glob("*.parquet"))}

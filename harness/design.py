@@ -104,8 +104,7 @@ def _refuse_what_does_not_belong(options: argparse.Namespace) -> None:
 
 
 def _guess(options: argparse.Namespace) -> GuessedCurve:
-    """Return the curve that was told, or that of a study's set-up with the sizes that it inspected, widened to the
-    curve's whole rise where they do not hold its a50 or its a90."""
+    """Return the curve that was told, or a study's, with the sizes that were told or inspected."""
     from harness.evaluation.pod.design import RISE, curve_through
     from harness.evaluation.study.limit import limit_of
     from harness.evaluation.study.record import read_record, set_up_named

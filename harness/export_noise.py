@@ -1,10 +1,8 @@
 """``python -m harness.export_noise CAMERA --out DIR``: a camera's noise as a table and one file of code.
 
-The files are for other simulators (Isaac Sim, Gazebo, MuJoCo, BlenderProc), which render ideal depth: ``NAME.npz``
-with the table, ``depth_noise.py`` (NumPy) and ``depth_noise_torch.py``, copies of `scenes.sensor.tabled` and
-`scenes.sensor.tabled_torch`, which say what is not modelled. The table is measured on the full model before tilted
-planes of many brightnesses: deviation of single pixels, chance of a return, correlation of neighbours, fixed pattern.
-"""
+For simulators that render ideal depth (Isaac Sim, Gazebo, MuJoCo, BlenderProc): ``NAME.npz`` with the table, and copies
+of `scenes.sensor.tabled` and `tabled_torch`, which say what is not modelled. The table is measured on the full model
+before planes of many brightnesses: deviation, chance of a return, correlation of neighbours, fixed pattern."""
 
 from __future__ import annotations
 

@@ -192,8 +192,7 @@ def _family(options: argparse.Namespace, scans: list[Scan]) -> DrawnTargetConfig
 
 
 def _shares(options: argparse.Namespace, said: str, peaks_mm: list[float]) -> list[str]:
-    """Return sentences on what is measured, what is simulated, and what the limit holds for; ``peaks_mm``: the largest
-    change of distance that each damage makes."""
+    """Return sentences on what is measured and simulated, and for what the limit holds; ``peaks_mm``: depths shown."""
     import numpy as np
 
     low, middle, high = np.quantile(peaks_mm, (0.1, 0.5, 0.9))

@@ -76,8 +76,7 @@ def offered(kind: str) -> list[Row]:
 
 
 def shown(kind: str, name: str) -> Row:
-    """Return an offer's row with all that can be set. Raises UserError where the name is unknown, taken twice or
-    broken."""
+    """Return an offer's row with all that can be set. Raises UserError where it is unknown, taken twice or broken."""
     settable = _detector_settings(name) if kind == "detectors" else _numbers(name)
     return {**_origin(plug_ins(kind).offer(name)), **_facts(kind, name), SETTABLE[kind]: settable}
 
@@ -134,8 +133,7 @@ def _facts(kind: str, name: str) -> Row:
 
 
 def _detector_settings(name: str) -> list[dict[str, Any]]:
-    """Every setting with its default and what is legal. Of a setting that is one of several kinds, those of the
-    default's kind."""
+    """Every setting with default and what is legal; of a setting of several kinds, those of the default's kind."""
     from pydantic import ValidationError
 
     from detectors import detector_type
@@ -278,8 +276,7 @@ def _limits(run: Path) -> list[dict[str, Any]]:
 
 
 def described(run: Path) -> dict[str, Any]:
-    """Describe a folder of results as JSON's types. ``state``: complete, unfinished, running or broken, with ``note``
-    in words; ``date`` None where none is known; ``size_bytes``: of all files below it."""
+    """Describe a folder of results as JSON's types. ``state``: complete, unfinished, running or broken."""
     from harness.engine.journal import Journal
 
     size_bytes = 0
@@ -345,8 +342,7 @@ def files_below(folder: Path) -> Iterator[Path]:
 
 
 def latest_run(parent: Path) -> str | None:
-    """Return the name of the run that ``parent/latest`` points to, whether it is there or not; None where there is no
-    such link of tofpod's."""
+    """Return the name of the run that ``parent/latest`` points to; None where there is no such link of tofpod's."""
     path = Path(parent) / LATEST
     said = os.readlink(path) if path.is_symlink() else ""
     return said if DIGEST_NAME.fullmatch(said) else None
@@ -383,8 +379,7 @@ def refuse_links(*paths: Path) -> None:
 
 
 def cache_removal(folder: Path, limit_bytes: int | None) -> list[StoredFile]:
-    """Return the longest unused renders, so that the rest fits into the limit, and what killed processes left a day and
-    more ago; None: all of both."""
+    """Return the longest unused renders, so that the rest fits, and old leftovers; None: all of both."""
     if limit_bytes is None:
         return stored_renders(folder) + leftovers(folder, 0.0)
     return longest_unused(stored_renders(folder), limit_bytes, ()) + leftovers(folder)
@@ -435,8 +430,7 @@ def removable(folder: Path) -> list[StoredFile]:
 
 
 def remove_results(folders: Sequence[Path], files: Iterable[StoredFile]) -> list[StoredFile]:
-    """Remove files, then folders that are empty, the experiment's own included, and `latest` where the run that it
-    names is gone. Returns what is gone."""
+    """Remove files, empty folders, and `latest` where its run is gone. Returns what is gone."""
     gone = removed(files)
     for folder in folders:
         _remove_empty(*folders_in(folder, re.compile(f"{JOURNAL}|{POINT_NAME.pattern}")), folder)

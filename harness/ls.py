@@ -37,8 +37,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def _list_offers(options: argparse.Namespace) -> int:
-    """List detectors and cameras, or show those of a name with all that can be set. Raises UserError where there is
-    none, or where it is broken."""
+    """List detectors and cameras, or all that can be set of those of a name. Raises UserError for another."""
     from harness.listing import SETTABLE, grid_of, offered, plug_ins, shown
     from harness.tables.text import Grid, show
     from harness.vocabulary.declaration.diagnose import nearest
@@ -71,8 +70,7 @@ def _list_offers(options: argparse.Namespace) -> int:
 
 
 def _list_results(options: argparse.Namespace) -> int:
-    """List every folder of results with its state, the limit that it found and what tells it from others. Raises
-    UserError where an experiment was named that has none."""
+    """List every folder of results with state, limit, differences. Raises UserError for an unknown experiment."""
     from harness.listing import differs_text, limit_text, result_folders
     from harness.tables.text import Grid
     from harness.vocabulary.files import size_text

@@ -68,9 +68,8 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def merge_into(into: Journal, other: Journal, counts: Counter[str]) -> list[str]:
-    """Copy what ``into`` lacks, or has not done; count trials that were copied, that were known, and of these those
-    that are alike but for last digits. Returns the keys of those that differ. Raises UserError where a newer tofpod
-    wrote either."""
+    """Copy what ``into`` lacks or has not done; count trials copied, known, and of these alike but for last digits.
+    Returns the keys of those that differ. Raises UserError where a newer tofpod wrote either."""
     from harness.engine.journal import THRESHOLDS
 
     different = []
@@ -92,8 +91,7 @@ def merge_into(into: Journal, other: Journal, counts: Counter[str]) -> list[str]
 
 
 def _without_seconds(value: object) -> object:
-    """A record without its timings, which no two runs have in common, and without arrays that a detector has learned:
-    text whose last digits unlike processors change; what trials made of them is compared."""
+    """A record without timings and learned arrays, whose last digits differ; what trials made of them is compared."""
     if isinstance(value, dict):
         kept = {name: each for name, each in value.items() if not name.startswith("seconds") and name != "arrays"}
         return {name: _without_seconds(each) for name, each in kept.items()}

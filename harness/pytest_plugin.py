@@ -26,8 +26,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.fixture
 def tofpod_gate(request: pytest.FixtureRequest) -> Callable[..., Path]:
-    """Return the gate: ``gate(experiment, *changes)`` runs a study (a YAML file beside the test, ``changes`` as of
-    ``--set``) and returns the folder of its results, or fails the test with what `harness.check` says."""
+    """Return ``gate(experiment, *changes)``: it returns a study's folder, or fails as `harness.check` does."""
 
     def gate(experiment: str, *changes: str) -> Path:
         from harness import check

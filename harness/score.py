@@ -97,8 +97,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def _found(predictions: Path, dataset: Path, samples: list[str]) -> dict[str, Path]:
-    """The file of each board's map, every one of them of the right shape. Raises UserError that names all that is
-    missing, extra or wrong."""
+    """The file of each board's map. Raises UserError that names all that is missing, extra or wrong."""
     from harness.engine.boards import read_arrays
 
     wanted = {name for name in samples if name.split("/")[1] in JUDGED}
@@ -161,8 +160,7 @@ def _read(path: Path) -> np.ndarray:
 def _judged(
     category: str, maps: dict[str, Path], options: argparse.Namespace, index: dict[str, Any], rate: float
 ) -> tuple[SetUpLimit, dict[str, Any]]:
-    """Judge the maps of a category, at a threshold that its good boards of ``validation`` set: their limit, and a row
-    of the table of scores."""
+    """Judge the maps of a category, at a threshold by its good boards of ``validation``: limit, and scores."""
     import pandas as pd
 
     from harness.engine.boards import read_arrays, read_truth
@@ -251,9 +249,8 @@ def _findings(places_m: np.ndarray, above: np.ndarray) -> Findings:
 
 
 def area_under(scores: np.ndarray, found: np.ndarray, false: np.ndarray, limit: float = 1.0) -> float:
-    """Return the area under the share of the weights ``found`` (n,) above a threshold against that of the weights
-    ``false`` (n,), up to ``limit`` of the latter and divided by it; NaN where either has no weight. Equal scores are
-    one threshold."""
+    """Return the area under the share of the weights ``found`` (n,) above a threshold against that of ``false`` (n,),
+    up to ``limit`` and divided by it; NaN where either has no weight. Equal scores are one threshold."""
     order = np.argsort(-scores, kind="stable")
     last = np.append(np.flatnonzero(np.diff(scores[order])), len(scores) - 1)
     up, across = (np.append(0.0, np.cumsum(each[order])[last]) for each in (found, false))

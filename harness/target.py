@@ -54,8 +54,7 @@ def main(arguments: argparse.Namespace, command: str) -> int:
 
 
 def declared(what: str | Path | Mapping[str, Any], board: int) -> TargetConfig:
-    """Return the target of a name, of a file, or of a declaration as plain data; of a family the ``board`` asked for.
-    Raises UserError with every mistake of the declaration."""
+    """Return the target of a name, a file or a declaration; of a family one ``board``. Raises UserError."""
     from harness.vocabulary.declaration.diagnose import read_as, settings_of
     from harness.vocabulary.declaration.yaml_source import read_yaml
     from scenes.target.drawn import DrawnTargetConfig

@@ -211,8 +211,7 @@ def orders_findings_by_score(make: Make, cloud: Cloud) -> None:
 
 
 def is_silent_at_the_quiet_threshold(make: Make, cloud: Cloud) -> None:
-    """Nothing is found there, something just below it, and it is the strongest finding's score; 0 where nothing can be
-    found."""
+    """Nothing is found there, something just below; it is the strongest finding's score, or 0 for none."""
     look = Look.at(make(), cloud)
     quiet = look.quiet
     require(np.isfinite(quiet) and quiet >= 0, f"the quiet threshold is {quiet:g}: a number from 0 is wanted")

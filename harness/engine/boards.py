@@ -1,9 +1,8 @@
 """Boards of a data set: which there are, and the files of each; and how programs read them again.
 
-Every board is one average of frames of one unit of a camera. Boards of different splits are different boards, drawn
-with random streams of their own: those of ``validation``, ``test/good`` and of damage are the boards by which a study
-of the same experiment sets thresholds, counts false calls and finds limits. Not included: several views, real captures.
-"""
+Every board is one average of frames of one unit of a camera. Splits have boards of their own: those of ``validation``,
+``test/good`` and of damage are those with which a study of the same experiment sets thresholds, counts false calls and
+finds limits. Not included: several views, real captures."""
 
 from __future__ import annotations
 
@@ -127,8 +126,7 @@ def joined(regions: list[Region]) -> Region:
 
 
 def write_board(out: Path, sample: Sample, window: Region) -> None:
-    """Write all files of a board on the ``window`` of the sensor that all boards of its category share; the truth last,
-    by which a resumed run knows that the board is there."""
+    """Write all files of a board on the ``window`` that its category shares; the truth last, for resuming."""
     set_up, (point,) = load_set_up(sample.task.set_ups[0]), sample.task.points
     known = known_view(set_up, cloud_of(sample.task, point), hole_free=sample.task.hole_free)
     cloud, truth = known.cloud, () if sample.task.hole_free else known.truth

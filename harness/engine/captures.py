@@ -22,10 +22,8 @@ from harness.vocabulary.provenance import RESULTS_VERSION, record
 
 
 def judge_captures(experiment: Experiment, out: Path, command: str) -> int:
-    """Judge every point's capture once and write its findings to ``<folder>/<number>/``, and a table of all points.
-
-    A capture has no repeats and no truth, so rates, sizes against the truth and claims are not given. Returns 0.
-    """
+    """Judge every point's capture and write its findings to ``<folder>/<number>/``, and a table of all points; return
+    0. Without repeats and truth there are no rates, sizes against the truth and claims."""
     folder = experiment.folder(out)
     write_text(folder / EXPERIMENT.name, resolved_yaml(experiment))
     rows = []

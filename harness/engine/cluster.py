@@ -1,9 +1,7 @@
-"""Jobs on a cluster by way of dask.distributed: each dask worker is a node that runs the local engine inside.
+"""Jobs on a cluster by dask.distributed: each dask worker is a node that runs the local engine inside.
 
-A node's processes do the jobs, enforce their limits and survive their deaths, as on this machine. The driver calls the
-nodes through the scheduler, with bundles of jobs, two at a time for each: dask neither queues nor retries them. When a
-node dies, its jobs go to others; a job that was aboard of `TRIES` nodes as they died counts as crashed.
-"""
+The driver calls the nodes through the scheduler with bundles of jobs, two at a time for each; dask neither queues nor
+retries them. When a node dies, its jobs go to others; a job that `TRIES` nodes had as they died counts as crashed."""
 
 from __future__ import annotations
 
@@ -143,8 +141,7 @@ class ClusterEngine:
         self._waiting[job.stage].append(job)
 
     def ended(self) -> list[tuple[Job, Ended]]:
-        """Wait for jobs to end. Raises UserError where the scheduler is gone, or for long no node is left that could
-        do what waits."""
+        """Wait for jobs to end. Raises UserError where the scheduler, or every node that could do them, is gone."""
         while not self._done:
             self._hand_out()
             if not self._done:
@@ -410,8 +407,7 @@ def drop(driver: str) -> None:
 
 
 async def carry_out(bundle: Bundle, code: Mapping[Stage, Code], driver: str, dask_worker: Any) -> tuple[Ended, ...]:
-    """Do the jobs of a bundle; returns their ends, in order. Raises UserError where the node's processes run other code
-    or cannot start."""
+    """Do the jobs of a bundle; returns their ends. Raises UserError for other code or processes that cannot start."""
     key = repr(sorted(code.items()))
     if key not in _engines:
         _engines[key] = LocalEngine(dask_worker.state.nthreads, Limits(), code)

@@ -1,10 +1,9 @@
-"""A part before a camera, patch by patch: what noise it has there, how strong damage shows, and how often it is found.
+"""A part before a camera, patch by patch: its noise there, how strong damage shows, and how often it is found.
 
 Noise at a place is what the detector's residual on the undamaged part has about it: noise of the average, the unit's
-pattern, and what the fitted surface cannot follow. A damage's strength is d' of the ideal observer on it at a noise of
-1 m, from the difference of noise-free views with and without it. Strength and hits are learnt on boards of the family
-in random poses as wide as those that are asked for. Not modelled: an unknown surface in the strength, light that other
-parts throw back, information in missing returns."""
+pattern, and what the fitted surface cannot follow. Strength is d' of the ideal observer at a noise of 1 m, from
+noise-free views with and without the damage. Both are learnt on boards of the family in random poses as wide as those
+asked for. Not modelled: an unknown surface in the strength, light of other parts, information in missing returns."""
 
 from __future__ import annotations
 
@@ -50,8 +49,7 @@ Pose = tuple[float, float, float]  # Distance in metres, tilts of the part about
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """A set-up before a part: its ``task`` with the threshold, what it finds, and how it has ``seen`` the patches in
-    each pose."""
+    """A set-up before a part: ``task`` with the threshold, what it finds, how it has ``seen`` patches by pose."""
 
     point: Point
     task: PointTask
@@ -61,9 +59,8 @@ class Survey:
 
 
 def survey(experiment: Experiment, poses: Sequence[Pose], cache: Path, folder: Path, engine: JobEngine) -> list[Survey]:
-    """Return a survey for each set-up of an experiment. Views and trials that are there already, in ``cache``
-    and ``folder``, are not made again. Raises UserError where a point has no threshold, and as `declared` and
-    `findable` do."""
+    """Return a survey for each set-up. Views and trials that are in ``cache`` and ``folder`` are not made again. Raises
+    UserError where a point has no threshold, and as `declared` and `findable` do."""
     plan = SweepPlan(tuple(_widened(group, poses) for group in plan_of(experiment, cache, folder).groups))
     journal, rows = Journal(folder / "journal"), dict[tuple[str, int, int, str], list[bool]]()
     with progress_display() as report:
@@ -120,8 +117,7 @@ def declared(config: ExperimentConfig) -> tuple[SimulatedSource, DrawnTargetConf
 
 
 def refuse_size(config: ExperimentConfig, size_mm: float) -> None:
-    """Raise UserError for a size outside of the range that an experiment declares: of damage of one size in plan, of
-    its depths."""
+    """Raise UserError for a size outside the range that is declared: of damage of one size in plan, of its depths."""
     damage = declared(config)[1].damage
     low, high = damage.size_mm
     word = damage.size_of
@@ -201,8 +197,7 @@ def _residuals(batch: Batch, point: PointTask, seed: int) -> tuple[np.ndarray, n
 def _board_learnt(
     batch: Batch, whole: Batch, point: PointTask, seed: int
 ) -> tuple[int, list[tuple[Damage, np.ndarray, tuple[float, float, float]]], NoiseSums]:
-    """A damaged board's number, its damages with their signatures (cut-outs, metres) and how each is seen, and the
-    noise of the board without them."""
+    """A damaged board's number, its damages with signatures (cut-outs, metres) and how each is seen, and its noise."""
     set_up, intact = (load_set_up(one.set_ups[0]) for one in (batch, whole))
     noise_m, known, deviation_m = _residuals(whole, point, seed)
     change_m = np.nan_to_num(noise_free_z_m(set_up) - noise_free_z_m(intact))

@@ -25,8 +25,7 @@ WINDOW_S = 60.0  # rates are those of the last minute: work of unlike set-ups go
 def progress_display(
     stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic
 ) -> Iterator[Callable[[Outcome], None]]:
-    """Yield a function that shows on ``stream`` (None: stderr) how far a run is: done of planned, rate, failures, time
-    left. Work that was found done is no part of the rate."""
+    """Yield a function that shows on ``stream`` (None: stderr) how far a run is; work found done is not in the rate."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
 

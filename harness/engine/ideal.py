@@ -1,9 +1,8 @@
-"""Noise of units drawn at random, and each damage's signature: the input of the ideal observer on a study's set-ups.
+"""Noise of random units, and each damage's signature: the input of the ideal observer on a study's set-ups.
 
-Noise is what a unit's average shows on a damaged board beyond what a camera without noise, unit errors and rounding
-shows of the same view, away from damage and rim; a cubic of each field is taken out. The signature is what that
-noise-free camera shows near the damage beyond a cubic through the undamaged pixels.
-"""
+Noise is what a unit's average shows, away from damage and rim, beyond what a camera without noise, unit errors and
+rounding shows, less a cubic of each field. The signature is what that noise-free camera shows near the damage beyond a
+cubic through the undamaged pixels."""
 
 from __future__ import annotations
 
@@ -127,8 +126,7 @@ def _noise_m(
 
 
 def _deviation_m(noise_m: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """(h, w): root mean square of the noise over units and a square about each pixel; where nothing is known about a
-    pixel, that of the nearest one."""
+    """(h, w): root mean square of the noise over units and a square about each pixel, else the nearest one's."""
     square, count = (ndimage.uniform_filter(image.sum(axis=0), SMOOTHED_PX) for image in (noise_m**2, known * 1.0))
     there = count > 0.5 * len(noise_m) / SMOOTHED_PX
     nearest = ndimage.distance_transform_edt(~there, return_distances=False, return_indices=True)

@@ -45,8 +45,7 @@ VARIANT = "main"
 
 @dataclass(frozen=True)
 class Judging:
-    """The rules by which clouds are judged: detector, settings, hit radius, and the ``threshold``; where that is None,
-    ``threshold_of`` an undamaged cloud returns it with warnings."""
+    """How clouds are judged. ``threshold`` None: ``threshold_of`` an undamaged cloud returns it, with warnings."""
 
     detector: str
     settings_json: str
@@ -56,8 +55,7 @@ class Judging:
 
 
 class Scan:
-    """A recording of an undamaged part, its surface, and what a detector judges of it. Raises UserError for a recording
-    without a lens or without anything to judge."""
+    """A recording of an undamaged part, its surface, what is judged of it. Raises UserError without either."""
 
     def __init__(self, recording: Recording, judging: Judging) -> None:
         if recording.lens is None or recording.slopes is None or recording.projection != "central":
@@ -135,8 +133,7 @@ class Scan:
         return family.damage.widest_mm * MM / 2 / self.pitch_m + BEYOND_PX + self.reach_px
 
     def left_out(self, family: DrawnTargetConfig) -> str:
-        """Return a sentence on the rim that no damage is placed on, empty where it is as steep as the rest, and so
-        tells nothing of its own."""
+        """Return a sentence on the rim that no damage is placed on; empty where it is as steep as the rest."""
         inner, known = self.depth_px >= self.rim_px(family), np.isfinite(self.angle_deg)
         if not (inner & known).any():
             return ""
@@ -208,8 +205,7 @@ class Implanted:
 def placements(
     scans: Sequence[Scan], family: DrawnTargetConfig, camera: str, targets: int, seed: int, cache: Path
 ) -> Iterator[Implanted]:
-    """Yield placements with ``targets`` damages in all, or a few more, scan by scan in turn; renders are kept in
-    ``cache``. Raises UserError where no damage finds a place."""
+    """Yield placements with ``targets`` damages or a few more, scan by scan. Raises UserError where none fits."""
     units = [unit_config(camera, scan.lens) for scan in scans]
     found = number = empty = 0
     while found < targets:

@@ -1,5 +1,4 @@
-"""One detector on one cloud, measured against the truth: the rows of a run and of each damage; and the further rows of
-a study's board: signals at every place, findings, and counts at other thresholds than the one in use."""
+"""One detector on one cloud against the truth: rows of a run and each damage; further rows of a study's board."""
 
 from __future__ import annotations
 
@@ -101,10 +100,9 @@ def matched(
     known: KnownCloud, detections: Sequence[Detection], radius_m: float, overlap: float | None
 ) -> tuple[dict[int, int], int]:
     """Return the findings that count for damages, {index of damage: index of finding}, one for each, nearest first; and
-    how many others are parts of a damage and so no false calls. A finding may count for a damage where its centre lies
-    within the radius of the damage's centre, of long damage of its centre line; with an ``overlap`` also where at least
-    this share of its pixels lie on the damage, its outline grown by `SMEARED_PX`. Findings that overlap so beside the
-    one that counts are its parts."""
+    how many others are parts of a damage and so no false calls. A finding may count where its centre lies within the
+    radius of the damage's centre (of long damage its centre line), with an ``overlap`` also where this share of its
+    pixels lies on the damage, its outline grown by `SMEARED_PX`. Findings that overlap so beside it are parts."""
     (found,) = _matched(known, [Findings.of(detections)], radius_m, overlap)
     return found
 
@@ -121,8 +119,7 @@ def _matched(
 
 
 def smeared(outlines: Sequence[np.ndarray], shape: tuple[int, ...], *, grid: bool = True) -> list[np.ndarray]:
-    """Return a mask (n,) of a cloud's pixels for each of the ``outlines``, flat indices, grown by `SMEARED_PX` where
-    the cloud has a pixel ``grid``."""
+    """Return masks (n,) of pixels for outlines of flat indices, grown by `SMEARED_PX` on a ``grid``."""
     masks = []
     for outline in outlines:
         on = np.zeros(shape, bool)
@@ -201,8 +198,7 @@ def _place(damage: Damage) -> dict[str, Any]:
 def _hole_row(
     known: KnownCloud, evidence: Evidence, damage: Damage, found: Measurement | None, largest: Measurement | None
 ) -> dict[str, Any]:
-    """The row of one damage, mm; positions as the thesis takes them, from the largest cluster. ``state``: found,
-    invalid (most pixels have no range), wrong depth (off the surface, below threshold), or invisible."""
+    """The row of one damage, mm; positions as the thesis takes them, from the largest cluster."""
     inside = known.outlines[damage.id]
     # a cloud without a grid has no pixels that could lack a range
     seen_z = known.cloud.points_m.reshape(-1, 3)[inside, 2]
@@ -315,9 +311,8 @@ def grid(threshold: float, octaves: tuple[int, int]) -> np.ndarray:
 def _without_return(
     known: KnownCloud, judged: JudgedCloud, radius_m: float, *, hole_free: bool
 ) -> tuple[frozenset[int], int]:
-    """Damages (indices into the truth) that a finding without return hits, and how many of these findings are false
-    calls: those that hit none and are no part of a finding by depth. None for detectors that test the harness, whose
-    findings are not what a cloud shows."""
+    """Damages (indices) that a finding without return hits, and how many such findings are false calls: they hit none
+    and are no part of a finding by depth. None for detectors that test the harness."""
     tests = getattr(judged.detector, "tests_the_harness", False)
     missing = None if tests else missing_returns(known.cloud, judged.evidence)
     if missing is None or not missing.detections:

@@ -1,9 +1,7 @@
-"""Hole-free boards on which a detector learns before its threshold is calibrated.
+"""Hole-free boards on which a detector (`detectors.interface.Calibratable`) learns before its threshold is set.
 
-Detectors that can do so implement `detectors.interface.Calibratable`. What one has learned is stored in the journal, as
-thresholds are, so that it is resumed, merged and shared by shards; and in a file of the same name, from which trials
-read it.
-"""
+What it has learned is stored in the journal, for resuming and for shards, and in a file of the same name, from which
+trials read it."""
 
 from __future__ import annotations
 
@@ -38,8 +36,7 @@ def _learns(detector: str, settings_json: str) -> bool:
 
 
 def learn(task: TrialTask) -> Rows:
-    """Return the record of what the one detector of a task learns: its arrays as an ``.npz`` in base 64. The task's
-    set-ups are those of `LEARNING_BOARDS` boards in a row."""
+    """Return the record of what a task's detector learns on its `LEARNING_BOARDS` boards: an ``.npz`` in base 64."""
     (point,), views = task.points, len(task.set_ups) // LEARNING_BOARDS
     boards = (
         replace(task, set_ups=task.set_ups[number * views : (number + 1) * views], repeat=number)

@@ -94,8 +94,7 @@ def _cloud_examples(group: Group, thresholds: Mapping[str, float]) -> list[Examp
 
 
 def _outline_px(set_up: SetUp, damage: Damage) -> np.ndarray:
-    """(n, 2) columns and rows of a damage's rim on the cloud's grid: its outline on the face, of a hole or dent a
-    circle in the face's tangent plane."""
+    """(n, 2) columns and rows of a damage's rim on the cloud's grid; of a hole or dent a circle."""
     region, lens = set_up.unit.region, set_up.unit.camera.nominal_lens
     across = np.cross(damage.axis_camera, [0.0, 1.0, 0.0])
     across /= np.linalg.norm(across)

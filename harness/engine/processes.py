@@ -1,8 +1,7 @@
 """Jobs in processes of this machine: a process that dies, hangs or needs too much memory fails its own job only.
 
-The executors of the standard library give up all their jobs when one of their processes dies. Here a thread serves each
-process through a pipe of its own, so that it is known which job a process held. A cluster's nodes use the same class.
-"""
+The standard library's executors give up all jobs when a process dies. Here a thread serves each process through a pipe,
+so that its job is known. A cluster's nodes use the same class."""
 
 from __future__ import annotations
 
@@ -345,8 +344,7 @@ def _limit_memory(memory_mb: int | None) -> None:
 def render_into_cache(
     target_data: dict[str, Any], camera_data: dict[str, Any], render_data: dict[str, Any], folder: str
 ) -> tuple[bool, float]:
-    """Render a view unless the cache holds it whole; this alone loads Mitsuba. Returns whether the view was there, and
-    the seconds that it took. Arguments are plain data."""
+    """Render a view unless it is cached; only this loads Mitsuba. Returns whether it was there, and seconds."""
     from scenes.optics import RenderConfig
     from scenes.render.cache import cached_view
     from scenes.sensor.camera import CameraConfig, camera_of
@@ -358,8 +356,7 @@ def render_into_cache(
 
 
 class SerialEngine:
-    """One job at a time in this process, for debuggers and tests. No limits hold, and a job that hangs or kills the
-    process is not survived."""
+    """One job at a time in this process, for debuggers and tests: no limits hold, no hang is survived."""
 
     def __init__(self) -> None:
         self._jobs: deque[Job] = deque()

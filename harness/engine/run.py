@@ -1,11 +1,8 @@
-"""The run of a plan: renders feed trials; detectors that can do so learn on hole-free boards, then hole-free trials set
-thresholds, then judged trials use both. All ends are in the journal; trials that the journal holds are not run again,
-and views that only they need are not rendered.
+"""The run of a plan: renders feed trials; detectors learn on hole-free boards, then hole-free trials set thresholds,
+then judged trials use both. What the journal holds is not run again, and views that only that needs are not rendered.
 
 Every shard calibrates for itself, and unlike processors give unlike last digits. So the journal stores the thresholds
-that were used beside the trials, and a merge keeps all work: trials that were judged at a threshold which agrees with
-the one in use to within `AGREES` count, filed under the one in use; others are judged anew.
-"""
+in use, and after a merge trials that were judged within `AGREES` of the one in use count, filed under it."""
 
 from __future__ import annotations
 
@@ -77,8 +74,7 @@ class Calibration:
         return found, failures
 
     def sets(self, own: Mapping[str, float], journal: Journal) -> list[dict[str, float]]:
-        """Return the thresholds to use (``own``, unless the journal has only others that agree), then others that agree
-        with them, at which shards have judged."""
+        """Return the thresholds to use (``own``, unless the journal has only others that agree), then others."""
         prefix, stored = self._prefix(), []
         for key in journal.thresholds():
             entry = journal.read(key) if prefix and key.startswith(prefix) else None
@@ -167,9 +163,8 @@ def run_plan(
     retry_failed: bool = False,
 ) -> Outcome:
     """Run the trials that the journal lacks, with ``retry_failed`` also those that are not done, and draw the pictures
-    of a whole sweep. A job that ends badly becomes a `Failure` and costs the trials that need it. Raises UserError
-    where nothing can be written or the engine is gone; KeyboardInterrupt passes through, with all ends in the
-    journal."""
+    of a whole sweep. A job that ends badly is a `Failure` and costs the trials that need it. Raises UserError where
+    nothing can be written or the engine is gone; KeyboardInterrupt passes through, with all ends in the journal."""
     first, then = parts_of(plan, shard)
     run = _Run(plan, journal, engine, report, shard, retry_failed)
     outcome = run.outcome
@@ -255,8 +250,7 @@ class _Trial(NamedTuple):
 
 
 class _Run:
-    """The state of a run. ``under_way``: jobs by name; ``there``: views that are in the cache; ``judged_paths``: views,
-    by group, that will be wanted once its thresholds are set."""
+    """The state of a run: jobs under way by name, views in the cache, views wanted after calibration by group."""
 
     def __init__(
         self,

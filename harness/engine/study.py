@@ -38,8 +38,7 @@ MOST_FAILURES = 200  # failures that are listed; the journal has all
 
 
 def run_study(experiment: Experiment, out: Path, options: EngineOptions, command: str) -> int:
-    """Run, write tables and report, print the summary; a shard's trials only go into the journal. Returns 0, 1 where
-    trials did not end well, 130 after Ctrl-C."""
+    """Run, write tables and report, print the summary; of a shard only the journal. Returns 0, 1, or 130."""
     began = time.monotonic()
     origin = record(command)  # now: a commit that is made while the sweep runs is not what it ran
     origin["started"] = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
@@ -260,8 +259,7 @@ def record_of(
     failed: Mapping[str, Sequence[Failure]],
     provenance: Mapping[str, Any],
 ) -> StudyRecord:
-    """Return the record of a study. ``failed``: trials that failed, by point digest. Set-ups of which no damaged
-    board was judged are left out; `without_limit` tells of them."""
+    """Return a study's record, without set-ups of which no damaged board was judged. ``failed``: by point digest."""
     calibrate = experiment.config.threshold.calibrate
     found = {point.digest: group for group in plan.groups for point in group.points}
     counts = {digest: len(failures) for digest, failures in failed.items()}

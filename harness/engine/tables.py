@@ -27,8 +27,7 @@ UNKNOWN = np.iinfo(np.int32).min  # stands among whole numbers for a value that 
 
 
 def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> trials.ResultTables:
-    """Collect records into tables in a fixed order; equal for equal records in equal order. The number of frames apart,
-    every axis is a column of all tables but those of a study alone."""
+    """Collect records into tables in a fixed order; every axis but frames is a column, but of a study's own."""
     parts: dict[str, list[dict[str, Any]]] = {name: [] for name in (*RECORDED, *OF_STUDY)}
     grids: dict[tuple[float, ...], np.ndarray] = {}
     probes: list[dict[str, Any]] = []

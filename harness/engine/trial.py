@@ -1,10 +1,8 @@
 """One trial: frames of one set-up, their averages, the maps made of them, every detector that asked for them, measured
 against the truth.
 
-Averages are drawn at once where that is equal in distribution (plain means of at least `FEWEST_FRAMES` frames, where
-the camera's model can), from single frames otherwise. Frames that jump as a whole are left out by how far each is
-displaced, which is known exactly here.
-"""
+Averages are drawn at once where that is equal in distribution (plain means of `FEWEST_FRAMES` frames and more, where
+the camera's model can). Frames that jump are left out by their displacement, which is known exactly here."""
 
 from __future__ import annotations
 
@@ -56,8 +54,7 @@ def averages_of(
 ) -> dict[int, Cloud]:
     """Return averages of the first n frames of a capture for each n in ``counts``, equal in distribution to
     `detectors.average.prefix_averages`, which is used (and raises) where ``exact`` or nothing else will do. Averages
-    drawn at once nest, and so do those drawn frame by frame; the two kinds have noise of their own. With a
-    ``flat_field`` they are corrected by it."""
+    drawn at once nest, and so do those drawn frame by frame. A ``flat_field`` is taken off."""
     many = sorted({n for n in counts if n >= FEWEST_FRAMES})
     clouds = _at_once(capture, many, config) if many and not exact and config.method == "mean" else {}
     rest = [n for n in counts if n not in clouds]
@@ -70,9 +67,8 @@ def averages_of(
 
 @lru_cache(maxsize=4)
 def flat_field_of(camera: CameraConfig, config: FlatFieldConfig, seed: int) -> FlatField:
-    """Return what a unit's whole sensor makes of a plane across its axis, with noise of its own, kept for the worker's
-    next trials. The plane is known to be flat, so one capture is enough. Raises UserError where no pixel has a
-    range."""
+    """Return what a unit makes of a flat plane across its axis, with noise of its own, kept for the worker's next
+    trials. Raises UserError where no pixel has a range."""
     facts = camera_of(camera)
     view = plane_view(facts, facts.nominal_lens.whole, config.distance_m, FLAT_ALBEDO)
     capture = SimulatedUnit(facts, camera, view).capture(config.frames, seed, "flat field")
@@ -295,8 +291,7 @@ def registration_error_m(
 
 
 Role = Literal["learning", "calibration", "hole_free", "damaged"]
-"""The purpose of a trial's target. Detectors learn on those of "learning" (`harness.engine.learning`). Only in a study
-do boards that set a threshold ("calibration") differ from those on which false calls are counted ("hole_free")."""
+"""Purpose of a trial's target: to learn on, to set a threshold (in a study only), to count false calls, to be found."""
 TABLES = ("runs", "holes", "probes", "noise", "registrations", *STUDY_TABLES)
 LAGS = (1, 2, 3)  # distances in pixels at which the noise's correlation is taken
 FEWEST_PAIRS = 50  # pairs of pixels below which a correlation is not told: its standard error would exceed 0.14
@@ -304,8 +299,7 @@ FEWEST_PAIRS = 50  # pairs of pixels below which a correlation is not told: its 
 
 @dataclass(frozen=True)
 class PointTask:
-    """The demands of a point on a trial. ``threshold`` is None while it is being calibrated. ``learned``: file of what
-    its detector has learned; None for one that learns nothing, or is learning."""
+    """A point's demands. ``threshold`` None: being calibrated. ``learned``: file of what its detector learned."""
 
     digest: str
     variant: str
@@ -324,8 +318,7 @@ class PointTask:
 
 @dataclass(frozen=True)
 class TrialTask:
-    """Frames of one set-up, drawn once, judged by all points that share them. ``poses`` declares the views, if there
-    are several. ``board``: its number among a study's boards of this role; None where the target is the only one."""
+    """Frames of one set-up, drawn once, judged by points that share them. ``board``: its number in a study."""
 
     set_ups: tuple[SetUpRef, ...]
     seed: int
@@ -448,8 +441,7 @@ def _point_rows(
 
 
 def _board_rows(task: TrialTask, set_up: SetUp, clouds: dict[int, Cloud], points: Sequence[PointTask]) -> Rows:
-    """Rows for each variant and number of frames: "probes", a list of errors of z; "noise", as in
-    `harness.tables.trials.NOISE`."""
+    """Rows by variant and number of frames: "probes", errors of z; "noise", as in `tables.trials.NOISE`."""
     pair = [frame.z_m for frame in islice(capture_of(set_up, 0, task, 2).frames(), 2)]
     noise = pair_noise(pair[0], pair[-1], set_up.bare)
     rows: Rows = {"probes": [], "noise": []}

@@ -1,9 +1,5 @@
-"""The seam between what is to be done and what does it: jobs go in, each comes back once with how it ended; one part of
-a sweep (`--shard 3/10`), with no other process to talk to; and the options of every program that runs an experiment.
-
-An engine runs jobs in this process, in processes of this machine or on a cluster. It loses none: a job that raises,
-kills its process, hangs or eats the memory comes back as such, and takes no other with it.
-"""
+"""The seam between what is to be done and what does it: jobs go in, each comes back once with how it ended, whatever it
+did; one part of a sweep (`--shard 3/10`); and the options of every program that runs an experiment."""
 
 from __future__ import annotations
 
@@ -39,8 +35,7 @@ TRACEBACK_CHARACTERS = 4000
 
 @dataclass(frozen=True)
 class Job:
-    """``function(*arguments)``, somewhere. The function is importable by its name; arguments and result are plain data
-    or frozen dataclasses."""
+    """``function(*arguments)``, importable by its name; arguments and result are plain data or frozen dataclasses."""
 
     name: str
     stage: Stage
@@ -255,8 +250,7 @@ LEAST_MEMORY_GB = 0.5  # a process that has loaded what trials need holds 0.2 GB
 
 @dataclass(frozen=True)
 class EngineOptions:
-    """``jobs``: processes, or workers that a cluster is asked for. ``scheduler``: address of one, or jobqueue:slurm and
-    the like; None: this machine. ``serial``: in this process."""
+    """``jobs``: processes, or workers of a cluster. ``scheduler`` None: this machine; ``serial``: this process."""
 
     jobs: int = 2
     limits: Limits = DEFAULT_LIMITS
@@ -268,8 +262,7 @@ class EngineOptions:
 
 
 def engine_of(options: EngineOptions, detectors: Iterable[str] = (), folder: Path = Path()) -> JobEngine:
-    """Return the engine, not yet begun, for trials of these ``detectors``; ``folder``: of renders. Raises UserError
-    where it is not installed or does not answer."""
+    """Return the engine, not yet begun, for trials of ``detectors``; ``folder``: of renders. Raises UserError."""
     from harness.engine.processes import LocalEngine, SerialEngine
 
     if options.serial:

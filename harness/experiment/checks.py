@@ -138,9 +138,8 @@ def _declared(config: AnyTargetConfig) -> TargetConfig:
 def _unseen(
     camera: CameraConfig, views: AnyViews | None, declared: AnyTargetConfig
 ) -> tuple[KeyPath, UserError] | None:
-    """Return why the camera does not see the target, and the key that this concerns: the camera cannot be made, finds
-    no albedo at its wavelength, or `_unseen_pose`; of a family of boards in the extreme poses that can be drawn, first
-    in a single view."""
+    """Return why the camera does not see the target, and the key that this concerns: no such camera, no albedo at its
+    wavelength, or `_unseen_pose`; of a family in the extreme poses that can be drawn, first in a single view."""
     target = _declared(declared)
     path: KeyPath = CAMERA_NUMBERS if camera.numbers else CAMERA_NAME
     try:

@@ -59,8 +59,7 @@ def load_experiment(path: Path, overrides: Sequence[str] = (), calibration: Path
 
 
 def _experiment_file(path: Path) -> Path:
-    """Return the file that a path or name means: ``averaging`` is the one that comes with tofpod where there is no file
-    of that name. Raises UserError for a name that is neither."""
+    """Return the file that a path means, or a name such as ``averaging`` that comes with tofpod. Raises UserError."""
     if path.exists() or path.name != str(path):
         return path
     own = shipped("experiments") / f"{path.name.removesuffix('.yaml')}.yaml"

@@ -173,12 +173,11 @@ class SensitivityConfig(Config):
 
 
 class StudyConfig(Config):
-    """A study of the probability of detection: the target is a family of boards, each one drawn at random. ``boards``
-    with damage, and ``hole_free_boards`` of their own on which false calls are counted. Every point of the experiment
-    is judged on the same boards; ``repeats`` of the experiment draw the noise anew on each.
+    """A study of the probability of detection on random boards: ``boards`` with damage, and ``hole_free_boards`` on
+    which false calls are counted; every point is judged on the same, and ``repeats`` draw the noise anew on each.
 
-    ``units`` draws units of the camera, each with a fixed pattern of its own: every damaged board is inspected by all
-    of them, every other board, those that set the threshold too, by a unit of its own."""
+    ``units`` draws cameras with patterns of their own: every damaged board is inspected by all, every other by its own.
+    """
 
     boards: Boards
     hole_free_boards: Boards
@@ -243,11 +242,10 @@ NO_NUMBERS = ("name", "title", "repeats", "study", "sweep", "draws", "switches",
 @dataclass(frozen=True)
 class Point:
     """A resolved experiment without axes. ``values``: dotted path -> value, for the paths that make the point.
-    ``variant`` is the label of its set-up ("main" where there is one only) or of a variation; ``label`` tells points
-    apart in tables. ``axes``: resolved value of every axis but the number of frames, which is what tells set-ups apart.
-    ``is_variation``: whether it belongs to the sensitivity study; ``reference`` is then the set-up to compare it with,
-    the one with the same ``axes`` (empty where none has them), else the point's own set-up. ``digest`` names the
-    point's numbers, ``frames_key`` those of its frames (source and seed), ``render_key`` those of its render."""
+    ``variant``: label of its set-up or variation; ``label`` tells points apart. ``axes``: resolved values of all axes
+    but the number of frames, which tell set-ups apart. ``reference``: of a variation the set-up with the same ``axes``
+    ("" for none), else the point's own. ``digest`` names the point's numbers, ``frames_key`` those of its frames
+    (source and seed), ``render_key`` those of its render."""
 
     label: str
     variant: str
@@ -314,8 +312,7 @@ def detector_version(config: ExperimentConfig) -> int:
 
 @lru_cache(maxsize=1000)
 def recording_of(source: CaptureSource) -> Recording:
-    """Open the recording behind a source, its first frame read and checked. Raises UserError for faults of its files.
-    ``intrinsics`` may name a camera, whose nominal lens then counts."""
+    """Open the recording behind a source, its first frame read and checked. Raises UserError for its files."""
     from detectors.recordings import open_capture  # brings the readers of every format
 
     name = source.intrinsics

@@ -1,7 +1,5 @@
-"""Dotted paths and ``--set path=value``; axes, switches and variations unfolded into points.
-
-Each point is validated, and problems stand at the value that causes them. Set-ups of an experiment differ in the axes
-other than the number of frames."""
+"""Dotted paths and ``--set path=value``; axes, switches and variations unfolded into points, each validated, with
+problems at the value that causes them. Set-ups differ in the axes other than the number of frames."""
 
 from __future__ import annotations
 
@@ -38,10 +36,9 @@ def key_path(text: str) -> KeyPath:
 
 
 def set_path(data: Any, path: KeyPath, value: Any, declared: shape.Declared | None = None, above: KeyPath = ()) -> Any:
-    """Return ``data`` with the value at ``path`` replaced or added; the argument itself stays unchanged. A mapping that
-    is missing on the way is filled with its declared defaults where ``declared`` is given, so that setting one key of
-    it leaves the others at what they would have been. Likewise a key that says which of several kinds a mapping is
-    (``merge.kind``) leaves out what only the former kind has. ``above`` is where ``data`` stands in the declared data.
+    """Return ``data`` with the value at ``path`` replaced or added; the argument stays unchanged. With ``declared``, a
+    mapping missing on the way is filled with its defaults, so that one key leaves the others as they would have been,
+    and a new kind of a mapping (``merge.kind``) leaves out what only the former has. ``above``: where ``data`` stands.
     Raises PathError where the way is barred."""
     if not path:
         return value
@@ -133,8 +130,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Draft:
-    """A point before its declaration is resolved. ``named_at``: its label in the file where it has one, else its last
-    value; ``frames``: a variation's own numbers of frames."""
+    """An unresolved point. ``named_at``: its label in the file, else its last value; ``frames``: a variation's."""
 
     label: str
     variant: str
@@ -145,8 +141,7 @@ class Draft:
 
 
 def unfolded(source: Source, config: ExperimentConfig | None) -> tuple[tuple[Point, ...], list[Problem]]:
-    """Return all points of an experiment in order, or all problems of its axes and variations. ``config`` is None where
-    the rest of the file is not valid: then axes are checked as far as they can be."""
+    """Return all points in order, or all problems of axes and variations. ``config`` None: the rest is wrong."""
     sweep = shape.child(source.data, "sweep")
     axes = [
         [Setting(path, value, ("sweep", path, index)) for index, value in enumerate(values)]

@@ -34,8 +34,7 @@ LEGAL_CROP = "auto, none, box:x0,x1,y0,y1,z0,z1 (mm, camera frame), polygon:u,v,
 
 
 def refuse_misfits(arguments: argparse.Namespace, paths: list[Path]) -> None:
-    """Raise UserError for arguments that contradict each other: those of several views for one capture, and those of
-    one capture for several views."""
+    """Raise UserError for arguments of several views with one capture, and the other way round."""
     several = f"--register {'|'.join(METHODS)}"
     if arguments.register is None:
         given = [name for name in ("merge", "marks", "poses") if getattr(arguments, name) is not None]
@@ -149,8 +148,7 @@ def assign(settings: dict[str, Any], assignment: str) -> None:
 
 
 def opened(paths: Sequence[Path], intrinsics: str | None, lens: Lens | None = None, **reading: Any) -> Recording:
-    """Open a capture; ``intrinsics`` names a file, or a camera, whose nominal lens then counts. ``reading``: the other
-    options of `detectors.recordings.open_capture`."""
+    """Open a capture. ``intrinsics``: a file or a camera; ``reading``: options of `open_capture`."""
     from detectors.recordings import open_capture
 
     file = None if intrinsics is None else Path(intrinsics)
@@ -176,16 +174,13 @@ LEGAL_POSES = (
 )
 RIGID_WITHIN = 1e-4  # tolerance of R R' = 1 and of the quaternion's length: poses are written with four digits and more
 FARTHEST_M = 100.0
-"""Largest distance of two views of one target: several times any such camera's range. Poses in millimetres lie beyond.
-"""
+"""Largest distance of two views of one target: poses in millimetres lie beyond."""
 
 
 def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
-    """Return ``T_first_view`` (4, 4) of each view, the first the identity, from poses to any common frame.
-
-    Raises UserError where the file cannot be read, is larger than `limits.TEXT_BYTES` or of a newer version, holds
-    another number of poses, one that is not rigid, or one farther than `FARTHEST_M` from the first.
-    """
+    """Return ``T_first_view`` (4, 4) of each view, the first the identity, from poses to any common frame. Raises
+    UserError where the file cannot be read or is a newer version's, has another number of poses, or one not rigid or
+    too far."""
     import numpy as np
 
     from harness.vocabulary.geometry import invert

@@ -86,8 +86,7 @@ def read_gauge(path: Path) -> Gauge:
 
 @dataclass(frozen=True)
 class GaugeRow:
-    """One hole of a board in a capture. ``found``: "hit", "miss", or "NA" where not all around it was judged;
-    ``offset_mm`` and ``score`` of the finding that hit it, None of others."""
+    """A hole in a capture. ``found`` "NA": not all around it was judged; ``offset_mm`` and ``score`` of the hit."""
 
     board: str
     hole: GaugeHole
@@ -136,8 +135,7 @@ class GaugeSeen:
 
 
 def seen_on(gauge: Gauge, judged: Judged) -> GaugeSeen:
-    """Find the boards in a judged capture by their marks, and match findings to their holes. Raises UserError where no
-    board shows three marks."""
+    """Find the boards in a judged capture by their marks, match findings to holes. Raises UserError without one."""
     from dataclasses import replace
 
     from detectors.marks.find import find_marks

@@ -44,8 +44,7 @@ if TYPE_CHECKING:
     from harness.vocabulary.geometry import Cloud
 
 DEFAULT_K = 5.0
-"""Robust standard deviations, where the capture cannot tell better: of a million normal pixels 0.6 lie beyond by
-chance. Real surfaces are not that kind."""
+"""Robust standard deviations, where the capture cannot tell better; of a million normal pixels 0.6 lie beyond."""
 FAINT_CALLS = 0.05
 """Expected false calls as strong as a finding, in the capture, from which on noise explains the finding."""
 FAINT_PEAKS = 20  # peaks below which their number does not tell how fast it falls with the score
@@ -161,16 +160,14 @@ def _calls(expected: float) -> str:
 
 
 START_FROM_MARKS = ("icp", "cpd")
-"""Methods that need a place to start from. `joint` finds its own by marks, `odometry` uses none and goes from view to
-view, `nominal` has nothing but the poses."""
+"""Methods that need a place to start from; `joint` finds its own, `odometry` goes from view to view."""
 LOOPING = ("marks", "icp", "cpd")
 """Methods that register any two views to each other by themselves, so that going round a loop can be wrong."""
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """Everything that a run knows when it is time to tell it. ``mapped`` is None for one capture; ``registrations``:
-    data of registrations.json."""
+    """What a run knows when it is told. ``mapped`` None: one capture; ``registrations``: data of registrations.json."""
 
     arguments: argparse.Namespace
     recordings: list[Recording]
@@ -193,10 +190,8 @@ class Inspection:
 
 
 def inspect(arguments: argparse.Namespace) -> int:
-    """Open, average, register and merge where there are several views, judge; print, and write with --out. Returns 0.
-
-    Raises UserError for faults of the files, where a view cannot be registered, and where nothing can be judged.
-    """
+    """Open, average, register and merge several views, judge; print, and write with --out. Returns 0. Raises UserError
+    for faults of the files, a view that cannot be registered, and where nothing can be judged."""
     from detectors.flat_field import doubts, load_flat_field
     from detectors.views import View
     from harness.inspection.gauge import read_gauge, seen_on
@@ -292,11 +287,8 @@ def _merged(
     views: Sequence[View],
     choices: Sequence[Choice | None],
 ) -> tuple[Mapped, dict[str, Any]]:
-    """Find targets and marks, which are told at once as they explain later failures, then register and merge. Returns
-    the data of registrations.json, too.
-
-    Raises UserError where a view has no target, or names each view that cannot be placed, and why.
-    """
+    """Find targets and marks, told at once as they explain later failures, then register and merge; return also the
+    data of registrations.json. Raises UserError where a view has no target, or for each view that cannot be placed."""
     from detectors.mapping.merge import Mapped, merge, prepare
     from detectors.registration.by_marks import register_by_marks
     from detectors.registration.register import register
@@ -434,8 +426,7 @@ def _print(run: Inspection) -> None:
 
 
 def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
-    """Return the facts that the JSON holds beside the findings, with command, code, versions, and the content of every
-    file that can change a number (those of ``recordings``, and the poses)."""
+    """Return the facts that the JSON holds beside the findings, with the origin and digests of all files read."""
     from harness.vocabulary.provenance import record
 
     evidence, arguments = run.result.evidence, run.arguments

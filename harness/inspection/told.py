@@ -96,8 +96,7 @@ def capture_facts(recording: Recording, cloud: Cloud) -> dict[str, Any]:
 
 
 def choice_by(settings: object, cloud: Cloud) -> Choice | None:
-    """Return the choice of the automatic crop among a detector's or a mapping's settings; None where they have another
-    crop, or none. Raises UserError as the crop does."""
+    """Return the automatic crop's choice by settings; None with another crop. Raises UserError as the crop does."""
     from detectors.crop import AutoCrop, choice_of
 
     config = getattr(settings, "crop", None)
@@ -205,8 +204,7 @@ def print_findings(findings: Sequence[Finding], grid: str = "px") -> None:
 
 
 def scene_of(mapped: Mapped, judged: Judged) -> Scene3d:
-    """Return the valid points of the merged cloud in its own frame (x right, y down, z away), millimetres, with a ring
-    around each finding of known size."""
+    """Return the merged cloud's valid points (x right, y down, z away, mm), with a ring around each finding."""
     cloud, merged = judged.cloud, mapped.merged
     valid = cloud.valid.reshape(-1)
     detected = np.zeros(valid.size, bool)

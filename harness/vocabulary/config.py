@@ -21,8 +21,7 @@ class Config(BaseModel):
 
     @classmethod
     def from_data(cls, data: Any) -> Self:
-        """Validate plain data (dicts, lists, numbers, text: what YAML and JSON hold). Raises pydantic.ValidationError,
-        whose ``loc`` paths match the data's."""
+        """Validate plain data. Raises pydantic.ValidationError, whose ``loc`` are the data's paths."""
         return cls.model_validate(data)
 
     def to_data(self) -> dict[str, Any]:

@@ -87,8 +87,7 @@ UNDISTORT_STEPS = 200  # Fixed-point steps of the inversion: the Azure Kinect's 
 
 
 SAME_SLOPE = 1e-3
-"""Rays closer than this, in slope, are the same: beyond the angle at which a lens' distortion turns back they differ
-by more."""
+"""Rays closer than this, in slope, are the same: where a lens' distortion turns back they differ by more."""
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,7 @@ LONGEST = 60  # Characters of a value that a table can show
 
 
 def names_of(paths: Iterable[str]) -> dict[str, str]:
-    """Return a name for each path, without its unit: the last key (of ``camera.name`` and the like the key before); the
-    whole path where that would be the same for two."""
+    """Return a name for each path, without unit: its last key that says something; the path if it is not unique."""
     short = {path: _split(path)[0] for path in paths}
     return {path: name if list(short.values()).count(name) == 1 else path for path, name in short.items()}
 
@@ -47,8 +46,7 @@ def value_text(path: str, value: Any) -> str:
 
 @cache
 def camera_title(name: str) -> str:
-    """Return the title in the file of a camera that comes with tofpod, without commas; of any other name its words, and
-    of a file's path those of its name."""
+    """Return the title of a camera of tofpod without commas; of any other name or path its words."""
     if re.fullmatch(r"\w+", name):
         file = resources.files("scenes") / "cameras" / f"{name}.yaml"
         told = re.search(r"^title: (.+)$", file.read_text(encoding="utf-8"), re.MULTILINE) if file.is_file() else None

@@ -18,8 +18,7 @@ OWN = "tofpod"  # The package that the built-in ones come from, as it is told
 
 @dataclass(frozen=True)
 class Offer:
-    """One name and what stands behind it: ``target`` is ``module:attribute`` (of a built-in also a file), ``package``
-    and ``package_version`` where it comes from."""
+    """A name, its ``target`` (``module:attribute``, of a built-in also a file), and the package it is from."""
 
     name: str
     target: str
@@ -74,8 +73,7 @@ class PlugIns:
         return found[0]
 
     def load(self, offer: Offer) -> Any:
-        """The attribute behind an offer. Raises UserError, with its package, where a plug-in cannot be imported; what
-        is wrong with a built-in one is a bug and keeps its traceback."""
+        """The attribute behind an offer. Raises UserError where a plug-in fails; a built-in one is a bug."""
         module, _, attribute = offer.target.partition("[")[0].strip().partition(":")
         try:
             found: Any = importlib.import_module(module)

@@ -105,8 +105,7 @@ def _kinds(models: tuple[type[BaseModel], ...]) -> tuple[str, Mapping[str, type[
 
 
 def model_for(slot: Slot | None, data: Any) -> type[BaseModel] | None:
-    """Return the model that a mapping is meant to fill: by its kind, else by most keys in common, which decide too
-    where the kind is not legal, a problem of its own."""
+    """Return the model that a mapping is meant to fill: by its kind, else by most keys in common."""
     kinds, given = kinds_of(slot), data if isinstance(data, Mapping) else {}
     if kinds and str(given.get(kinds[0])) in kinds[1]:
         return kinds[1][str(given[kinds[0]])]
@@ -203,8 +202,7 @@ def _words(kind: Any, limits: Mapping[str, Any]) -> str:
 
 
 def every_key(model: type[BaseModel], before: str = "") -> Iterator[tuple[str, Slot]]:
-    """Yield every key below a model with its place: items of a list as ``key[]``, models of several kinds as
-    ``key[kind=name]``."""
+    """Yield every key below a model with its place: items as ``key[]``, kinds as ``key[kind=name]``."""
     for name, field in model.model_fields.items():
         path, slot = f"{before}{name}", slot_of(field.annotation, field)
         yield path, slot

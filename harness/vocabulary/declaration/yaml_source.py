@@ -1,8 +1,7 @@
 """YAML 1.2 as plain data that remembers the place of every key and value; problems are shown there, all at once.
 
-The parser is ruamel.yaml's; only its node tree is used, so that no tag can build an object, every duplicate key is
-seen, and places come from the nodes. Not supported on purpose: merge keys (``<<``, no part of YAML 1.2), tags, several
-documents, keys that are no text."""
+Only ruamel.yaml's node tree is used, so that no tag can build an object and every duplicate key is seen. Not supported
+on purpose: merge keys (``<<``, no part of YAML 1.2), tags, several documents, keys that are no text."""
 
 from __future__ import annotations
 
@@ -111,8 +110,7 @@ _OTHER_VERSION = re.compile(r"^%YAML[ \t]+(?!1\.2\b).*", re.MULTILINE)
 
 @dataclass(frozen=True)
 class Source:
-    """Plain data (dicts, lists, text, numbers, booleans, None) and the place of everything in it. ``values`` and
-    ``keys`` map a `KeyPath` to the place of the value, respectively of its key."""
+    """Plain data with the places of all values and ``keys``, by `KeyPath`."""
 
     origin: str
     text: str
