@@ -51,16 +51,15 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.evaluation.atlas import surfaces_of
     from harness.tables.atlas import ATLAS, curves
     from harness.tables.schema import write_table
+    from scenes.sensor.camera import load_camera
 
     asked = sum(given is not None for given in (options.size, options.distance))
     if asked == 1 or (not asked and options.out is None):
-        raise UserError(
-            "a question needs --size and --distance",
-            legal="--damage hole --size 5mm --distance 1m, or --out DIR for the whole atlas",
-        )
+        legal = "--damage hole --size 5mm --distance 1m, or --out DIR for the whole atlas"
+        raise UserError("a question needs --size and --distance", legal=legal)
     limits, about = _read(options.atlas or shipped("baselines") / STORED)
     surfaces = surfaces_of(limits)
-    titles = _titles(surfaces)
+    titles = {name: load_camera(name).title for name in dict.fromkeys(surface.camera for surface in surfaces)}
     if asked:
         _answer(options, surfaces, titles, about)
     if options.out is not None:
@@ -95,13 +94,6 @@ def _read(path: Path) -> tuple[Any, dict[str, Any]]:
     if missing := [name for name in needed if name not in table.column_names]:
         raise UserError(f"{file}: it lacks the columns {', '.join(missing)}", legal=legal)
     return table.to_pandas(), json.loads((table.schema.metadata or {}).get(b"tofpod", b"{}"))
-
-
-def _titles(surfaces: Sequence[LimitSurface]) -> dict[str, str]:
-    """Return the cameras' titles by their names."""
-    from scenes.sensor.camera import load_camera
-
-    return {name: load_camera(name).title for name in dict.fromkeys(surface.camera for surface in surfaces)}
 
 
 def _warnings(cameras: Iterable[str]) -> list[str]:
@@ -155,12 +147,10 @@ def _answer(options: argparse.Namespace, surfaces: Sequence[LimitSurface], title
         f"{verdicts.count('yes')} of {many(len(rows), 'set-up')}" + (f" ({said})." if said else ".")
     )
     errors = [row.surface.error for row in rows if np.isfinite(row.surface.error)]
-    missed = (
-        f"; the surfaces miss set-ups left out by {100 * max(errors):.0f} % of a90 at the most (rms)" if errors else ""
-    )
+    left_out = f"the surfaces miss set-ups left out by {100 * max(errors, default=0):.0f} % of a90 at the most (rms)"
+    missed = f"; {left_out}" if errors else ""
     notes = [
-        f"Simulated: one unit of each camera under the conditions of {about.get('experiment', 'the study')}.yaml"
-        f"{missed}.",
+        f"Simulated: one unit of each camera, conditions of {about.get('experiment', 'the study')}.yaml{missed}.",
         *(f"not answered: {reason}" for reason in refused),
     ]
     show([answer, ATLAS.grid(rows, terminal=True), *notes, f"computed exactly: {_exactly(rows[0], about)}"])
@@ -199,11 +189,8 @@ def _exactly(row: Any, about: dict[str, Any]) -> str:
     """Return the command that computes one set-up of the answer by a study of its own."""
     from harness.evaluation import atlas
 
-    axes = {
-        atlas.CAMERA: row.surface.camera,
-        **{atlas.AXES[axis]: row.place[axis] for axis in ("distance_m", "frames")},
-    }
-    axes["capture.frames"] = int(axes.pop("frames"))
+    axes: dict[str, Any] = {atlas.CAMERA: row.surface.camera, "capture.frames": int(row.place["frames"])}
+    axes[atlas.AXES["distance_m"]] = row.place["distance_m"]
     parts = [f"tofpod sweep {about.get('experiment', 'atlas')}"]
     depth = row.place.get("depth_mm")
     if depth is not None or row.surface.kind != "through":

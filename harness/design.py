@@ -13,15 +13,12 @@ from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
     from harness.evaluation.pod.curve import PodCurve
-    from harness.report.design import StudyDesign
 
 LINKS = ("logit", "probit", "cloglog", "loglog")
 FILES = ("design.json", "design.png", "design.html")
 TARGETS = (30, 40, 60, 120)
 MOST_STUDIES = 100_000  # Simulated studies are kept in memory
 LEAST, MOST = 10, 10_000  # Targets of a study: as many rows as python -m harness.pod asks for; nobody makes more
-FURTHEST = 2.0  # Times the largest size inspected: a90 beyond it is no plan's guess
-LEAST_SHARE = 0.1  # Share of a50 for the smallest size: a curve against the size itself may begin to rise below 0
 OWNERS = {"set_up": "study", "board_m2": "false_calls_per_m2"}  # Options that mean nothing without another
 
 
@@ -68,7 +65,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0 (also where no plan shows a limit), 2 on a mistake of the user, 130 after Ctrl-C."""
     import json
 
-    from harness.report.design import design_data, design_html, design_parts, save_design_png
+    from harness.evaluation.pod import design as plan
+    from harness.report.design import StudyDesign, design_data, design_html, design_parts, save_design_png
     from harness.tables.text import show
     from harness.vocabulary.files import write_text
     from harness.vocabulary.provenance import RESULTS_VERSION
@@ -76,7 +74,13 @@ def main(options: argparse.Namespace, command: str) -> int:
     _refuse_what_does_not_belong(options)
     guess = _guess(options)
     _check(options, guess)
-    design = _designed(options, guess)
+    unit, wanted = "mm" if options.unit is None else options.unit, options.false_calls_per_m2
+    area_m2 = guess.board_m2 if options.board_m2 is None else options.board_m2
+    # its mistakes come before the simulation's minute; `_check` has asked for the area
+    free = plan.hole_free(wanted, area_m2 or 0.0) if wanted is not None else None
+    plans = plan.design(guess.curve, sorted(set(options.targets)), guess.sizes, studies=options.studies, seed=1)
+    found = (plans, plan.recommend(plans, options.goal), options.goal, free)
+    design = StudyDesign(guess.curve, guess.origin, unit, guess.sizes, *found)
     show(design_parts(design))
     if options.out is not None:
         data, picture, page = (options.out / name for name in FILES)
@@ -105,7 +109,7 @@ def _refuse_what_does_not_belong(options: argparse.Namespace) -> None:
 
 def _guess(options: argparse.Namespace) -> GuessedCurve:
     """Return the curve that was told, or a study's, with the sizes that were told or inspected."""
-    from harness.evaluation.pod.design import RISE, curve_through
+    from harness.evaluation.pod.design import curve_through
     from harness.evaluation.study.limit import limit_of
     from harness.evaluation.study.record import read_record, set_up_named
 
@@ -120,22 +124,8 @@ def _guess(options: argparse.Namespace) -> GuessedCurve:
         raise UserError(f"{options.study}: {record.label} has no curve to guess from: {limit.why}", fix=fix)
     curve, origin = limit.statement.curve, f"fitted to {study.name}, {record.label}"
     seen, boards = record.inspected.size_mm, record.unflawed.area_m2
-    low, high = inspected = float(seen.min()), float(seen.max())
-    if options.sizes is not None:
-        low, high = options.sizes
-    else:
-        a50, a90 = curve.size_at(0.5), curve.size_at(0.9)
-        if not a50 > 0 or a90 > FURTHEST * high:
-            said = f"the curve {origin} has a50 = {a50:.4g} and a90 = {a90:.4g} mm; the study inspected {low:.4g} to"
-            fix = "run the study with damage of other sizes, or tell a guess: --a50 SIZE --a90 SIZE --sizes FROM TO"
-            raise UserError(f"{said} {high:.4g} mm: it says too little about the rise of the curve", fix=fix)
-        if not low < a50:
-            low = max(curve.size_at(RISE[0]), LEAST_SHARE * a50)
-        if not a90 < high:
-            high = min(max(high, curve.size_at(RISE[1])), FURTHEST * high)
-        if (low, high) != inspected:
-            origin += f"; sizes beyond the {inspected[0]:.4g} to {inspected[1]:.4g} mm that it inspected"
-    return GuessedCurve(curve, origin, (low, high), float(boards.mean()) if len(boards) else None)
+    sizes = options.sizes or (float(seen.min()), float(seen.max()))
+    return GuessedCurve(curve, origin, tuple(sizes), float(boards.mean()) if len(boards) else None)
 
 
 def _check(options: argparse.Namespace, guess: GuessedCurve) -> None:
@@ -145,7 +135,11 @@ def _check(options: argparse.Namespace, guess: GuessedCurve) -> None:
     # NaN compares false with everything, so every rule is written as what has to hold.
     rules = (
         (0 <= low < high < float("inf"), f"--sizes {low:g} {high:g}", "0 <= FROM < TO"),
-        (low < a50 < high, f"--sizes {low:g} {high:g} do not hold a50 = {a50:.4g}", f"FROM < {a50:.4g} < TO"),
+        (
+            low < a50 < high,
+            f"sizes of {low:g} to {high:g} do not hold a50 = {a50:.4g}",
+            f"--sizes FROM < {a50:.4g} < TO",
+        ),
         (not guess.curve.log_size or low > 0, "--sizes from 0 under a logarithm", "FROM above 0"),
         (wrong is None, f"--targets {wrong}", f"{LEAST} to {MOST}; MIL-HDBK-1823A asks for 60 at least"),
         (LEAST <= options.studies <= MOST_STUDIES, f"--studies {options.studies}", f"{LEAST} to {MOST_STUDIES}"),
@@ -160,20 +154,6 @@ def _check(options: argparse.Namespace, guess: GuessedCurve) -> None:
         raise UserError(said, legal=f"more than {a90:.4g}", fix=fix)
     if options.false_calls_per_m2 is not None and options.board_m2 is None and guess.board_m2 is None:
         raise UserError("--false-calls-per-m2 needs --board-m2: boards of which face?", legal="square metres")
-
-
-def _designed(options: argparse.Namespace, guess: GuessedCurve) -> StudyDesign:
-    from harness.evaluation.pod import design as plan
-    from harness.report.design import StudyDesign
-
-    area = guess.board_m2 if options.board_m2 is None else options.board_m2
-    wanted = options.false_calls_per_m2
-    # its mistakes come before the simulation's minute; `_check` has asked for the area
-    free = plan.hole_free(wanted, area or 0.0) if wanted is not None else None
-    plans = plan.design(guess.curve, sorted(set(options.targets)), guess.sizes, studies=options.studies, seed=1)
-    recommended = plan.recommend(plans, options.goal)
-    unit, found = "mm" if options.unit is None else options.unit, (plans, recommended, options.goal, free)
-    return StudyDesign(guess.curve, guess.origin, unit, guess.sizes, *found)
 
 
 def _flag(name: str) -> str:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import numpy as np
     from matplotlib.figure import Figure
 
-    from detectors.flat_captures import FlatCapture, Separated
+    from detectors.flat_captures import FlatCapture
     from detectors.recordings import Recording
     from harness.vocabulary.geometry import Lens
 
@@ -51,7 +51,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0 (also where the pattern is not stable), 2 on a mistake of the user, 130 after Ctrl-C."""
     from detectors.flat_captures import separated
     from detectors.flat_field import save_flat_field
-    from harness.inspection.told import print_warnings
+    from harness.inspection.told import mm, print_warnings
     from harness.report.blocks import save_png
     from harness.report.findings import plain_json
     from harness.tables.flat_field import FLAT_CAPTURES, FLAT_FIGURES, figures_of
@@ -63,7 +63,10 @@ def main(options: argparse.Namespace, command: str) -> int:
         raise UserError(f"--out {options.out}: is no name of a flat field", legal="a name that ends in .npz")
     lens, captures = _captures(options)
     found = separated(captures, lens)
-    answer, figures, error_m = _answer(found), list(figures_of(found)), found.field.error_m
+    near, far = found.field.distances_m
+    at = f"{near:.2f} m" if far < near * 1.01 else f"{near:.2f} to {far:.2f} m"
+    answer = f"fixed pattern {mm(found.field.rms_m)} rms at {at}, known to {mm(found.noise_m)}"
+    figures, error_m = list(figures_of(found)), found.field.error_m
     print_warnings(found.field.warnings)
     print(answer)
     show([FLAT_CAPTURES.grid(captures, terminal=True), FLAT_FIGURES.grid(figures, terminal=True)])
@@ -88,14 +91,6 @@ def _draw(figure: Figure, error_m: np.ndarray, title: str) -> None:
     axes.grid(visible=False)
     figure.colorbar(shown, ax=axes, extend="both").set_label("error of range, mm")
     figure.suptitle(title, fontsize=10, parse_math=False)
-
-
-def _answer(found: Separated) -> str:
-    from harness.inspection.told import mm
-
-    near, far = found.field.distances_m
-    at = f"{near:.2f} m" if far < near * 1.01 else f"{near:.2f} to {far:.2f} m"
-    return f"fixed pattern {mm(found.field.rms_m)} rms at {at}, known to {mm(found.noise_m)}"
 
 
 def _captures(options: argparse.Namespace) -> tuple[Lens, list[FlatCapture]]:

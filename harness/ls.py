@@ -32,7 +32,12 @@ def _options(parser: argparse.ArgumentParser) -> None:
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0 (also where something listed is broken), 2 on a mistake of the user."""
-    lists = {"results": _list_results, "cache": _list_cache, "keys": _list_keys}
+    if options.what == "keys":
+        from harness.listing import reference
+
+        print(reference())
+        return 0
+    lists = {"results": _list_results, "cache": _list_cache}
     return lists.get(options.what, _list_offers)(options)
 
 
@@ -98,13 +103,6 @@ def _list_results(options: argparse.Namespace) -> int:
         for run, line in zip(shown, Grid.of(("run", "date", "size", "state"), rows, left=4).lines()[1:], strict=True):
             said = (limit_text(run["limits"]), differs_text(run["differs"]))
             print("\n".join([f"    {line}", *(f"      {text}" for text in said if text)]))
-    return 0
-
-
-def _list_keys(options: argparse.Namespace) -> int:
-    from harness.listing import reference
-
-    print(reference())
     return 0
 
 

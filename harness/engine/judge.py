@@ -80,7 +80,7 @@ def judge(
     if threshold is None:
         return JudgedCloud(run, [], detector, evidence)
     detections = detector.find(cloud, evidence, threshold)
-    places_m = _places_of(known, detections)
+    places_m = known.on_board(np.array([one.centre_m for one in detections]).reshape(-1, 3))
     pairs, parts = matched(known, detections, radius_m, overlap)
     of_damage = 0 if hole_free else len(pairs) + parts
     run |= {"detections": len(detections), "false_calls": len(detections) - of_damage}
@@ -177,11 +177,6 @@ def detector_for(
         for damage in known.truth
     )
     return detector.told(() if hole_free else tuple(truth))
-
-
-def _places_of(known: KnownCloud, detections: Sequence[Detection]) -> np.ndarray:
-    """(m, 2) places of findings on the face."""
-    return known.on_board(np.array([one.centre_m for one in detections]).reshape(-1, 3))
 
 
 def _place(damage: Damage) -> dict[str, Any]:

@@ -7,14 +7,11 @@ from __future__ import annotations
 
 import base64
 import io
-import json
 from dataclasses import replace
-from functools import lru_cache
 from typing import cast
 
 import numpy as np
 
-from detectors import load_detector
 from detectors.interface import Calibratable
 from harness.engine.judge import Rows, detector_of
 from harness.engine.trial import TrialTask, cloud_of
@@ -27,12 +24,7 @@ some 200,000 pixels of a board at 0.7 m, so that a spectrum is known to a few pe
 
 def learns(detector: str, settings: dict[str, object]) -> bool:
     """Return whether a detector can learn."""
-    return _learns(detector, canonical_json(settings))
-
-
-@lru_cache(maxsize=1000)
-def _learns(detector: str, settings_json: str) -> bool:
-    return isinstance(load_detector(detector, json.loads(settings_json)), Calibratable)
+    return isinstance(detector_of(detector, canonical_json(settings)), Calibratable)
 
 
 def learn(task: TrialTask) -> Rows:

@@ -178,14 +178,13 @@ class Group:
             task.board,
             task.repeat,
             [ref.camera.unit_seed for ref in task.set_ups],
-            [[point.digest, point.variant, point.threshold, _name(point.learned)] for point in task.points],
+            [
+                [point.digest, point.variant, point.threshold, point.learned and Path(point.learned).name]
+                for point in task.points
+            ],
         ]
         number = task.repeat if task.board is None else task.board
         return f"{task.role}-{number:05d}-{digest(content)}"
-
-
-def _name(path: str | None) -> str | None:
-    return None if path is None else Path(path).name
 
 
 def point_task(point: Point, threshold: float | None, learned: str | None) -> PointTask:

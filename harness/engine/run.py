@@ -288,9 +288,14 @@ class _Run:
                 if not to_open or self._ahead >= AHEAD:
                     break
                 self._open(to_open.popleft())
-            while self._engine.room("renders") > 0 and (path := self._next_render(prefetch=not to_open)) is not None:
-                self.under_way[path.name] = self._renders[path]
-                self._engine.submit(_render_job(self._renders[path]))
+            while self._engine.room("renders") > 0:
+                while self._later and not to_open and not self._wanted:  # what is wanted later is rendered meanwhile
+                    self._want(self._later.popleft())
+                if not self._wanted:
+                    break
+                render = self._renders[self._wanted.popleft()]
+                self.under_way[render.path.name] = render
+                self._engine.submit(_render_job(render))
             while self._engine.room("trials") > 0 and self._queue:
                 self._begin(self._queue.popleft())
             self.step()
@@ -346,11 +351,6 @@ class _Run:
             made = self._groups[number].trials(part.batch, None, part.repeats)
             self._skip([_Trial(part, *keyed) for keyed in made], f"no threshold: {failures[0].in_short}")
         return judged if thresholds else []
-
-    def _next_render(self, *, prefetch: bool) -> Path | None:
-        while self._later and prefetch and not self._wanted:
-            self._want(self._later.popleft())
-        return self._wanted.popleft() if self._wanted else None
 
     def _want(self, path: Path) -> None:
         if path not in self._asked:

@@ -68,6 +68,11 @@ class SetUp:
         return np.where((over & np.isfinite(z))[..., None], met, np.nan)
 
     @property
+    def light_bytes(self) -> int:
+        """Bytes of its view's light."""
+        return self.unit.view.phasor.nbytes
+
+    @property
     def board_xy_m(self) -> np.ndarray:
         """(h, w, 2): the same, along the face in plan."""
         return self.on_face_m[..., :2]
@@ -169,25 +174,18 @@ _kept: OrderedDict[SetUpRef, SetUp] = OrderedDict()
 def load_set_up(ref: SetUpRef) -> SetUp:
     """Return the set-up behind a reference, kept for the worker's next trials within ``KEPT`` and ``KEPT_BYTES``."""
     if ref not in _kept:
-        _kept[ref] = _read_set_up(ref)
+        T_camera_board, view = ref.target.pose.T_camera_board, read_view(Path(ref.view_path))
+        if view is None:
+            said = f"{ref.view_path}: the stored render is missing or damaged"
+            raise UserError(said, fix="run the same command again")
+        unit, truth = SimulatedUnit(camera_of(ref.camera), ref.camera, view), truth_of(ref.target, T_camera_board)
+        in_view = unit.camera.images(np.array([damage.centre_camera_m for damage in truth]).reshape(-1, 3))
+        seen = tuple(damage for damage, there in zip(truth, in_view, strict=True) if there)
+        _kept[ref] = SetUp(unit, ref.damaged, seen, ref.target, T_camera_board)
     _kept.move_to_end(ref)
-    while len(_kept) > KEPT or (
-        len(_kept) > 1 and sum(kept.unit.view.phasor.nbytes for kept in _kept.values()) > KEPT_BYTES
-    ):
+    while len(_kept) > 1 and (len(_kept) > KEPT or sum(kept.light_bytes for kept in _kept.values()) > KEPT_BYTES):
         _kept.popitem(last=False)
     return _kept[ref]
-
-
-def _read_set_up(ref: SetUpRef) -> SetUp:
-    place, T_camera_board = Path(ref.view_path), ref.target.pose.T_camera_board
-    view = read_view(place)
-    if view is None:
-        raise UserError(f"{place}: the stored render is missing or damaged", fix="run the same command again")
-    unit = SimulatedUnit(camera_of(ref.camera), ref.camera, view)
-    truth = truth_of(ref.target, T_camera_board)
-    in_view = unit.camera.images(np.array([damage.centre_camera_m for damage in truth]).reshape(-1, 3))
-    seen = tuple(damage for damage, there in zip(truth, in_view, strict=True) if there)
-    return SetUp(unit, ref.damaged, seen, ref.target, T_camera_board)
 
 
 @dataclass(frozen=True)

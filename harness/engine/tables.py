@@ -152,12 +152,9 @@ def _variants(experiment: Experiment) -> pd.DataFrame:
     for path in paths:
         numbers = table[path].map(lambda v: isinstance(v, int | float) and not isinstance(v, bool))
         # a column of Parquet has one type
-        table[path] = table[path].astype(float) if numbers.all() else table[path].map(_text)
+        texts = table[path].map(lambda value: value if isinstance(value, str) else json.dumps(value, sort_keys=True))
+        table[path] = table[path].astype(float) if numbers.all() else texts
     return table
-
-
-def _text(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value, sort_keys=True)
 
 
 def _reason(experiment: Experiment, point: Point) -> str:
