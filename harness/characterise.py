@@ -26,9 +26,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--albedo", type=float, default=0.6, help="albedo that the surfaces are taken to have (default: 0.6)")
     add("--rate", type=float, metavar="FPS", help="frames per second (default: of --like, or 30)")
     add("--title", default="my camera", help="the camera's and the unit's name on page and certificate")
-    add(
-        "--certificate", action="store_true", help="write two pages to file or to send, certificate.html and .json, too"
-    )
+    add("--certificate", action="store_true", help="write two pages to send, certificate.html and .json, too")
     study = "results of harness.sweep with a study, or of harness.implant, whose limits the certificate quotes"
     add("--study", type=Path, metavar="DIR", help=study)
     about = "what the certificate says of the unit, such as serial=1234, firmware=1.6, warm-up='40 minutes'; repeat it"

@@ -31,10 +31,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--unit", help="unit of the stored distances: mm, m, cm, um, tum (5000/m) or N/m")
     add("--intrinsics", metavar="FILE|CAMERA", help="the lens: a file, or a camera's nominal lens by name")
     add("--crop", default="auto", metavar="KIND", help="the part that shows the wall, as for harness.detect")
-    poses = (
-        "where the camera stood, as for harness.detect: the surface's own shape is then parted from the pattern"
-        " by least squares; without, it counts as noise"
-    )
+    poses = "where the camera stood, as for harness.detect: the surface's own shape then counts as no noise"
     add("--poses", type=Path, metavar="FILE", help=poses)
 
 
@@ -111,9 +108,8 @@ def _captures(options: argparse.Namespace) -> tuple[Lens, list[FlatCapture]]:
         if recording.lens is None:
             raise UserError(f"{path}: the lens is not known", fix="name a file or a camera with --intrinsics")
         if recording.lens != first.lens:
-            raise UserError(
-                f"{path}: is of another lens than {options.paths[0]}", legal="captures of one unit and mode"
-            )
+            said = f"{path}: is of another lens than {options.paths[0]}"
+            raise UserError(said, legal="captures of one unit and mode")
     found = []
     for recording, pose in zip(recordings, poses, strict=True):
         for part in _halves(recording) if len(recordings) == 1 else (recording,):

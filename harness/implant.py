@@ -40,9 +40,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--frames", type=int, nargs="+", metavar="N", help="frames to average (default: 1 and all)")
     add("--targets", type=int, default=60, metavar="N", help="damages in all (default: 60, as MIL-HDBK-1823A asks)")
     add("--hit-radius", type=float, default=15.0, metavar="MM", help="a finding this near is a hit (default: 15)")
-    add(
-        "--apart", type=float, metavar="MM", help="least distance of two damages (default: hit radius times 2, plus 10)"
-    )
+    add("--apart", type=float, metavar="MM", help="least distance of damages (default: hit radius times 2, plus 10)")
     add("--seed", type=int, default=1, help="of places, sizes and noise (default: 1)")
     calls = f"expected in a capture, which sets the threshold as harness.detect does (default: {DEFAULT_FALSE_CALLS:g})"
     add("--false-calls", type=float, metavar="N", help=calls)

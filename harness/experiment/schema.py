@@ -78,12 +78,10 @@ class CaptureConfig(Config):
     frames: Frames
     average: AverageConfig = AverageConfig()
     flat_field: FlatFieldConfig | None = Field(
-        None,
-        description="a plane that the unit is shown first: the pattern found there is taken off",
+        None, description="a plane that the unit is shown first: the pattern found there is taken off"
     )
     exact: bool = Field(
-        False,
-        description="draw each simulated frame; false: a mean is drawn at once where that is equal in distribution",
+        False, description="draw each simulated frame; false: a mean at once where that is equal in distribution"
     )
 
 

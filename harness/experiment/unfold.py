@@ -233,12 +233,10 @@ def _variation_problems(variations: list[Draft], axes: list[list[Setting]], sour
     # variations at a number of frames that the main experiment does not have could be compared with nothing
     main = [setting.value for axis in axes for setting in axis if setting.path == FRAMES]
     main = main or [shape.get(source.data, ("capture", "frames"))]
-    written = _frame_settings(shape.get(source.data, ("sensitivity", "frames")), ("sensitivity", "frames"))
-    for setting in written:
+    at = ("sensitivity", "frames")
+    for setting in _frame_settings(shape.get(source.data, at), at):
         if setting.value not in main:
-            message = (
-                f"{setting.value} frames are not run in the main experiment, so that there is nothing to compare with"
-            )
+            message = f"{setting.value} frames are not run in the main experiment: there is nothing to compare with"
             yield Problem(message, source.place_of(setting.written_at), "of " + ", ".join(map(str, main)))
 
 
@@ -278,14 +276,11 @@ def _drafts(
     axes: list[list[Setting]], telling: list[str], variations: list[Draft], config: ExperimentConfig
 ) -> Iterator[Draft]:
     """Yield the product of the axes, the last one fastest; then every variation at every number of frames."""
-    names = names_of(telling)
-    told = {
-        id(one): one.name
-        or f"{names[one.path]}={value_text(one.path, differing(one.value, (other.value for other in axis)))}"
-        for axis in axes
-        for one in axis
-        if one.path in telling
-    }
+    names, told = names_of(telling), dict[int, str]()
+    for axis in axes:
+        for one in axis if axis[0].path in telling else ():
+            value = value_text(one.path, differing(one.value, (other.value for other in axis)))
+            told[id(one)] = one.name or f"{names[one.path]}={value}"
     chosen = list(product(*axes))
     if config.draws is not None:
         groups: dict[str, list[tuple[Setting, ...]]] = {}
