@@ -45,18 +45,17 @@ def _options(parser: argparse.ArgumentParser) -> None:
 def main(arguments: argparse.Namespace, command: str) -> int:
     """Returns its exit code (0, 2 for the user's mistake, 130 for Ctrl-C)."""
     from harness.engine.plan import batch_of
-    from harness.engine.setup import load_set_up
-    from harness.engine.trial import TrialTask, capture_of
     from harness.exchange import in_turn, write_bag, write_tum
     from harness.experiment.load import load_experiment
     from harness.vocabulary.files import atomic_folder
     from scenes.render.cache import cached_view
     from scenes.sensor.camera import camera_of
+    from scenes.sensor.source import SimulatedUnit
 
     experiment = load_experiment(arguments.experiment, arguments.overrides)
     source, seed = experiment.config.simulated, experiment.config.seed
     role: Role = "hole_free" if arguments.hole_free else "damaged"
-    cache = arguments.results / ".cache" / "renders"
+    camera, cache = camera_of(source.camera), arguments.results / ".cache" / "renders"
     batch = batch_of(source.target.declare(), role, source, cache)
     count = len(batch.renders) if arguments.views is None else arguments.views
     if count > len(batch.renders):
@@ -64,13 +63,13 @@ def main(arguments: argparse.Namespace, command: str) -> int:
         raise UserError(f"--views {count}: the experiment has {len(batch.renders)}", legal=legal)
     frames, captures = arguments.frames or experiment.config.capture.frames, []
     with atomic_folder(arguments.out) as folder:
-        for number, (job, ref) in enumerate(zip(batch.renders[:count], batch.set_ups, strict=False)):
-            view, found = cached_view(job.target, camera_of(job.camera).optics, job.config, cache)
+        for number, job in enumerate(batch.renders[:count]):
+            view, found = cached_view(job.target, camera.optics, job.config, cache)
             print(f"view {number}: {'render from the cache' if found else f'rendered in {view.seconds:.1f} s'}")
-            task = TrialTask(batch.set_ups, seed, role, REPEAT, ())
-            captures.append(capture_of(load_set_up(ref), number, task, frames))
+            unit, labels = SimulatedUnit(camera, job.camera, view), ("view", number) if number else ()
+            captures.append(unit.capture(frames, seed, role, REPEAT, *labels))
         targets = [job.target for job in batch.renders[:count]]
-        rate = camera_of(source.camera).unit.frames_per_second.value
+        rate = camera.unit.frames_per_second.value
         views = in_turn(captures, [each.pose.T_camera_board for each in targets], frames, rate)
         if arguments.format == "tum":
             write_tum(folder, views)

@@ -238,7 +238,7 @@ def test_a_study_whose_sizes_do_not_hold_the_curve_is_refused(
     record = study_record(Study((SetUp(a50_mm=3.0, width_mm=1.5),), boards=30, sizes_mm=(4.0, 14.0)))
     (tmp_path / "study.json").write_text(record_text(record))
     assert main(["--study", str(tmp_path)]) == 2
-    assert "sizes of 4 to 14 mm do not hold a50" in capsys.readouterr().err
+    assert "sizes of 4 to 14 do not hold a50" in capsys.readouterr().err
 
 
 def test_a_study_without_a_curve(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
