@@ -311,7 +311,7 @@ class ClusterEngine:
             lacking, fix = "worker", "start some with `dask worker ADDRESS --nthreads PROCESSES`"
         elif self._waiting["renders"] and not any(one.can_render for one in self._nodes.values()):
             lacking = "worker that can render (with Mitsuba, Dr.Jit and trimesh as here)"
-            fix = f"install tofpod on the workers just as here; {len(self._nodes)} that cannot render are there"
+            fix = "install tofpod on the workers just as here"
         if lacking != self._lacking:
             self._lacking, self._lacking_since = lacking, time.monotonic()
         if lacking == "worker" and self._scheduler.startswith("jobqueue:"):

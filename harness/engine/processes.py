@@ -312,8 +312,7 @@ def serve(pipe: Connection[Any, Any], name: str, stage: Stage, said: str, code: 
             try:
                 pipe.send(ended)
             except (TypeError, AttributeError, pickle.PicklingError) as error:
-                why = f"its result cannot be sent: {error}"
-                pipe.send(Ended("failed", why=why, is_bug=True, seconds=ended.seconds, worker=name))
+                pipe.send(Ended("failed", why=f"its result cannot be sent: {error}", is_bug=True, worker=name))
 
 
 def _prepare(said: str) -> IO[str]:

@@ -228,8 +228,8 @@ def _held(path: Path, *, shared: bool) -> Iterator[None]:
             file.seek(0)
             said = file.read(20).strip()
             who = f" (process {said})" if said.isdigit() else ""
-            fix = "wait for it, or name another folder with --out"
-            raise UserError(f"{path.parent}: another sweep is at work in this folder{who}", fix=fix)
+            said = f"{path.parent}: another sweep is at work in this folder{who}"
+            raise UserError(said, fix="wait for it, or name another folder with --out")
         if answer == "no locks":
             print(f"{path.parent}: cannot be locked on this system: start no second sweep in it", file=sys.stderr)
         file.truncate(0)
@@ -309,15 +309,10 @@ def engine_options(options: argparse.Namespace) -> EngineOptions:
         legal = f"{LEAST_MEMORY_GB:g} GB or more; 1 GB is enough for most trials"
         said = f"--memory-limit {options.memory_limit:g}: a process needs more than that to begin with"
         raise UserError(said, legal=legal)
-    return EngineOptions(
-        jobs=options.jobs,
-        limits=Limits(options.time_limit, round(1000 * options.memory_limit)),
-        scheduler=options.scheduler,
-        serial=options.serial,
-        shard=WHOLE if options.shard is None else Shard.of(options.shard),
-        retry_failed=options.retry_failed,
-        cache_limit_gb=options.cache_limit,
-    )
+    limits = Limits(options.time_limit, round(1000 * options.memory_limit))
+    shard = WHOLE if options.shard is None else Shard.of(options.shard)
+    where = (options.scheduler, options.serial, shard, options.retry_failed, options.cache_limit)
+    return EngineOptions(options.jobs, limits, *where)
 
 
 def _positive(text: str) -> float:

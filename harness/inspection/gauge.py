@@ -128,10 +128,8 @@ class GaugeSeen:
     def answer(self) -> str:
         """The counts in a sentence."""
         count = {state: sum(row.found == state for row in self.rows) for state in ("hit", "miss", "NA")}
-        return (
-            f"gauge: {count['hit']} hits, {count['miss']} misses, {count['NA']} holes not judged, "
-            f"{self.false_calls} false calls"
-        )
+        hits = f"{count['hit']} hits, {count['miss']} misses, {count['NA']} holes not judged"
+        return f"gauge: {hits}, {self.false_calls} false calls"
 
 
 def seen_on(gauge: Gauge, judged: Judged) -> GaugeSeen:
@@ -162,9 +160,8 @@ def seen_on(gauge: Gauge, judged: Judged) -> GaugeSeen:
         fit_mm = float(np.sqrt((apart_m**2).mean())) / MM
         notes.append(f"{board.name}: {len(marks)} marks, {fit_mm:.2f} mm from where the board has them")
         if fit_mm > WORST_FIT_MM:
-            warnings.append(
-                f"{board.name}: its marks are {fit_mm:.1f} mm off: was it printed at 100 %, and is it flat?"
-            )
+            doubt = f"its marks are {fit_mm:.1f} mm off: was it printed at 100 %, and is it flat?"
+            warnings.append(f"{board.name}: {doubt}")
         own, beside = _matched(board, gauge.hit_radius_mm * MM, judged, invert(T_camera_board))
         if unjudged := [str(row.hole.id) for row in own if row.found == "NA"]:
             told = "is not judged all around, as near the edge of what is judged: it counts neither as hit nor as miss"

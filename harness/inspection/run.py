@@ -84,9 +84,7 @@ def refuse_thresholds(arguments: argparse.Namespace) -> None:
     """Raise UserError where several arguments set the threshold, or where its value is none."""
     given = [f"--{name.replace('_', '-')}" for name in THRESHOLDS if getattr(arguments, name) is not None]
     if len(given) > 1:
-        raise UserError(
-            f"{' and '.join(given)} {'both' * (len(given) == 2) or 'all'} set the threshold", fix="give one of them"
-        )
+        raise UserError(f"{' and '.join(given)} set the threshold", fix="give one of them")
     for name, value in (("threshold", arguments.threshold), ("false-calls", arguments.false_calls)):
         if value is not None and not 0 < value < float("inf"):
             raise UserError(f"--{name} {value:g}", legal="a number above 0")
@@ -144,10 +142,9 @@ def with_faint_told(judged: Judged, threshold: float) -> Judged:
     faint = [str(each.id) for each in judged.findings if each.kind != "no return" and each.score < sure]
     if len(faint) <= max(null["expected"], 1.0) + 1e-6:
         return judged
-    warning = (
-        f"{len(faint)} of {len(judged.findings)} findings ({', '.join(faint)}) are so faint that noise explains them:"
-        f" {_calls(null['expected'])} false calls are expected, with scores up to about {sure:.2g}"
-    )
+    which = f"{len(faint)} of {len(judged.findings)} findings ({', '.join(faint)})"
+    calls = f"{_calls(null['expected'])} false calls are expected, with scores up to about {sure:.2g}"
+    warning = f"{which} are so faint that noise explains them: {calls}"
     evidence = replace(judged.evidence, warnings=(*judged.evidence.warnings, warning))
     return replace(judged, evidence=evidence)
 
@@ -231,18 +228,14 @@ def inspect(arguments: argparse.Namespace) -> int:
 
     evidence = analysed(detector, cloud)
     if field is not None:
-        told_of_field = dict.fromkeys(
-            each for view in views for each in doubts(view.cloud, field, arguments.flat_field)
-        )
-        evidence = replace(evidence, warnings=(*told_of_field, *evidence.warnings))
+        doubted = dict.fromkeys(each for view in views for each in doubts(view.cloud, field, arguments.flat_field))
+        evidence = replace(evidence, warnings=(*doubted, *evidence.warnings))
     threshold, origin, evidence = threshold_of(arguments, detector, cloud, evidence, silent_threshold)
     result = judged(detector, cloud, evidence, threshold)
     result = result if mapped else with_faint_told(result, threshold)
     seen = seen_on(gauge, result) if gauge else None
-    run = Inspection(
-        arguments, recordings, choices, config, mapped, registrations, detector, settings, result, threshold, origin,
-        seen,
-    )  # fmt: skip
+    found = (mapped, registrations, detector, settings, result, threshold, origin, seen)
+    run = Inspection(arguments, recordings, choices, config, *found)
     _print(run)
     if arguments.out is not None:
         _write(run, _facts(run, [*recordings, *quiet]))
@@ -318,12 +311,10 @@ def _merged(
     failed = [each for each in registrations if each.failure]
     if failed:
         reasons = "\n  ".join(f"{each.view}: {each.failure.removeprefix(f'{each.view}: ')}" for each in failed)
-        pose = "correct --poses where it is wrong" if has_poses else "state where they stand (--poses)"
         several = f"{len(failed)} of {len(registrations)} views" if len(failed) > 1 else "one view"
-        raise UserError(
-            f"{several} cannot be registered to {registrations[0].view} by {failed[0].method}:\n  {reasons}",
-            fix=f"leave such views out, {pose}, or choose another --register or --marks",
-        )
+        said = f"{several} cannot be registered to {registrations[0].view} by {failed[0].method}:\n  {reasons}"
+        pose = "correct --poses where it is wrong" if has_poses else "state where they stand (--poses)"
+        raise UserError(said, fix=f"leave such views out, {pose}, or choose another --register or --marks")
     mapped = Mapped(tuple(prepared), registrations, merge(tuple(prepared), registrations, config.merge))
     return mapped, _registration_data(config, mapped)
 
@@ -356,9 +347,6 @@ def _registration_data(config: MappingConfig, mapped: Mapped) -> dict[str, Any]:
             "marks": len(view.marks.trusted),
             "marks_doubtful": len(view.marks.marks) - len(view.marks.trusted),
             "pairs": each.pairs,
-            "iterations": each.iterations,
-            "converged": each.converged,
-            "seconds": round(each.seconds, 4),
             "notes": each.notes,
         }
 
@@ -373,7 +361,6 @@ def _registration_data(config: MappingConfig, mapped: Mapped) -> dict[str, Any]:
             " both in the first view's frame",
         },
         "T_reference_cloud": np.asarray(mapped.merged.T_reference_cloud).tolist(),
-        "merge_seconds": round(mapped.merged.seconds, 4),
         "views": list(map(row, mapped.views, mapped.registrations)),
         "loops": [
             {
