@@ -92,8 +92,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     worst = max(np.nan_to_num(off, nan=1.0), default=0.0)
     warnings = [*(warning for recording in recordings for warning in recording.warnings), *found.doubts]
     if worst > REPEATED:
-        warnings.insert(0, f"{CAMERA_FILE} does not repeat the captures' noise, which it has wrong by up to"
-                           f" {100 * worst:.0f} %: limits that are simulated with it are wrong, too")  # fmt: skip
+        wrong = f"{CAMERA_FILE} has the captures' noise wrong by up to {100 * worst:.0f} %"
+        warnings.insert(0, f"{wrong}: limits that are simulated with it are wrong, too")
     elif noise:
         answer += f" {CAMERA_FILE} repeats it within {100 * worst:.0f} %."
     print_warnings(warnings)

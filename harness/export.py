@@ -106,13 +106,15 @@ def _write_beside(
     source, role = experiment.config.simulated, "hole_free" if arguments.hole_free else "damaged"
     if source.views is not None:
         nominal = [guessed_T_reference_view(source.views, poses, n, role, REPEAT) for n in range(len(poses))]
+    frames = {
+        "board": "x along the row of holes, y up the face, z out of it to the camera, origin at its centre",
+        "camera": "x right, y down, z along the optical axis; of damages, the first view's camera",
+    }
+    damages = truth_of(targets[0], targets[0].pose.T_camera_board)
     files: dict[str, dict[str, Any]] = {
         "truth.json": {
-            "frames": {
-                "board": "x along the row of holes, y up the face, z out of it to the camera, origin at its centre",
-                "camera": "x right, y down, z along the optical axis; of damages, the first view's camera",
-            },
-            "damages": [damage.to_row() for damage in truth_of(targets[0], targets[0].pose.T_camera_board)],
+            "frames": frames,
+            "damages": [damage.to_row() for damage in damages],
             "views": [{"name": view.name, "T_board_camera": view.T_board_camera.tolist()} for view in views],
         },
         "nominal_poses.json": {POSES_KEY: [pose.tolist() for pose in nominal]},
@@ -121,8 +123,6 @@ def _write_beside(
             "experiment": experiment.config.name,
             "seed": experiment.config.seed,
             "hole_free": arguments.hole_free,
-            "format": arguments.format,
-            "frames_per_view": views[0].n_frames,
             "frames_per_second": views[0].frames_per_second,
             "rounding_step_mm": 1e3 * views[0].source.z_step_m,
             "notes": [

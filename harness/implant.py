@@ -107,8 +107,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     made = []
     for placement in placements(scans, family, options.camera, options.targets, options.seed, cache):
         made.append(placement)
-        done = sum(len(one.implants) for one in made)
-        print(f"rendered {done} of {options.targets} damages", file=sys.stderr)
+        print(f"rendered {sum(len(one.implants) for one in made)} of {options.targets} damages", file=sys.stderr)
     longest = max(len(scan.frames) for scan in scans)
     frames = sorted(set(options.frames or (1, longest)))
     found = judge_scans(scans, made, family, options.camera, judging, frames)
@@ -127,21 +126,18 @@ def main(options: argparse.Namespace, command: str) -> int:
     }
     origin = record(command) | {"warnings": warnings, "seed": options.seed, "failures": []}
     title = f"Virtual damage in {said}"
-    thresholds = (
-        f"Given as {options.threshold:g}."
-        if options.threshold
-        else "Set by the undamaged frames as harness.detect sets it, by noise that stands out towards the camera, for "
-        f"{options.false_calls or DEFAULT_FALSE_CALLS:g} false calls a capture: the median over groups of frames."
-    )
+    calls = f"{options.false_calls or DEFAULT_FALSE_CALLS:g} false calls a capture: the median over groups of frames."
+    own = f"Set by the undamaged frames as harness.detect sets it, by noise that stands out towards the camera, for {calls}"
+    thresholds = f"Given as {options.threshold:g}." if options.threshold else own
+    known = {key: origin[key] for key in ("commit", "dirty", "versions", "seed", "command")}
     study = StudyRecord(
         name="implant",
         digest=digest(facts),
         hit_radius_mm=options.hit_radius,
         false_calls_per_m2=None,
-        provenance={**{key: origin[key] for key in ("commit", "dirty", "versions", "seed", "command")},
-                    "thresholds": thresholds},
+        provenance={**known, "thresholds": thresholds},
         set_ups=found.set_ups,
-    )  # fmt: skip
+    )
     provenance = {**origin, "results_version": RESULTS_VERSION, "experiment": "implant", "digest": study.digest}
     result = evaluate_study(study, found.tables, facts)
     write_text(options.out / STUDY.name, record_text(study))
@@ -197,19 +193,15 @@ def _shares(options: argparse.Namespace, said: str, peaks_mm: list[float]) -> li
     return [
         f"Measured: {said}, with their surface, noise, fixed pattern, texture and missing returns.",
         f"Simulated: the damage, by the model of {options.camera}, on the tangent plane at its place, with an albedo "
-        f"of {options.albedo:g}; noise is added where the damage weakens the light.",
+        f"of {options.albedo:g}; noise is added where the damage weakens the light, and none taken off where it does not.",
         f"Virtual damage shows a depth of {middle:.2g} mm at the median ({low:.2g} to {high:.2g} mm for eight in ten). "
         "If real damage of such sizes shows more or less in recordings of this camera, the limit is wrong by as much: "
         "check it with a gauge board.",
-        "Where damage should make pixels quieter than the recording they keep its noise: it is then a little harder to "
-        "find than it would be.",
         "A board, here, is one placement of damage in a group of recorded frames. Placements share the recording's "
         "surface and fixed pattern, and its noise where it has few frames: intervals are over places and sizes in this "
         "recording, not over other parts, units or days.",
-        "No damage was placed within the hit radius of a finding in the average of all undamaged frames, so that "
-        "nothing else passes for it.",
-        "The undamaged recording is the hole-free board. Where false calls are counted on the frames that set the "
-        "threshold, a warning says so.",
+        "No damage was placed within the hit radius of a finding in the average of all undamaged frames. The undamaged "
+        "recording is the hole-free board; a warning says where the same frames set the threshold.",
     ]
 
 

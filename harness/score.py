@@ -181,20 +181,17 @@ def _judged(
     quiet = [(np.nanmax(scores), area_m2) for _, scores, _, _, area_m2 in boards("validation")]
     highest, areas_m2 = np.array(quiet, float).T
     threshold = threshold_for_rate(highest, float(areas_m2.mean()), rate).value
-    radius_m, truths = index["hit_radius_mm"] * MM, []
+    radius_m, overlap, truths = index["hit_radius_mm"] * MM, index["hit_overlap"], []
     holes, runs = list[dict[str, Any]](), list[dict[str, Any]]()
-    pixels: list[np.ndarray] = []
-    regions: list[np.ndarray] = []
-    tops: list[tuple[float, bool]] = []
+    pixels, regions, tops = list[np.ndarray](), list[np.ndarray](), list[tuple[float, bool]]()
     for name, scores, places_m, damage, area_m2 in boards("test"):
         truth = read_truth(options.dataset, name)
         damages, board = truth["damages"], truth["board"]
         truths.append([board, damages])
         lines = [np.array(one["line_m"]) for one in damages]
-        found, overlap = _findings(places_m, scores > threshold), index["hit_overlap"]
-        areas = (
-            [] if overlap is None else smeared([np.flatnonzero(damage == one["id"]) for one in damages], damage.shape)
-        )
+        found = _findings(places_m, scores > threshold)
+        outlines = [np.flatnonzero(damage == one["id"]) for one in damages]
+        areas = [] if overlap is None else smeared(outlines, damage.shape)
         ((pairs, parts),) = matched_places(lines, areas, lambda centres_m: centres_m, [found], radius_m, overlap)
         signals = highest_within(places_m, scores, lines, radius_m)
         common: dict[str, Any] = {"board": board, "repeat": 0, "threshold": float(threshold), "scale_mm": np.nan}
@@ -226,10 +223,9 @@ def _judged(
     )
     scores, of = np.concatenate(pixels), np.unique(np.concatenate(regions), return_inverse=True)[1]
     damaged, (top, is_flawed) = (of > 0) * 1.0, np.array(tops, float).T
-    overlap = damaged / np.bincount(of)[of]
     return limit_of(record), {
         "category": category,
-        "au_pro": area_under(scores, overlap, 1 - damaged, PRO_LIMIT),
+        "au_pro": area_under(scores, damaged / np.bincount(of)[of], 1 - damaged, PRO_LIMIT),
         "pixel_auroc": area_under(scores, damaged, 1 - damaged),
         "board_auroc": area_under(top, is_flawed, 1 - is_flawed),
     }

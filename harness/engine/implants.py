@@ -140,11 +140,9 @@ class Scan:
         steep = [float(np.quantile(self.angle_deg[part & known], 0.99)) for part in (inner, self.judged)]
         if steep[1] - steep[0] < TELLING_DEG:
             return ""
-        percent, name = 100 * (inner & known).sum() / known.sum(), self.recording.name
-        return (
-            f"{name}: damage is placed on the inner {percent:.0f} % of what is judged, seen at up to {steep[0]:.0f} "
-            f"degrees; the limit says nothing of the rim, seen at up to {steep[1]:.0f} degrees, where more is missed"
-        )
+        inside = f"the inner {100 * (inner & known).sum() / known.sum():.0f} % of what is judged"
+        rim = f"the limit says nothing of the rim, seen at up to {steep[1]:.0f} degrees, where more is missed"
+        return f"{self.recording.name}: damage is placed on {inside}, seen at up to {steep[0]:.0f} degrees; {rim}"
 
     def averaged(self, frames: Sequence[Frame]) -> Cloud:
         """Return the average of some frames, as `harness.detect` takes it."""
@@ -163,9 +161,8 @@ class Scan:
         h, w = self.judged.shape
         if not (0 <= row < h and 0 <= column < w) or self.depth_px[row, column] < rim_px:
             return None
-        around = np.s_[
-            max(row - NORMAL_PX, 0) : row + NORMAL_PX + 1, max(column - NORMAL_PX, 0) : column + NORMAL_PX + 1
-        ]
+        rows, columns = (slice(max(at - NORMAL_PX, 0), at + NORMAL_PX + 1) for at in (row, column))
+        around = rows, columns
         points = (self.rays[around] * self.surface_z_m[around][..., None]).reshape(-1, 3)
         points = points[np.isfinite(points[:, 2])]
         middle = points.mean(axis=0)
@@ -274,10 +271,9 @@ def judge_scans(
             known = scan.known(scan.averaged(scan.frames[group]), sites)
             _add(rows, judging, known, threshold, {"frames": count, "board": number, "role": "hole_free"})
         for at, placement in enumerate(made):
-            own_groups = [group for scan, group in judged if scan is placement.scan] or [
-                group for scan, group in groups if scan is placement.scan
-            ]
-            cloud = placement.cloud(own_groups[at % len(own_groups)])
+            mine = [group for scan, group in (*judged, *groups) if scan is placement.scan]
+            mine = [group for scan, group in judged if scan is placement.scan] or mine
+            cloud = placement.cloud(mine[at % len(mine)])
             known = placement.scan.known(cloud, placement.target)
             _add(rows, judging, known, threshold, {"frames": count, "board": placement.number, "role": "damaged"})
             print(f"{count} frames: placement {at + 1} of {len(made)}", file=sys.stderr)
@@ -287,7 +283,7 @@ def judge_scans(
     )  # fmt: skip
     detector = detector_of(judging.detector, judging.settings_json)
     camera_data = camera_of(unit_config(camera, scans[0].lens)[0]).to_data()
-    set_ups = []
+    set_ups, files = [], [str(path) for one in scans for path in one.recording.files]
     for count in frames:
         holes, runs = (of[of["frames"] == count] for of in (tables.holes, tables.runs))
         set_ups.append(
@@ -300,9 +296,7 @@ def judge_scans(
                 calibration_runs=calibrated[count],
                 failed=0,
                 targets_digest=digest([placement.target.to_data() for placement in made]),
-                frames_digest=digest(
-                    [camera_data, count, *(str(path) for one in scans for path in one.recording.files)]
-                ),
+                frames_digest=digest([camera_data, count, *files]),
                 **judged_facts(holes, runs),
             )
         )

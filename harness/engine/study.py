@@ -34,7 +34,7 @@ from harness.vocabulary.seeds import digest
 from scenes.render.cache import in_use, read_view, trim_cache
 from scenes.sensor.camera import camera_of, guessed_precision
 
-MOST_FAILURES = 200  # failures that are listed; the journal has all
+MOST_FAILURES, FAILURE = 200, ("what", "state", "why")  # failures that are listed; the journal has all
 
 
 def run_study(experiment: Experiment, out: Path, options: EngineOptions, command: str) -> int:
@@ -173,8 +173,7 @@ def _write_report(
 def _nothing_to_report(experiment: Experiment, outcome: Outcome) -> int:
     """Conclude a run without any result: the user's mistake is raised; a bug keeps its traceback (once) and gives 1."""
     name, detector = experiment.config.name, experiment.config.detector.name
-    bug = next((failure for failure in outcome.failures if failure.is_bug), None)
-    if bug is not None:
+    if bug := next((failure for failure in outcome.failures if failure.is_bug), None):
         count = outcome.trials.failed
         told = f"no trial of {name} succeeded; {count} failed, the first as above (detector {detector!r})"
         print(f"{bug.why}\n{told}", file=sys.stderr)
@@ -233,9 +232,7 @@ def _provenance(
         "trials": {"done": trials.done, "resumed": trials.found, "failed": trials.failed},
         "peak_mb": outcome.peak_mb,
         "warnings": [text for text in guesses if text],
-        "failures": [
-            {"what": one.what, "state": one.state, "why": one.why} for one in outcome.failures[:MOST_FAILURES]
-        ],
+        "failures": [{name: getattr(one, name) for name in FAILURE} for one in outcome.failures[:MOST_FAILURES]],
         "failures_in_all": _counts(outcome),
     }
 
