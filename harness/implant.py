@@ -127,7 +127,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     origin = record(command) | {"warnings": warnings, "seed": options.seed, "failures": []}
     title = f"Virtual damage in {said}"
     calls = f"{options.false_calls or DEFAULT_FALSE_CALLS:g} false calls a capture: the median over groups of frames."
-    own = f"Set by the undamaged frames as harness.detect sets it, by noise that stands out towards the camera, for {calls}"
+    own = f"Set by the undamaged frames as harness.detect sets it, by noise towards the camera, for {calls}"
     thresholds = f"Given as {options.threshold:g}." if options.threshold else own
     known = {key: origin[key] for key in ("commit", "dirty", "versions", "seed", "command")}
     study = StudyRecord(
@@ -193,7 +193,7 @@ def _shares(options: argparse.Namespace, said: str, peaks_mm: list[float]) -> li
     return [
         f"Measured: {said}, with their surface, noise, fixed pattern, texture and missing returns.",
         f"Simulated: the damage, by the model of {options.camera}, on the tangent plane at its place, with an albedo "
-        f"of {options.albedo:g}; noise is added where the damage weakens the light, and none taken off where it does not.",
+        f"of {options.albedo:g}; noise is added where the damage weakens the light, never taken off.",
         f"Virtual damage shows a depth of {middle:.2g} mm at the median ({low:.2g} to {high:.2g} mm for eight in ten). "
         "If real damage of such sizes shows more or less in recordings of this camera, the limit is wrong by as much: "
         "check it with a gauge board.",

@@ -271,9 +271,9 @@ def judge_scans(
             known = scan.known(scan.averaged(scan.frames[group]), sites)
             _add(rows, judging, known, threshold, {"frames": count, "board": number, "role": "hole_free"})
         for at, placement in enumerate(made):
-            mine = [group for scan, group in (*judged, *groups) if scan is placement.scan]
-            mine = [group for scan, group in judged if scan is placement.scan] or mine
-            cloud = placement.cloud(mine[at % len(mine)])
+            slices = [group for scan, group in judged if scan is placement.scan]
+            slices = slices or [group for scan, group in groups if scan is placement.scan]
+            cloud = placement.cloud(slices[at % len(slices)])
             known = placement.scan.known(cloud, placement.target)
             _add(rows, judging, known, threshold, {"frames": count, "board": placement.number, "role": "damaged"})
             print(f"{count} frames: placement {at + 1} of {len(made)}", file=sys.stderr)

@@ -39,10 +39,8 @@ RAISE = "if the file is to be so large, raise the limit in harness/vocabulary/fi
 
 def size_text(count: int) -> str:
     """Return bytes as text in the unit that is easiest to read."""
-    for unit, factor in (("GiB", 1 << 30), ("MiB", 1 << 20), ("kiB", 1 << 10)):
-        if count >= factor:
-            return f"{count / factor:.4g} {unit}"
-    return f"{count} bytes"
+    units = (("GiB", 1 << 30), ("MiB", 1 << 20), ("kiB", 1 << 10))
+    return next((f"{count / factor:.4g} {unit}" for unit, factor in units if count >= factor), f"{count} bytes")
 
 
 def refuse_bytes(name: str, count: int, at_most: int, what: str = "has", fix: str = RAISE) -> None:
@@ -62,8 +60,7 @@ def bounded_bytes(path: Path, at_most: int) -> bytes:
     """Return a file's content. Raises UserError where it is larger, also of a device or pipe; OSError as files do."""
     with Path(path).open("rb") as stream:
         content = stream.read(at_most + 1)
-    if len(content) > at_most:
-        raise UserError(f"{path}: has more than {size_text(at_most)}", legal=f"at most {size_text(at_most)}", fix=RAISE)
+    refuse_bytes(str(path), len(content), at_most, "has at least")
     return content
 
 
@@ -199,10 +196,8 @@ def inside(folder: Path, *parts: str) -> Path:
             raise UserError(f"{part!r} is no name of a file or folder", legal="letters, digits, - and _")
     path = Path(folder).joinpath(*parts)
     if not path.resolve().is_relative_to(Path(folder).resolve()):
-        raise UserError(
-            f"{path}: is a link that leads out of {folder}, to {path.resolve()}",
-            fix=f"remove the link, or name its goal with --out; {folder} itself may be a link",
-        )
+        fix = f"remove the link, or name its goal with --out; {folder} itself may be a link"
+        raise UserError(f"{path}: is a link that leads out of {folder}, to {path.resolve()}", fix=fix)
     return path
 
 

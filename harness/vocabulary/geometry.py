@@ -68,19 +68,13 @@ class Region:
 
     def grown(self, margin: int, height: int, width: int) -> Region:
         """This region with ``margin`` more pixels on each side, clipped to a sensor of ``height`` x ``width``."""
-        return Region(
-            max(self.row0 - margin, 0),
-            min(self.row1 + margin, height),
-            max(self.col0 - margin, 0),
-            min(self.col1 + margin, width),
-        )
+        rows = max(self.row0 - margin, 0), min(self.row1 + margin, height)
+        return Region(*rows, max(self.col0 - margin, 0), min(self.col1 + margin, width))
 
     def within(self, outer: Region) -> tuple[slice, slice]:
         """Slices that cut this region out of an array that covers ``outer``."""
-        return (
-            slice(self.row0 - outer.row0, self.row1 - outer.row0),
-            slice(self.col0 - outer.col0, self.col1 - outer.col0),
-        )
+        rows = slice(self.row0 - outer.row0, self.row1 - outer.row0)
+        return rows, slice(self.col0 - outer.col0, self.col1 - outer.col0)
 
 
 UNDISTORT_STEPS = 200  # Fixed-point steps of the inversion: the Azure Kinect's corners converge to 1e-9 px within 60
@@ -178,21 +172,15 @@ class Reason(IntEnum):
     """The reason why a pixel has no range; a recording says NO_RETURN or NOT_FINITE only, a simulated camera all."""
 
     VALID = 0
-    NO_RETURN = 1
-    """The file holds the code for 'no depth' (0), or the ray met nothing."""
+    NO_RETURN = 1  # the file holds the code for "no depth" (0), or the ray met nothing
     SATURATED = 2
     LOW_AMPLITUDE = 3
-    AMPLITUDE_RATIO = 4
-    """The amplitudes of the modulation frequencies disagree (a mixed pixel)."""
-    UNWRAP = 5
-    """The phases of the modulation frequencies fit no single distance."""
-    EDGE = 6
-    """The neighbourhood's phases differ too much."""
+    AMPLITUDE_RATIO = 4  # the amplitudes of the modulation frequencies disagree (a mixed pixel)
+    UNWRAP = 5  # the phases of the modulation frequencies fit no single distance
+    EDGE = 6  # the neighbourhood's phases differ too much
     OUT_OF_RANGE = 7
-    OUTSIDE_MASK = 8
-    """Outside the illuminated field."""
-    LOW_REFLECTIVITY = 9
-    """Amplitude times distance squared too small."""
+    OUTSIDE_MASK = 8  # outside the illuminated field
+    LOW_REFLECTIVITY = 9  # amplitude times distance squared too small
     NOT_FINITE = 10
 
 

@@ -88,11 +88,9 @@ class PlugIns:
 
     def broken(self, offer: Offer, why: str, command: str = "") -> UserError:
         """The mistake that a plug-in is not what its group asks for. ``command`` would show more."""
-        shown = f"; `{command}` shows where it fails" if command else ""
-        return UserError(
-            f"{self.noun} {offer.name!r} ({offer.target}, of the package {offer.origin}) cannot be loaded: {why}",
-            fix=f"repair or uninstall the package {offer.package}{shown}",
-        )
+        fix = f"repair or uninstall the package {offer.package}" + (f"; `{command}` shows more" if command else "")
+        said = f"{self.noun} {offer.name!r} ({offer.target}, of the package {offer.origin}) cannot be loaded: {why}"
+        return UserError(said, fix=fix)
 
 
 def _changed_ns(folder: str) -> int:

@@ -192,8 +192,7 @@ def shown(value: Any) -> str:
         noun = "mapping" if isinstance(value, dict) else "list"
         return f"a {noun}" if value else f"an empty {noun}"
     text = json.dumps(value, ensure_ascii=False)
-    if isinstance(value, float):
-        text = text.replace("Infinity", ".inf").replace("NaN", ".nan")
+    text = text.replace("Infinity", ".inf").replace("NaN", ".nan") if isinstance(value, float) else text
     return text if len(text) <= 40 else text[:39] + "…"
 
 

@@ -138,11 +138,8 @@ def default_at(slot: Slot | None) -> tuple[Any, ...]:
     default = slot.field.get_default(call_default_factory=True)
     if not isinstance(default, Config):
         return (json.loads(json.dumps(default)),)
-    constant = {
-        n: getattr(default, n)
-        for n, f in type(default).model_fields.items()
-        if len(choices_of(slot_of(f.annotation))) == 1
-    }
+    fields = type(default).model_fields
+    constant = {n: getattr(default, n) for n, f in fields.items() if len(choices_of(slot_of(f.annotation))) == 1}
     least = {**constant, **default.model_dump(mode="json", exclude_defaults=True)}
     return (least if type(default).from_data(json.loads(json.dumps(least))) == default else default.to_data(),)
 
@@ -163,9 +160,8 @@ def child(data: Any, key: str | int) -> Any:
 
 def choices_of(slot: Slot | None) -> tuple[Any, ...]:
     """Return the values of a Literal at this place, () where it is none."""
-    return tuple(
-        v for kind, _ in (slot.branches if slot else ()) if get_origin(kind) is Literal for v in get_args(kind)
-    )
+    branches = slot.branches if slot else ()
+    return tuple(v for kind, _ in branches if get_origin(kind) is Literal for v in get_args(kind))
 
 
 def legal_at(slot: Slot | None) -> str | None:

@@ -49,8 +49,7 @@ class Place:
         shown = "".join(letter if letter.isprintable() else " " for letter in cut)
         offset = self.column - 1 - start
         width = max(1, min(self.width, len(shown) - offset))
-        label = f"{self.line or '':>5}"
-        return [f"{label} | {shown}".rstrip(), f"{' ' * 5} | {' ' * offset}^{'~' * (width - 1)}"]
+        return [f"{self.line or '':>5} | {shown}".rstrip(), f"{' ' * 5} | {' ' * offset}^{'~' * (width - 1)}"]
 
 
 @dataclass(frozen=True)
@@ -182,10 +181,9 @@ def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = Fa
         width = max(1, min(end + start, starts[line] + len(lines[line])) - index)
         return Place(origin, 0 if is_argument else line + 1, index - starts[line] + 1, lines[line], width)
 
-    version = _OTHER_VERSION.search(text)
-    if version:
-        problem = Problem("only YAML 1.2 is read", place(version.start() - start, version.end()))
-        raise DeclarationError(origin, [problem])
+    if version := _OTHER_VERSION.search(text):
+        at = place(version.start() - start, version.end())
+        raise DeclarationError(origin, [Problem("only YAML 1.2 is read", at)])
     depth = nodes = 0
     try:
         for event in YAML(typ="safe", pure=True).parse(text[start:]):
