@@ -213,9 +213,6 @@ def frame_name(view: ExportedView) -> str:
     return f"{view.name}_depth_optical_frame"
 
 
-# ---- messages --------------------------------------------------------------------------------------------------------
-
-
 def _header(types: dict[str, Any], frame: str, stamp_ns: int) -> Any:
     time = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
     return types["std_msgs/msg/Header"](stamp=time, frame_id=frame)

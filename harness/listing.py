@@ -40,9 +40,6 @@ def bytes_of(text: str) -> int:
     return round(float(found[1]) * factors[found[2].lower()])
 
 
-# ---------------------------------------------------------------- detectors and cameras
-
-
 Row = Mapping[str, Any]
 SETTABLE = {"detectors": "settings", "cameras": "numbers"}  # kinds of offers, and the name of what can be set of each
 
@@ -336,9 +333,6 @@ def folders_in(folder: Path, names: re.Pattern[str]) -> list[Path]:
 def files_below(folder: Path) -> Iterator[Path]:
     """Yield everything below a folder that is no folder; links are not followed."""
     return (Path(inner, name) for inner, _, names in os.walk(folder) for name in names)
-
-
-# ---------------------------------------------------------------- the newest run
 
 
 def latest_run(parent: Path) -> str | None:

@@ -154,9 +154,6 @@ def _read(path: Path) -> np.ndarray:
     return np.asarray(found, float)
 
 
-# ---------------------------------------------------------------- judging
-
-
 def _judged(
     category: str, maps: dict[str, Path], options: argparse.Namespace, index: dict[str, Any], rate: float
 ) -> tuple[SetUpLimit, dict[str, Any]]:

@@ -78,9 +78,6 @@ def check_detector(
     require(loud, "nothing was found on any cloud at any threshold, so that next to nothing was checked")
 
 
-# ---------------------------------------------------------------- checks
-
-
 STRONGEST = 5  # findings of one cloud that are looked at one by one
 CENTRE_MARGIN_M = 0.02  # distance outside the cloud's extent up to which the centre of a finding may lie
 SCORE_TOLERANCE = 0.01
@@ -339,9 +336,6 @@ CHECKS = (
     turns_with_the_cloud,
     moves_with_the_cloud,
 )
-
-
-# ---------------------------------------------------------------- what several checks ask
 
 
 def _sound(look: Look) -> None:

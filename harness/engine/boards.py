@@ -194,9 +194,6 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
     write_text(place / file / TRUTH, json.dumps(told, allow_nan=False) + "\n", durable=False)
 
 
-# ---------------------------------------------------------------- reading
-
-
 def read_index(folder: Path) -> dict[str, Any]:
     """Read a data set's ``dataset.json``; ``samples`` is None while it is not finished. Raises UserError."""
     data = _read_json(folder / INDEX, RECORD_BYTES, "name a folder that harness.dataset wrote")

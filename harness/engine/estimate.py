@@ -76,9 +76,6 @@ def progress_display(
             show(None)
 
 
-# ---------------------------------------------------------------- the estimate
-
-
 def dry_run(experiment: Experiment, out: Path, options: EngineOptions) -> int:
     """Say what a sweep, or a shard of it, consists of; nothing is written."""
     name, folder, points = experiment.config.name, experiment.folder(out), many(len(experiment.points), "point")

@@ -234,9 +234,6 @@ def _hole_row(
     return row | {"score": float(found.score), "points": int(found.points), "model_note": found.model_note}
 
 
-# ---------------------------------------------------------------- a study's board
-
-
 def study_rows(known: KnownCloud, judged: JudgedCloud, radius_m: float, *, hole_free: bool) -> Rows:
     """Return the rows of one board by table (`STUDY_TABLES`, "runs", "holes"); of one that only sets a threshold, the
     area and what stood out most. Findings without return stand in ``no_return`` and ``no_return_calls``."""

@@ -54,9 +54,6 @@ def _detected(judged: JudgedCloud) -> np.ndarray:
     return detected
 
 
-# ---------------------------------------------------------------- clouds of one view
-
-
 def _cloud_examples(group: Group, thresholds: Mapping[str, float]) -> list[ExampleCloud]:
     """The clouds of repeat 0 at the least and the greatest number of frames of each variant of a group."""
     batch, by_variant = group.damaged, dict[str, list[PointTask]]()
@@ -100,9 +97,6 @@ def _outline_px(set_up: SetUp, damage: Damage) -> np.ndarray:
         on_face = face_of(set_up.target.board).point(*outline.T)
         rim = transform_points(set_up.T_camera_board, np.vstack([on_face, on_face[:1]]))
     return np.asarray(lens.project(rim) - [region.col0, region.row0])
-
-
-# ---------------------------------------------------------------- maps of several views
 
 
 def _map_examples(group: Group, thresholds: Mapping[str, float]) -> list[MappedExample]:
@@ -177,9 +171,6 @@ def _map_example(maps: MapMaker, point: Point, threshold: float, learned: str | 
         ),
     )
     return MappedExample(point.variant, frames, count, *way, scene, point.is_variation)
-
-
-# ---------------------------------------------------------------- damages of a study
 
 
 class ShownDamage(NamedTuple):

@@ -141,9 +141,6 @@ def threshold_of(point: Point, quiet: Iterable[tuple[float, float]]) -> float | 
         raise UserError(f"{message}, too little for a threshold") from error
 
 
-# ---------------------------------------------------------------- the run
-
-
 AHEAD = 4096
 """Trials that may wait to be run: enough for a thousand workers, and a few megabytes whatever the plan's size."""
 TRIES = 2

@@ -108,9 +108,6 @@ def _records(journal: Journal, outcome: Outcome) -> Iterator[dict[str, Any]]:
         yield entry.record
 
 
-# ---------------------------------------------------------------- pages
-
-
 def _write_study(
     folder: Path,
     experiment: Experiment,
@@ -165,9 +162,6 @@ def _write_report(
     told = (provenance, resolved_yaml(experiment), title_of(experiment), facts)
     write_report(folder, tables, outcome.examples, *told, found=found)
     return final_tables(tables, found)
-
-
-# ---------------------------------------------------------------- failures, provenance
 
 
 def _nothing_to_report(experiment: Experiment, outcome: Outcome) -> int:
@@ -235,9 +229,6 @@ def _provenance(
         "failures": [{name: getattr(one, name) for name in FAILURE} for one in outcome.failures[:MOST_FAILURES]],
         "failures_in_all": _counts(outcome),
     }
-
-
-# ---------------------------------------------------------------- a study's record
 
 
 SIMULATION = ("scenes.sensor.source",)

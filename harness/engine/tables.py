@@ -171,9 +171,6 @@ def _reason(experiment: Experiment, point: Point) -> str:
     return ""
 
 
-# ---------------------------------------------------------------- files
-
-
 def write_tables(folder: Path, tables: Mapping[Table, pd.DataFrame], provenance: Mapping[str, Any]) -> None:
     """Write tables, with what names the run in the schema of every Parquet file."""
     keys = ("results_version", "experiment", "digest", "seed", "commit", "dirty", "versions")

@@ -152,9 +152,6 @@ def _cloud(capture: SimulatedCapture, totals: FrameTotals, left_out: tuple[LeftO
     )
 
 
-# ---------------------------------------------------------------- maps
-
-
 Made = TypeVar("Made")
 BOARD_STEPS = 9  # places along each side of the board at which a registration's error is taken
 
@@ -285,9 +282,6 @@ def registration_error_m(
     across = moved @ normal
     in_plane = np.linalg.norm(moved - across[:, None] * normal, axis=-1)
     return float(np.sqrt((in_plane**2).mean())), float(np.sqrt((across**2).mean()))
-
-
-# ---------------------------------------------------------------- trials
 
 
 Role = Literal["learning", "calibration", "hole_free", "damaged"]
@@ -435,9 +429,6 @@ def _point_rows(
         for name, found in done[key].items()
     }
     return rows | {"registrations": [{**common, **role, **row} for row in registrations]}
-
-
-# ---------------------------------------------------------------- what one camera makes of an undamaged board
 
 
 def _board_rows(task: TrialTask, set_up: SetUp, clouds: dict[int, Cloud], points: Sequence[PointTask]) -> Rows:

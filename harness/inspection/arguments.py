@@ -163,9 +163,6 @@ def opened(paths: Sequence[Path], intrinsics: str | None, lens: Lens | None = No
     return open_capture(list(paths), intrinsics=file, lens=lens, **reading)
 
 
-# ---------------------------------------------------------------- poses
-
-
 POSES_KEY = "T_reference_view"  # key of the list in a file of `harness.export`, beside the file's version
 LEGAL_POSES = (
     "JSON: a list with a 4x4 matrix (metres, last row 0 0 0 1) for each view, all to one common frame, bare or"

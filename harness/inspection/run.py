@@ -153,9 +153,6 @@ def _calls(expected: float) -> str:
     return f"{expected:.1f}" if expected >= 0.1 else f"{expected:.1g}" if expected >= 1e-4 else "0"
 
 
-# ---------------------------------------------------------------- the program
-
-
 START_FROM_MARKS = ("icp", "cpd")
 """Methods that need a place to start from; `joint` finds its own, `odometry` goes from view to view."""
 LOOPING = ("marks", "icp", "cpd")
@@ -270,9 +267,6 @@ def _mistakes_named(view: View | None) -> Iterator[None]:
         raise UserError(f"view {view.name}: {mistake.message}", legal=mistake.legal, fix=mistake.fix) from mistake
 
 
-# ---- several views as one cloud --------------------------------------------------------------------------------------
-
-
 def _merged(
     arguments: argparse.Namespace,
     config: MappingConfig,
@@ -372,9 +366,6 @@ def _registration_data(config: MappingConfig, mapped: Mapped) -> dict[str, Any]:
             for loop in (loop_errors(mapped.views, config.registration) if is_looping else ())
         ],
     }
-
-
-# ---- what is told ----------------------------------------------------------------------------------------------------
 
 
 def _print(run: Inspection) -> None:

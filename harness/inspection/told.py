@@ -48,9 +48,6 @@ def print_notes(notes: Iterable[str]) -> None:
         print(f"note: {note}")
 
 
-# ---- captures --------------------------------------------------------------------------------------------------------
-
-
 def print_capture(recording: Recording, cloud: Cloud, name: str, kept: np.ndarray, crop: str) -> None:
     """Print the frames, those left out, and the points that the crop keeps (``kept``, of the cloud), a line each."""
     height, width = cloud.valid.shape
@@ -88,9 +85,6 @@ def capture_facts(recording: Recording, cloud: Cloud) -> dict[str, Any]:
         "notes": recording.notes,
         "warnings": recording.warnings,
     }
-
-
-# ---- the target that the automatic crop took -------------------------------------------------------------------------
 
 
 def choice_by(settings: object, cloud: Cloud) -> Choice | None:
@@ -144,9 +138,6 @@ def pictures(choice: Choice | None, name: str = "targets.png") -> dict[str, Call
     return {name: lambda path: save_targets(path, choice.grid, outlines, texts, choice.taken)}
 
 
-# ---- registrations, surface, threshold and findings ------------------------------------------------------------------
-
-
 def print_registrations(data: Mapping[str, Any]) -> None:
     """Print ``data`` of registrations.json: a table with a view a line, then notes and loops."""
     columns = {
@@ -192,9 +183,6 @@ def print_findings(findings: Sequence[Finding], grid: str = "px") -> None:
         long = [f"{f.length_mm:.1f} x {f.width_mm:.1f}, {f.angle_deg:.0f}" if f.is_long else "-" for f in findings]
         rows = [(*row, text) for row, text in zip(rows, long, strict=True)]
     show([Grid.of(heads, rows, left=0)])
-
-
-# ---------------------------------------------------------------- the scene
 
 
 def scene_of(mapped: Mapped, judged: Judged) -> Scene3d:
