@@ -142,17 +142,15 @@ def _answer(options: argparse.Namespace, surfaces: Sequence[LimitSurface], title
         print(f"warning: {text}")
     verdicts = [row.answer.verdict(size_mm) for row in rows]
     said = ", ".join(f"{name} for {verdicts.count(name)}" for name in ("no", "undecided") if name in verdicts)
-    answer = (
-        f"{damage_words(kind).capitalize()}s of {size_mm:g} mm at {distance_m:g} m are found nine times out of ten in "
-        f"{verdicts.count('yes')} of {many(len(rows), 'set-up')}" + (f" ({said})." if said else ".")
-    )
+    of_all = f"{verdicts.count('yes')} of {many(len(rows), 'set-up')}" + (f" ({said})." if said else ".")
+    asked_for = f"{damage_words(kind).capitalize()}s of {size_mm:g} mm at {distance_m:g} m"
+    answer = f"{asked_for} are found nine times out of ten in {of_all}"
     errors = [row.surface.error for row in rows if np.isfinite(row.surface.error)]
     left_out = f"the surfaces miss set-ups left out by {100 * max(errors, default=0):.0f} % of a90 at the most (rms)"
     missed = f"; {left_out}" if errors else ""
-    notes = [
-        f"Simulated: one unit of each camera, conditions of {about.get('experiment', 'the study')}.yaml{missed}.",
-        *(f"not answered: {reason}" for reason in refused),
-    ]
+    study = about.get("experiment", "the study")
+    notes = [f"Simulated: one unit of each camera, under the conditions of {study}.yaml{missed}."]
+    notes += [f"not answered: {reason}" for reason in refused]
     show([answer, ATLAS.grid(rows, terminal=True), *notes, f"computed exactly: {_exactly(rows[0], about)}"])
 
 

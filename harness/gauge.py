@@ -145,12 +145,10 @@ def _laid_out(options: argparse.Namespace, sizes: np.ndarray) -> Gauge:
             GaugeHole(id=k + 1, diameter_mm=float(own[k]), depth_mm=deep[k], x_mm=places[at][0], y_mm=places[at][1])
             for k, at in enumerate(chosen.tolist())
         )
-        marks = tuple(
-            GaugeMark(code=4 * number + k, x_mm=x, y_mm=y, side_mm=side) for k, (x, y) in enumerate(corners.tolist())
-        )
-        boards.append(
-            GaugeBoard(name=f"board-{number + 1}", width_mm=width, height_mm=height, marks=marks, holes=holes)
-        )
+        corner = enumerate(corners.tolist(), start=4 * number)
+        marks = tuple(GaugeMark(code=code, x_mm=x, y_mm=y, side_mm=side) for code, (x, y) in corner)
+        name = f"board-{number + 1}"
+        boards.append(GaugeBoard(name=name, width_mm=width, height_mm=height, marks=marks, holes=holes))
     return Gauge(dictionary=DICTIONARY, hit_radius_mm=HIT_SHARE * apart, boards=tuple(boards))
 
 

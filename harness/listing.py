@@ -81,10 +81,7 @@ def shown(kind: str, name: str) -> Row:
 def grid_of(kind: str, rows: Sequence[Row]) -> Grid:
     """Return rows of offers as a table."""
     if kind == "detectors":
-        heads, told = (
-            ("version", "what it does"),
-            lambda row: ("-" if row["version"] is None else row["version"], row["about"]),
-        )
+        heads, told = ("version", "what it does"), lambda row: (row["version"] or "-", row["about"])
     else:
         heads, told = ("pixels", "range", "light", "title"), _camera_cells
     lines = []

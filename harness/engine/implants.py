@@ -229,9 +229,8 @@ def damages_placed(scan: Scan, family: DrawnTargetConfig, camera: str, purpose: 
     """Return a board of the family with those of its damages that have enough judged surface around them."""
     drawn, rim_px = family.drawn(purpose, number), scan.rim_px(family)
     kept = {each.id for each in drawn.damages if scan.place(*each.centre_m, rim_px) is not None}
-    return drawn.model_copy(
-        update={name: tuple(each for each in getattr(drawn, name) if each.id in kept) for name in KINDS}
-    )
+    left = {name: tuple(each for each in getattr(drawn, name) if each.id in kept) for name in KINDS}
+    return drawn.model_copy(update=left)
 
 
 @dataclass(frozen=True, eq=False)

@@ -254,33 +254,17 @@ def study_rows(known: KnownCloud, judged: JudgedCloud, radius_m: float, *, hole_
     lines = [damage.line_m for damage in known.truth]
     signals = highest_within(known.places_m, score, lines, radius_m).tolist()
     counts_for = {} if hole_free else {finding: str(known.truth[i].id) for i, finding in judged.pairs.items()}
-    findings = [
-        {
-            "x_mm": float(place[0]) / MM,
-            "y_mm": float(place[1]) / MM,
-            "score": float(detection.score),
-            "hole": counts_for.get(number, ""),
-        }
-        for number, (detection, place) in enumerate(zip(judged.detections, judged.places_m, strict=True))
-    ]
-    tables: Rows = {
-        "runs": [run],
-        "holes": [],
-        "sites": [],
-        "findings": findings,
-        "operating": [_operating(known, judged, threshold, radius_m, hole_free=hole_free)],
-        "pixels": [],
-    }
+    operating = _operating(known, judged, threshold, radius_m, hole_free=hole_free)
+    tables: Rows = {"runs": [run], "holes": [], "sites": [], "findings": [], "operating": [operating], "pixels": []}
+    for number, (detection, place) in enumerate(zip(judged.detections, judged.places_m, strict=True)):
+        row = {"x_mm": float(place[0]) / MM, "y_mm": float(place[1]) / MM, "score": float(detection.score)}
+        tables["findings"].append({**row, "hole": counts_for.get(number, "")})
     if hole_free:  # places of left-out damage
-        tables["sites"] = [
-            _place(damage) | {"detected": i in judged.pairs, "signal": signal}
-            for i, (damage, signal) in enumerate(zip(known.truth, signals, strict=True))
-        ]
+        for i, (damage, signal) in enumerate(zip(known.truth, signals, strict=True)):
+            tables["sites"].append(_place(damage) | {"detected": i in judged.pairs, "signal": signal})
         return tables
-    tables["holes"] = [
-        {**row, "signal": signal, "no_return": i in without_return}
-        for i, (row, signal) in enumerate(zip(judged.holes, signals, strict=True))
-    ]
+    for i, (row, signal) in enumerate(zip(judged.holes, signals, strict=True)):
+        tables["holes"].append({**row, "signal": signal, "no_return": i in without_return})
     # judged pixels of each damage and of the undamaged face, and how many of them lie above each threshold
     thresholds, flat = grid(threshold, PIXEL_OCTAVES), score.ravel()
     parts = [(str(damage.id), known.outlines[damage.id]) for damage in known.truth]

@@ -178,10 +178,7 @@ class Group:
             task.board,
             task.repeat,
             [ref.camera.unit_seed for ref in task.set_ups],
-            [
-                [point.digest, point.variant, point.threshold, point.learned and Path(point.learned).name]
-                for point in task.points
-            ],
+            [[one.digest, one.variant, one.threshold, one.learned and Path(one.learned).name] for one in task.points],
         ]
         number = task.repeat if task.board is None else task.board
         return f"{task.role}-{number:05d}-{digest(content)}"

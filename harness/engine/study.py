@@ -57,9 +57,8 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
                 outcome = run_plan(plan, journal, engine, report, shard=options.shard, retry_failed=retry)
             if not options.shard.is_whole:
                 done = outcome.trials
-                print(
-                    f"shard {options.shard}: {done.done} trials done, {done.found} found, {done.failed} not ended well"
-                )
+                counts = f"{done.done} trials done, {done.found} found, {done.failed} not ended well"
+                print(f"shard {options.shard}: {counts}")
                 _tell_failures(outcome)
                 print(f"journal: {folder / 'journal'}")
                 print("when all shards have run: python -m harness.merge, then the same command without --shard")
@@ -298,10 +297,7 @@ def _set_up(point: Point, group: Group, tables: ResultTables, failed: int) -> Se
             board=loudest["board"].to_numpy(int),
             repeat=loudest["repeat"].to_numpy(int),
             score=loudest["quiet_threshold"].to_numpy(float),
-            x_mm=loudest["loudest_x_mm"].to_numpy(float),
-            y_mm=loudest["loudest_y_mm"].to_numpy(float),
-            u_px=loudest["loudest_u_px"].to_numpy(float),
-            v_px=loudest["loudest_v_px"].to_numpy(float),
+            **{name: loudest[f"loudest_{name}"].to_numpy(float) for name in ("x_mm", "y_mm", "u_px", "v_px")},
         ),
         **judged_facts(holes, runs),
     )

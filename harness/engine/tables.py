@@ -64,11 +64,8 @@ def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> t
             return pd.DataFrame()
         order = {column: joined(column)[column].array for column in declared.order if column in names}
         places = pd.DataFrame(order).sort_values(list(order), kind="stable").index.to_numpy()
-        table = {
-            column: (order[column] if column in order else joined(column)[column].array).take(places)
-            for column in names
-        }
-        return pd.DataFrame(table, copy=False)
+        held = ((one, order[one] if one in order else joined(one)[one].array) for one in names)
+        return pd.DataFrame({name: values.take(places) for name, values in held}, copy=False)
 
     return trials.ResultTables(
         **{name: with_axes(ordered(name, table)) for name, table in RECORDED.items()},

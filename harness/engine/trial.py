@@ -7,11 +7,11 @@ the camera's model can). Frames that jump are left out by their displacement, wh
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice, pairwise
-from typing import Any, Literal, TypeVar, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 from scipy import special
@@ -152,7 +152,6 @@ def _cloud(capture: SimulatedCapture, totals: FrameTotals, left_out: tuple[LeftO
     )
 
 
-Made = TypeVar("Made")
 BOARD_STEPS = 9  # places along each side of the board at which a registration's error is taken
 
 
@@ -189,22 +188,20 @@ class MapMaker:
 
     def merged(self, mapping: MappingConfig, frames: int) -> Merged:
         """Return the map."""
-
-        def make() -> Merged:
-            return merge(self.prepared(mapping, frames), self.registrations(mapping, frames), mapping.merge)
-
-        return self._once(make, "merged", self.key(mapping, frames))
+        if (key := f"merged {self.key(mapping, frames)}") not in self._made:
+            registrations = self.registrations(mapping, frames)
+            self._made[key] = merge(self.prepared(mapping, frames), registrations, mapping.merge)
+        return cast("Merged", self._made[key])
 
     def prepared(self, mapping: MappingConfig, frames: int, count: int | None = None) -> tuple[PreparedView, ...]:
         """Return the views with their targets cut out and their marks found."""
-
-        def make() -> PreparedView:
-            return prepare(View(f"view {number}", self._clouds[number][frames], self.guesses[number]), mapping)
-
-        key, found = (frames, mapping.crop.to_data(), mapping.marks.to_data()), []
+        keys = []
         for number in range(self.count(mapping) if count is None else count):
-            found.append(self._once(make, "prepared", number, *key))
-        return tuple(found)
+            keys.append(canonical_json([number, frames, mapping.crop.to_data(), mapping.marks.to_data()]))
+            if keys[-1] not in self._made:
+                view = View(f"view {number}", self._clouds[number][frames], self.guesses[number])
+                self._made[keys[-1]] = prepare(view, mapping)
+        return tuple(self._made[key] for key in keys)
 
     def registrations(self, mapping: MappingConfig, frames: int) -> tuple[Registration, ...]:
         """Return a registration for each view."""
@@ -213,8 +210,9 @@ class MapMaker:
             most = sum(frames in clouds for clouds in self._clouds)
             parts = [frames, mapping.crop.to_data(), mapping.marks.to_data(), mapping.registration.to_data()]
             key, count = canonical_json(parts), max(most, count)
-        views = self.prepared(mapping, frames, count)
-        return self._once(lambda: register(views, mapping.registration), "registered", key)[: self.count(mapping)]
+        if key not in self._made:
+            self._made[key] = register(self.prepared(mapping, frames, count), mapping.registration)
+        return tuple(self._made[key][: self.count(mapping)])
 
     def registration_rows(self, mapping: MappingConfig, frames: int) -> list[dict[str, Any]]:
         """Return a row for each view but the first, once for each registration (columns: `REGISTRATIONS`)."""
@@ -235,22 +233,14 @@ class MapMaker:
         registration = mapping.registration.to_data() if count > 1 else None
         return canonical_json([count, frames, mapping.crop.to_data(), mapping.marks.to_data(), registration])
 
-    def _once(self, make: Callable[[], Made], *key: Any) -> Made:
-        name = canonical_json(key)
-        if name not in self._made:
-            self._made[name] = make()
-        return cast("Made", self._made[name])
-
     def _row(self, number: int, view: PreparedView, registration: Registration) -> dict[str, Any]:
         first = self._set_ups[0]
         board, T_camera_board = first.target.board, first.T_camera_board
         x, y = (np.linspace(-0.5, 0.5, BOARD_STEPS) * side * MM for side in (board.width_mm, board.height_mm))
         grid = np.stack([*np.meshgrid(x, y), np.zeros((BOARD_STEPS, BOARD_STEPS))], axis=-1).reshape(-1, 3)
         places_m, normal = transform_points(T_camera_board, grid), T_camera_board[:3, 2]
-        (in_plane, across), guessed = (
-            registration_error_m(T, self.truth[number], places_m, normal)
-            for T in (registration.T_reference_view, self.guesses[number])
-        )
+        both = (registration.T_reference_view, self.guesses[number])
+        (in_plane, across), guessed = (registration_error_m(T, self.truth[number], places_m, normal) for T in both)
         predicted = predicted_error_m(registration, places_m, normal)
         return {
             "view": number,

@@ -429,13 +429,10 @@ def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
         with path.open("rb") as stream:
             files.append({"path": str(path), "sha256": hashlib.file_digest(stream, "sha256").hexdigest()})
     scale_mm = evidence.scale_m / MM
+    threshold_mm = None if evidence.unit else run.threshold * scale_mm
     return {
         **facts,
-        "threshold": {
-            "k": run.threshold,
-            "mm": None if evidence.unit else run.threshold * scale_mm,
-            "from": run.origin,
-        },
+        "threshold": {"k": run.threshold, "mm": threshold_mm, "from": run.origin},
         "warnings": evidence.warnings,
         "missing_returns": None if run.result.missing is None else run.result.missing.facts,
         "surface": {"one_unit_of_score_mm": scale_mm, **evidence.notes},
