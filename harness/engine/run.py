@@ -319,7 +319,6 @@ class _Run:
                 continue
             self._journal.write(work.key, ended)
             self.outcome.peak_mb = max(self.outcome.peak_mb, ended.peak_mb)
-            self.outcome.trials.seconds += ended.seconds
             self.outcome.trials.done += ended.state == "done"
             self._count(work, ended)
         self._report(self.outcome)

@@ -242,15 +242,13 @@ class Point:
     """A resolved experiment without axes. ``values``: dotted path -> value, for the paths that make the point.
     ``variant``: label of its set-up or variation; ``label`` tells points apart. ``axes``: resolved values of all axes
     but the number of frames, which tell set-ups apart. ``reference``: of a variation the set-up with the same ``axes``
-    ("" for none), else the point's own. ``digest`` names the point's numbers, ``frames_key`` those of its frames
-    (source and seed), ``render_key`` those of its render."""
+    ("" for none), else the point's own. ``digest`` names the point's numbers, ``frames_key`` those of its frames."""
 
     label: str
     variant: str
     values: Mapping[str, Any]
     config: ExperimentConfig
     digest: str
-    render_key: str
     frames_key: str
     axes: Mapping[str, Any] = field(default_factory=dict)
     is_variation: bool = False
@@ -284,13 +282,12 @@ def point_of(label: str, variant: str, values: Mapping[str, Any], config: Experi
         files = [[file.name, file_digest(file)] for file in recording_of(source).files]
         camera_name = lens_names().get(source.intrinsics or "")
         named = load_camera(camera_name).lens.to_data() if camera_name else None
-        render = frames = {"kind": source.kind, "files": files, "unit": source.unit, "lens": named}
+        frames = {"kind": source.kind, "files": files, "unit": source.unit, "lens": named}
     else:
         # the full target (of a family of boards what they are drawn from) and the camera's numbers
         drawn = isinstance(source.target, DrawnTargetConfig)
         target = source.target.to_data() if drawn else source.target.declare().to_data()
         camera, work = camera_of(source.camera), source.render.to_data()
-        render = {"target": target, "optics": camera.optics.content(), "render": work}
         frames = {"kind": source.kind, "target": target, "render": work}
         frames["camera"] = {**source.camera.to_data(), "name": camera.name, "facts": camera_digest(camera)}
         frames |= {} if source.views is None else {"views": source.views.to_data()}
@@ -299,7 +296,7 @@ def point_of(label: str, variant: str, values: Mapping[str, Any], config: Experi
     offer = DETECTORS.offer(config.detector.name)
     numbers |= {} if offer.built_in else {"detector_from": offer.origin}
     frames_key = digest({"source": frames, "seed": config.seed})
-    return Point(label, variant, values, config, digest(numbers), digest(render), frames_key)
+    return Point(label, variant, values, config, digest(numbers), frames_key)
 
 
 def detector_version(config: ExperimentConfig) -> int:
