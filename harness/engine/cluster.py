@@ -21,6 +21,7 @@ import warnings
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,7 @@ class Bundle:
 
 @dataclass(frozen=True)
 class NodeFacts:
-    """A node's description of itself. ``digests``: of code and packages by stage, without those that are not installed;
+    """What a node says of itself. ``digests``: of code and packages by stage, without those that are not installed;
     ``processes``: jobs at once; ``sees``: content of the file that it was asked for."""
 
     python: str
@@ -70,9 +71,8 @@ class _Node:
     """A node that takes jobs. ``bundles``: those under way, by number, ``renders`` of them renders."""
 
     address: str
-    processes: int
+    facts: NodeFacts
     can_render: bool
-    offers_render: bool
     bundles: dict[int, Bundle] = field(default_factory=dict)
     renders: int = 0
 
@@ -133,7 +133,7 @@ class ClusterEngine:
     def room(self, stage: Stage) -> int:
         """Room for as much as keeps all nodes busy, and the next bundles ready."""
         each = 1 if stage == "renders" else WITH_NODE * self._bundle_size() + 1
-        return max(1, each * sum(one.processes for one in self._nodes.values())) + 1 - self._out[stage]
+        return max(1, each * sum(one.facts.processes for one in self._nodes.values())) + 1 - self._out[stage]
 
     def submit(self, job: Job) -> None:
         """Take a job."""
@@ -156,19 +156,19 @@ class ClusterEngine:
     def _hand_out(self) -> None:
         """Send every node a bundle of trials, then a second one, and renders where it may render."""
         renders, trials = self._waiting["renders"], self._waiting["trials"]
-        some_offer = any(one.offers_render and one.can_render for one in self._nodes.values())
-        for most in range(WITH_NODE):
-            for to in list(self._nodes.values()):
-                may_render = to.can_render and (to.offers_render or not some_offer)
-                # a node of one process does one thing at a time: trials first, as renders make more of them, but
-                # where nodes are set aside for renders, these first there
-                may_render &= to.processes > 1 or not (to.bundles or (trials and not to.offers_render))
-                if renders and may_render and to.renders < min(MOST_RENDERERS, to.processes):
-                    self._send(to, (renders.popleft(),))
-                elif trials and len(to.bundles) - to.renders <= most and not (to.processes == 1 and to.renders):
-                    share = -(-len(trials) // (WITH_NODE * len(self._nodes)))
-                    count = min(self._bundle_size() * to.processes, max(share, to.processes), len(trials))
-                    self._send(to, tuple(trials.popleft() for _ in range(count)))
+        some_offer = any(one.facts.offers_render and one.can_render for one in self._nodes.values())
+        for most, to in product(range(WITH_NODE), list(self._nodes.values())):
+            processes, offers = to.facts.processes, to.facts.offers_render
+            # a node of one process does one thing at a time: trials first, as renders make more of them, but where
+            # nodes are set aside for renders, these first there
+            may_render = to.can_render and (offers or not some_offer)
+            may_render &= processes > 1 or not (to.bundles or (trials and not offers))
+            if renders and may_render and to.renders < min(MOST_RENDERERS, processes):
+                self._send(to, (renders.popleft(),))
+            elif trials and len(to.bundles) - to.renders <= most and not (processes == 1 and to.renders):
+                share = -(-len(trials) // (WITH_NODE * len(self._nodes)))
+                count = min(self._bundle_size() * processes, max(share, processes), len(trials))
+                self._send(to, tuple(trials.popleft() for _ in range(count)))
 
     def _send(self, to: _Node, jobs: tuple[Job, ...]) -> None:
         self._number += 1
@@ -185,9 +185,8 @@ class ClusterEngine:
             for pause_s in (0.0,) if number is not None else (0.0, 0.2, 1.0, 3.0):
                 await asyncio.sleep(pause_s)
                 try:
-                    calling = self._client.run(
-                        function, *arguments, workers=[address], on_error="return", asynchronous=True
-                    )
+                    given = {"workers": [address], "on_error": "return", "asynchronous": True}
+                    calling = self._client.run(function, *arguments, **given)
                     answers = await (calling if number is not None else asyncio.wait_for(calling, EXAMINED_S))
                     said = answers.get(address, OSError("no answer"))
                 except Exception as error:
@@ -271,7 +270,7 @@ class ClusterEngine:
             self._refuse(address, UserError(message, fix="name a folder with --out that all machines share"))
         else:
             can_render = said.digests.get("renders") == self._digests.get("renders")
-            self._nodes[address] = _Node(address, said.processes, can_render, said.offers_render)
+            self._nodes[address] = _Node(address, said, can_render)
 
     def _refuse(self, address: str, why: UserError) -> None:
         self._refused[address] = why
