@@ -1,5 +1,4 @@
-"""What `harness.ls` lists and `harness.clean` removes: plug-ins, folders of results and stored renders. Only files
-that tofpod wrote inside ``--out`` are removed; listing only reads, and no link is followed."""
+"""What `harness.ls` lists and `harness.clean` removes: only what tofpod wrote in ``--out``, never through a link."""
 
 from __future__ import annotations
 
@@ -170,8 +169,7 @@ def leaves(data: Mapping[str, Any], path: tuple[str, ...] = ()) -> Iterator[tupl
 
 
 def reference() -> str:
-    """Return every key of an experiment and every setting of tofpod's detectors, in Markdown: what is legal there, the
-    default, the meaning. Kinds with keys in common are told apart in the keys' names."""
+    """Return every key of an experiment and of tofpod's detectors in Markdown: legal, default, meaning."""
     from detectors import detector_type
     from harness.experiment.schema import ExperimentConfig
     from harness.vocabulary.declaration.shape import default_at, every_key, legal_at, plain
@@ -206,8 +204,7 @@ SHOWN_SETTINGS = 6
 
 
 def result_folders(out: Path, experiment: str | None = None) -> list[dict[str, Any]]:
-    """Describe every folder of results below ``out``, or of one experiment: `described`, ``limits`` of a study,
-    ``differs`` (settings that are not the same in all runs of the experiment) and ``is_latest``."""
+    """Return `described` of every folder, ``limits`` of a study, the settings in which it ``differs``, ``is_latest``."""
     found = []
     for parent in folders_in(out, EXPERIMENT_NAME):
         if experiment is not None and parent.name != experiment:

@@ -99,8 +99,7 @@ def _without_seconds(value: object) -> object:
 
 
 def _alike(first: Any, second: Any, *, in_tenth_um: bool = False) -> bool:
-    """Return whether two values agree as unlike processors make them agree: to a thousandth, or in mm to 1 um.
-    Whole numbers are counts, which must be equal, but for errors in tenths of a micrometre."""
+    """Return whether values agree as on unlike processors: to a thousandth, or 1 um; counts must be equal."""
     if isinstance(first, dict) and isinstance(second, dict) and first.keys() == second.keys():
         return all(_alike(first[name], second[name], in_tenth_um=name == "error_tenth_um") for name in first)
     if isinstance(first, list) and isinstance(second, list) and len(first) == len(second):

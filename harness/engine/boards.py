@@ -51,8 +51,7 @@ AGAIN = "run the command that wrote the data set again"
 
 @dataclass(frozen=True)
 class Sample:
-    """One board of a data set: the render that it needs, and the trial whose average it is. ``label``: ``good``, the
-    kind of its damage, or ``combined`` where it has several."""
+    """One board: the render that it needs, and the trial whose average it is. ``label``: good, kind, combined."""
 
     category: str
     split: str

@@ -22,8 +22,7 @@ from harness.vocabulary.provenance import RESULTS_VERSION, record
 
 
 def judge_captures(experiment: Experiment, out: Path, command: str) -> int:
-    """Judge every point's capture and write its findings to ``<folder>/<number>/``, and a table of all points; return
-    0. Without repeats and truth there are no rates, sizes against the truth and claims."""
+    """Judge every point's capture and write its findings to ``<folder>/<number>/``, and a table of all. Returns 0."""
     folder = experiment.folder(out)
     write_text(folder / EXPERIMENT.name, resolved_yaml(experiment))
     rows = []

@@ -59,8 +59,7 @@ def judge(
     hole_free: bool,
     learned: str | None = None,
 ) -> JudgedCloud:
-    """Judge one detector on one cloud. Without a threshold only the quiet one is found. ``radius_m``, ``overlap``: what
-    counts as a hit (`matched`). ``learned``: file of what the detector has learned."""
+    """Judge a detector on a cloud; without threshold only the quiet one is found. ``learned``: a file."""
     cloud = known.cloud
     detector = detector_for(known, detector_name, settings_json, hole_free=hole_free, learned=learned)
     evidence = detector.analyse(cloud)

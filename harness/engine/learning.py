@@ -18,8 +18,7 @@ from harness.engine.trial import TrialTask, cloud_of
 from harness.vocabulary.seeds import canonical_json
 
 LEARNING_BOARDS = 8
-"""Boards, outside of a study repeats of the one target, on which a detector learns, and on which nothing else is done:
-some 200,000 pixels of a board at 0.7 m, so that a spectrum is known to a few per cent."""
+"""Boards to learn on, and for nothing else: 200,000 pixels each at 0.7 m make a spectrum good to a few per cent."""
 
 
 def learns(detector: str, settings: dict[str, object]) -> bool:

@@ -186,8 +186,7 @@ class ShownDamage(NamedTuple):
 
 
 def shown_in(plan: SweepPlan, limits: Sequence[SetUpLimit]) -> Iterator[ShownDamage]:
-    """Yield the damages of each of the first few set-ups whose sizes lie nearest to 0.75, 1 and 1.25 of its limit:
-    a90/95 where demonstrated, else the estimate of a90, a50 or the middle size. One view's clouds only."""
+    """Yield the damages of the first few set-ups (single views) nearest to 0.75, 1 and 1.25 of the limit."""
     places = [(group, point) for group in plan.groups for point in group.points]
     by_place = {(point.variant, point.config.capture.frames): (group, point) for group, point in places}
     for limit in limits[:MOST_SET_UPS]:

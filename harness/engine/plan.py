@@ -290,8 +290,7 @@ class PlanPart(NamedTuple):
 
 
 def parts_of(plan: SweepPlan, shard: Shard) -> tuple[list[list[PlanPart]], list[list[PlanPart]]]:
-    """Cut a plan, by group, into parts that set its thresholds, those of learning first, and judged parts that are the
-    shard's. A group of which the shard judges nothing has neither."""
+    """Cut a plan, by group, into parts that set its thresholds, learning first, and the shard's judged parts."""
 
     def cut(number: int, batch: Batch, repeats: range, sets_threshold: bool) -> list[PlanPart]:
         starts = range(repeats.start, repeats.stop, MOST_REPEATS)

@@ -144,8 +144,7 @@ def threshold_of(point: Point, quiet: Iterable[tuple[float, float]]) -> float | 
 AHEAD = 4096
 """Trials that may wait to be run: enough for a thousand workers, and a few megabytes whatever the plan's size."""
 TRIES = 2
-"""A render whose process died is begun once more: two of them may have been too much for the memory. So is a trial that
-sets a threshold, since with another threshold all that was judged by it would be run again."""
+"""Tries of a render (two may have been too much for the memory), and of trials that set a threshold."""
 PARTS_AT_ONCE = 200  # parts that are looked up in the journal before the engine is asked again: some 0.1 s
 TOLD_WHOLE = 200  # failures whose traceback is kept in memory; of the others the journal has it
 

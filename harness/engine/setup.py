@@ -242,8 +242,7 @@ def known_view(set_up: SetUp, cloud: Cloud, *, hole_free: bool) -> KnownCloud:
 
 
 def known_map(first: SetUp, cloud: Cloud, T_reference_cloud: np.ndarray, *, hole_free: bool) -> KnownCloud:
-    """Return a map of several views, ``first`` being the reference view's set-up: the truth by each point's own place
-    (deep in a hole that was seen at an angle it is aside, within the margin round the damage)."""
+    """Return a map, ``first`` being the reference view's set-up, with the truth by each point's own place."""
     T_board_cloud = invert(first.T_camera_board) @ T_reference_cloud
     place = board_places_m(cloud, T_board_cloud)
     margin_m = INTACT_MARGIN_PX * max(first.pitch_mm) * MM

@@ -67,8 +67,7 @@ def averages_of(
 
 @lru_cache(maxsize=4)
 def flat_field_of(camera: CameraConfig, config: FlatFieldConfig, seed: int) -> FlatField:
-    """Return what a unit makes of a flat plane across its axis, with noise of its own, kept for the worker's next
-    trials. Raises UserError where no pixel has a range."""
+    """Return what a unit makes of a flat plane across its axis, kept. Raises UserError where no pixel has a range."""
     facts = camera_of(camera)
     view = plane_view(facts, facts.nominal_lens.whole, config.distance_m, FLAT_ALBEDO)
     capture = SimulatedUnit(facts, camera, view).capture(config.frames, seed, "flat field")

@@ -158,8 +158,7 @@ def _unseen(
 
 
 def _unseen_pose(optics: Optics, views: AnyViews | None, target: TargetConfig) -> tuple[KeyPath, UserError] | None:
-    """Return the mistake of the first pose (of several views the first view) from which the camera sees nothing of the
-    face, or none of it within its range; and the key that it concerns."""
+    """Return the mistake of the first pose that sees nothing of the face within range, and the key that it concerns."""
     try:
         poses = (target.pose,) if views is None else poses_of(views, target.pose)
     except ValidationError as error:

@@ -106,8 +106,7 @@ def mapping_of(arguments: argparse.Namespace) -> MappingConfig:
 
 
 def crop_from_text(text: str, target: int | None = None) -> dict[str, Any]:
-    """Return the crop's declaration from ``auto``, ``none``, ``box:..`` or ``polygon:..``, with the number of the
-    automatic crop's candidate where one is chosen. Raises UserError on anything else."""
+    """Return the crop's declaration from text, with the automatic crop's candidate. Raises UserError."""
     kind, _, values = text.partition(":")
     if target is not None and text != "auto":
         what = f"--target {target}: chooses among what --crop auto finds, and --crop {text} is another crop"

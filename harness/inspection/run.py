@@ -184,8 +184,7 @@ class Inspection:
 
 
 def inspect(arguments: argparse.Namespace) -> int:
-    """Open, average, register and merge several views, judge; print, and write with --out. Returns 0. Raises UserError
-    for faults of the files, a view that cannot be registered, and where nothing can be judged."""
+    """Open, average, register and merge views, judge, print, and write with --out. Returns 0. Raises UserError."""
     from detectors.flat_field import doubts, load_flat_field
     from detectors.views import View
     from harness.inspection.gauge import read_gauge, seen_on

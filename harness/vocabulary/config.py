@@ -8,8 +8,7 @@ from pydantic import BaseModel, ConfigDict, model_validator
 
 
 class Config(BaseModel):
-    """A declaration. Unknown keys, NaN, infinity, and text or booleans in place of numbers are refused. Fields carry
-    their unit in their name (``width_mm``)."""
+    """A declaration: no unknown keys, NaN, infinity, text or booleans as numbers; units in the fields' names."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 

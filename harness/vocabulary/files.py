@@ -154,8 +154,7 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """Yield an empty temporary folder beside ``path``; rename it to ``path`` on success, delete it on failure. Raises
-    UserError where ``path`` exists and is no empty folder, cannot be written, or the disk is full."""
+    """Yield a new folder beside ``path``, which gets its name on success. Raises UserError where it cannot be."""
     path = Path(path)
     if path.is_dir() and any(path.iterdir()):
         raise UserError(f"{path}: is not empty, and nothing is written over", fix="name a new folder with --out")

@@ -134,8 +134,7 @@ class Lens:
         return pixels.reshape(*points_camera_m.shape[:-1], 2)
 
     def images(self, points_camera_m: np.ndarray) -> np.ndarray:
-        """Tell which points (..., 3) have an image on the sensor, (...) bool: they lie in front of the camera, and the
-        ray of the pixel on which the projection puts them leads back to them."""
+        """Tell which points (..., 3) have an image, (...) bool: in front, and met by the ray of their own pixel."""
         ahead = points_camera_m[..., 2] > 0
         points = np.where(ahead[..., None], points_camera_m, [0.0, 0.0, 1.0])
         u, v = np.moveaxis(self.project(points), -1, 0)

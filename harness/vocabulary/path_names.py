@@ -30,8 +30,7 @@ def unit_of(path: str) -> str:
 
 
 def value_text(path: str, value: Any) -> str:
-    """A value on one line, short, with its unit where it is a number or a range of two; of a mapping which of several
-    it is, then each key and value; of a camera's file, its name."""
+    """A value on one short line, with its unit; of a mapping which of several it is, then its keys and values."""
     if isinstance(value, dict) and value:
         choice = next((key for key in CHOICES if key in value), "")
         rest = (f"{_split(key)[0]} {value_text(key, held)}" for key, held in value.items() if key != choice)

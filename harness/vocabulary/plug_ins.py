@@ -38,8 +38,7 @@ class Offer:
 
 @dataclass(frozen=True)
 class PlugIns:
-    """The names of one entry point group. ``noun`` is what one of them is called in messages; ``built_in`` gives
-    tofpod's own, name to target; ``fix`` is the advice on an unknown name."""
+    """The names of an entry point group: ``noun`` for messages, ``built_in`` ones by name, ``fix`` as advice."""
 
     group: str
     noun: str
