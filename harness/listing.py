@@ -204,7 +204,7 @@ SHOWN_SETTINGS = 6
 
 
 def result_folders(out: Path, experiment: str | None = None) -> list[dict[str, Any]]:
-    """Return `described` of every folder, ``limits`` of a study, the settings in which it ``differs``, ``is_latest``."""
+    """Return `described` of every folder with ``limits``, settings in which it ``differs``, ``is_latest``."""
     found = []
     for parent in folders_in(out, EXPERIMENT_NAME):
         if experiment is not None and parent.name != experiment:
