@@ -17,9 +17,8 @@ Build a target, render what a camera sees of it, draw noisy frames, average them
     (1, 'hole')
     >>> figure = tofpod.plot(found)  # a Figure of Matplotlib
 
-Examples below go on from this one. A real capture goes the same way from `load`. Whole experiments, with calibrated
-thresholds and intervals, are run by `sweep`. What a program refuses with a message is a `UserError` here.
-Units are SI; where they are not, names say so.
+Examples below go on from this one. A real capture goes the same way from `load`; whole experiments are run by `sweep`.
+What a program refuses with a message is a `UserError` here. Units are SI; where they are not, names say so.
 """
 
 from __future__ import annotations

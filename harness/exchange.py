@@ -209,7 +209,7 @@ def write_bag(folder: Path, view: ExportedView, is_mcap: bool) -> None:
 
 
 def frame_name(view: ExportedView) -> str:
-    """Return the name of a camera's optical frame; each view has its own, so that bags can be played together."""
+    """Return the name of a view's own optical frame, so that bags can be played together."""
     return f"{view.name}_depth_optical_frame"
 
 

@@ -1,9 +1,8 @@
 """``python -m harness.score PREDICTIONS --dataset DIR``: the detection limit of anybody's anomaly maps.
 
-A map is judged as a study judges a detector's score: the threshold is the lowest with the wanted rate of false calls on
-the good boards of ``validation``; pixels above it that chains of steps of at most `LINK_M` on the face join are a
-finding, which hits a damage by the experiment's rule (`harness.engine.judge.matched`); POD, a90 and a90/95 follow from
-hits and misses on ``test``, the rate of false calls from its good boards. Only pixels that are inspected count.
+A map is judged as a study judges a score: the threshold is the lowest with the wanted rate of false calls on the good
+boards of ``validation``; pixels above it that steps of at most `LINK_M` join are a finding, which hits a damage by the
+experiment's rule (`harness.engine.judge.matched`); limits follow from ``test``. Only inspected pixels count.
 
 AU-PRO is the area under the mean overlap of damages against the share of false pixels, up to `PRO_LIMIT` and divided by
 it (Bergmann et al., International Journal of Computer Vision 129 (2021), 1038), with each damage as a region.

@@ -6,7 +6,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import os
 import re
 import sys
 import time
@@ -225,19 +224,11 @@ def _held(path: Path, *, shared: bool) -> Iterator[None]:
     with opened_lock(path) as file:
         answer = lock(file, shared=shared, wait=False)
         if answer == "busy":
-            file.seek(0)
-            said = file.read(20).strip()
-            who = f" (process {said})" if said.isdigit() else ""
-            said = f"{path.parent}: another sweep is at work in this folder{who}"
+            said = f"{path.parent}: another sweep is at work in this folder"
             raise UserError(said, fix="wait for it, or name another folder with --out")
         if answer == "no locks":
             print(f"{path.parent}: cannot be locked on this system: start no second sweep in it", file=sys.stderr)
-        file.truncate(0)
-        if not shared:
-            file.write(f"{os.getpid()}\n")
-            file.flush()
         yield
-        file.truncate(0)
 
 
 # ---------------------------------------------------------------- options

@@ -241,13 +241,12 @@ Answer = Literal["held", "busy", "no locks"]
 """``busy``: another process holds it. ``no locks``: the system (Windows) or the file system knows none."""
 
 
-def opened_lock(path: Path) -> IO[str]:
+def opened_lock(path: Path) -> IO[bytes]:
     """Open a lock file, made where there is none. Raises OSError, or UserError where it is no regular file."""
-    with open_plain(path, os.O_RDWR | os.O_CREAT | os.O_APPEND) as file:
-        return os.fdopen(os.dup(file.fileno()), "a+", encoding="utf-8")
+    return open_plain(path, os.O_RDWR | os.O_CREAT | os.O_APPEND)
 
 
-def lock(file: IO[str], *, shared: bool, wait: bool) -> Answer:
+def lock(file: IO[bytes], *, shared: bool, wait: bool) -> Answer:
     """Lock an open file until it is closed."""
     try:
         import fcntl
