@@ -141,6 +141,7 @@ def threshold_of(point: Point, quiet: Iterable[tuple[float, float]]) -> float | 
         raise UserError(f"{message}, too little for a threshold") from error
 
 
+Report = Callable[[Outcome], None]
 AHEAD = 4096
 """Trials that may wait to be run: enough for a thousand workers, and a few megabytes whatever the plan's size."""
 TRIES = 2
@@ -153,7 +154,7 @@ def run_plan(
     plan: SweepPlan,
     journal: Journal,
     engine: JobEngine,
-    report: Callable[[Outcome], None],
+    report: Report,
     *,
     shard: Shard = WHOLE,
     retry_failed: bool = False,
@@ -249,20 +250,14 @@ class _Run:
     """The state of a run: jobs under way by name, views in the cache, views wanted after calibration by group."""
 
     def __init__(
-        self,
-        plan: SweepPlan,
-        journal: Journal,
-        engine: JobEngine,
-        report: Callable[[Outcome], None],
-        shard: Shard,
-        retry_failed: bool,
+        self, plan: SweepPlan, journal: Journal, engine: JobEngine, report: Report, shard: Shard, retry: bool
     ) -> None:
         self.outcome = Outcome()
         self.under_way: dict[str, _Trial | RenderJob] = {}
         self.there: set[Path] = set()
         self.judged_paths: dict[int, list[Path]] = {}
         self._groups, self._journal, self._engine, self._report = plan.groups, journal, engine, report
-        self._shard, self._retry_failed = shard, retry_failed
+        self._shard, self._retry_failed = shard, retry
         self._renders = {job.path: job for job in plan.renders}
         self._calibrations = [Calibration(group) for group in plan.groups]
         # by group, thresholds that agree with those in use, at which other shards have judged

@@ -151,6 +151,7 @@ def _cloud(capture: SimulatedCapture, totals: FrameTotals, left_out: tuple[LeftO
     )
 
 
+Clouds = Mapping[int, Cloud]  # one view's averages by number of frames
 BOARD_STEPS = 9  # places along each side of the board at which a registration's error is taken
 
 
@@ -159,11 +160,7 @@ class MapMaker:
     this trial's random errors of the poses. ``truth`` and ``guesses``: T_reference_view."""
 
     def __init__(
-        self,
-        set_ups: Sequence[SetUp],
-        clouds: Sequence[Mapping[int, Cloud]],
-        poses: AnyViews,
-        labels: Sequence[str | int],
+        self, set_ups: Sequence[SetUp], clouds: Sequence[Clouds], poses: AnyViews, labels: Sequence[str | int]
     ) -> None:
         self._set_ups, self._clouds = set_ups, clouds
         self._made: dict[str, Any] = {}
