@@ -23,25 +23,10 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from detectors.interface import Calibratable, Detection, Detector, Evidence, Measurement
-from harness.synthetic_clouds import (
-    DAMAGE,
-    DISTANCE_M,
-    LENS,
-    SHAPE,
-    cylinder,
-    plane,
-    synthetic_clouds,
-    with_gaps,
-    without,
-)
+from harness.synthetic_clouds import plane, synthetic_clouds, with_gaps, without
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud, Lens, MapViews, Region, transform_points
-
-__all__ = [
-    "CHECKS", "DAMAGE", "DISTANCE_M", "LENS", "SHAPE", "check_detector", "cylinder", "plane", "synthetic_clouds",
-    "with_gaps", "without",
-]  # fmt: skip
 
 
 def check_detector(
