@@ -11,14 +11,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from detectors import detector_names
-from harness.experiment.schema import (
-    DETECTOR_NAME,
-    CaptureSource,
-    ExperimentConfig,
-    SimulatedSource,
-    recording_of,
-    splices_of,
-)
+from harness.experiment.schema import CaptureSource, ExperimentConfig, SimulatedSource, recording_of, splices_of
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.diagnose import nearest, validated, wrong_choice
 from harness.vocabulary.declaration.yaml_source import KeyPath, Problem, Source
@@ -32,7 +25,7 @@ from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.thesis import AnyTargetConfig
 
-CAMERA_NAME = ("source", "camera", "name")
+CAMERA_NAME, DETECTOR_NAME = ("source", "camera", "name"), ("detector", "name")
 CAMERA_NUMBERS = ("source", "camera", "numbers")
 TARGET = ("source", "target")
 VIEWS = ("source", "views")

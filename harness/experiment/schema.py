@@ -215,7 +215,6 @@ class ExperimentConfig(Config):
         return self.source
 
 
-DETECTOR_NAME = ("detector", "name")
 DETECTOR_SETTINGS = ("detector", "settings")
 
 

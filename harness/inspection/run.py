@@ -16,16 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from harness.inspection import arguments as asked
 from harness.inspection import told
-from harness.inspection.arguments import (
-    DEFAULT_FALSE_CALLS,
-    PREFIX,
-    detector_of,
-    mapping_of,
-    opened,
-    read_poses,
-    refuse_misfits,
-)
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM
 from harness.vocabulary.provenance import RESULTS_VERSION
@@ -110,7 +102,7 @@ def threshold_of(
     if default is not None and arguments.false_calls is None:
         return float(default), "the detector's own", evidence
 
-    own = own_threshold(detector, cloud, evidence, arguments.false_calls or DEFAULT_FALSE_CALLS)
+    own = own_threshold(detector, cloud, evidence, arguments.false_calls or asked.DEFAULT_FALSE_CALLS)
     names = ("threshold", "expected", "low", "high", "peaks", "floor", "objects", "rim_pixels")
     notes = {**evidence.notes, "own_null": {name: getattr(own, name) for name in names}}
     told = f"{own.peaks} peaks towards the camera"
@@ -189,15 +181,15 @@ def inspect(arguments: argparse.Namespace) -> int:
     from detectors.views import View
     from harness.inspection.gauge import read_gauge, seen_on
 
-    config = mapping_of(arguments) if arguments.register is not None else None
+    config = asked.mapping_of(arguments) if arguments.register is not None else None
     paths = arguments.paths[: config.views] if config else arguments.paths
-    refuse_misfits(arguments, paths)
+    asked.refuse_misfits(arguments, paths)
     refuse_thresholds(arguments)
-    own_settings = [each for each in arguments.set if config is None or not each.startswith(PREFIX)]
-    detector, settings = detector_of(arguments, "none" if config else arguments.crop, own_settings)
+    own_settings = [each for each in arguments.set if config is None or not each.startswith(asked.PREFIX)]
+    detector, settings = asked.detector_of(arguments, "none" if config else arguments.crop, own_settings)
     gauge = read_gauge(arguments.gauge) if arguments.gauge else None
     field = load_flat_field(arguments.flat_field) if arguments.flat_field else None
-    guesses = read_poses(arguments.poses, len(paths)) if arguments.poses else (None,) * len(paths)
+    guesses = asked.read_poses(arguments.poses, len(paths)) if arguments.poses else (None,) * len(paths)
     recordings = [_opened(arguments, group) for group in ([[path] for path in paths] if config else [paths])]
     quiet = [] if arguments.quiet_capture is None else [_opened(arguments, [arguments.quiet_capture])]
 
@@ -241,7 +233,9 @@ def inspect(arguments: argparse.Namespace) -> int:
 def _opened(arguments: argparse.Namespace, paths: Sequence[Path]) -> Recording:
     names = ("unit", "topic", "array", "pitch", "raw")
     frames = slice(arguments.max_frames) if arguments.max_frames else None
-    return opened(paths, arguments.intrinsics, frames=frames, **{name: getattr(arguments, name) for name in names})
+    return asked.opened(
+        paths, arguments.intrinsics, frames=frames, **{name: getattr(arguments, name) for name in names}
+    )
 
 
 def _averaged(arguments: argparse.Namespace, recording: Recording, field: FlatField | None) -> Cloud:

@@ -14,15 +14,7 @@ from pydantic import ValidationError
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration import shape
-from harness.vocabulary.declaration.yaml_source import (
-    MAX_PROBLEMS,
-    DeclarationError,
-    KeyPath,
-    Place,
-    Problem,
-    Source,
-    in_order,
-)
+from harness.vocabulary.declaration.yaml_source import MAX_PROBLEMS, DeclarationError, KeyPath, Place, Problem, Source
 from harness.vocabulary.errors import UserError
 
 YES_AND_NO = {"yes": "true", "on": "true", "no": "false", "off": "false"}  # Booleans of YAML 1.1, text in YAML 1.2
@@ -89,7 +81,7 @@ def settings_of(model: type[C], data: Mapping[str, Any], what: str, within: str 
         source = Source(what, "", whole, {(): Place(what, 0, 1, "")}, {})
         declared = shape.Declared(Config if base else model, whole, {base: model} if base else {})
         problems = [replace(each, place=None) for each in problems_of(error, declared, source, base)]
-        told = [str(each).replace("\n", "\n  ") for each in in_order(problems)]
+        told = dict.fromkeys(str(each).replace("\n", "\n  ") for each in problems)
         raise UserError(f"{what}:\n  " + "\n  ".join(told)) from error
 
 
