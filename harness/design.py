@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,7 +18,6 @@ FILES = ("design.json", "design.png", "design.html")
 TARGETS = (30, 40, 60, 120)
 MOST_STUDIES = 100_000  # Simulated studies are kept in memory
 LEAST, MOST = 10, 10_000  # Targets of a study: as many rows as python -m harness.pod asks for; nobody makes more
-OWNERS = {"set_up": "study", "board_m2": "false_calls_per_m2"}  # Options that mean nothing without another
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -43,14 +41,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, metavar="DIR", help=f"write {', '.join(FILES)} there as well")
 
 
-@dataclass(frozen=True)
-class GuessedCurve:
-    """A curve, where it is from, sizes to choose from; face of a hole-free board, None if not known."""
-
-    curve: PodCurve
-    origin: str
-    sizes: tuple[float, float]
-    board_m2: float | None = None
+Guess = tuple["PodCurve", str, tuple[float, float], float | None]
+"""A curve, where it is from, sizes to choose from; face of a hole-free board in m2, None if not known."""
 
 
 @program(
@@ -74,13 +66,13 @@ def main(options: argparse.Namespace, command: str) -> int:
     _refuse_what_does_not_belong(options)
     guess = _guess(options)
     _check(options, guess)
-    unit, wanted = "mm" if options.unit is None else options.unit, options.false_calls_per_m2
-    area_m2 = guess.board_m2 if options.board_m2 is None else options.board_m2
+    (curve, origin, sizes, board_m2), wanted = guess, options.false_calls_per_m2
+    board_m2 = board_m2 if options.board_m2 is None else options.board_m2
     # its mistakes come before the simulation's minute; `_check` has asked for the area
-    free = plan.hole_free(wanted, area_m2 or 0.0) if wanted is not None else None
-    plans = plan.design(guess.curve, sorted(set(options.targets)), guess.sizes, studies=options.studies, seed=1)
+    free = plan.hole_free(wanted, board_m2 or 0.0) if wanted is not None else None
+    plans = plan.design(curve, sorted(set(options.targets)), sizes, studies=options.studies, seed=1)
     found = (plans, plan.recommend(plans, options.goal), options.goal, free)
-    design = StudyDesign(guess.curve, guess.origin, unit, guess.sizes, *found)
+    design = StudyDesign(curve, origin, "mm" if options.unit is None else options.unit, sizes, *found)
     show(design_parts(design))
     if options.out is not None:
         data, picture, page = (options.out / name for name in FILES)
@@ -102,12 +94,13 @@ def _refuse_what_does_not_belong(options: argparse.Namespace) -> None:
         legal = "--a50 SIZE --a90 SIZE --sizes FROM TO, or --study DIR"
         fix = "guess from what is known; a plan for a guess too good is a study that demonstrates nothing"
         raise UserError(f"{', '.join(missing)}: not told", legal=legal, fix=fix)
-    for name, owner in OWNERS.items():
-        if getattr(options, name) is not None and getattr(options, owner) is None:
-            raise UserError(f"{_flag(name)} belongs to {_flag(owner)}", fix=f"add {_flag(owner)}, or leave it out")
+    for name, owner in (("set-up", "study"), ("board-m2", "false-calls-per-m2")):
+        given, of = (getattr(options, each.replace("-", "_")) for each in (name, owner))
+        if given is not None and of is None:
+            raise UserError(f"--{name} belongs to --{owner}", fix=f"add --{owner}, or leave it out")
 
 
-def _guess(options: argparse.Namespace) -> GuessedCurve:
+def _guess(options: argparse.Namespace) -> Guess:
     """Return the curve that was told, or a study's, with the sizes that were told or inspected."""
     from harness.evaluation.pod.design import curve_through
     from harness.evaluation.study.limit import limit_of
@@ -115,7 +108,7 @@ def _guess(options: argparse.Namespace) -> GuessedCurve:
 
     if options.study is None:
         curve = curve_through(options.a50, options.a90, options.link or "logit", log_size=bool(options.log))
-        return GuessedCurve(curve, "as told", tuple(options.sizes))
+        return curve, "as told", tuple(options.sizes), None
     study = read_record(options.study)
     record = set_up_named(study, options.set_up)
     limit = limit_of(record)
@@ -125,35 +118,31 @@ def _guess(options: argparse.Namespace) -> GuessedCurve:
     curve, origin = limit.statement.curve, f"fitted to {study.name}, {record.label}"
     seen, boards = record.inspected.size_mm, record.unflawed.area_m2
     sizes = options.sizes or (float(seen.min()), float(seen.max()))
-    return GuessedCurve(curve, origin, tuple(sizes), float(boards.mean()) if len(boards) else None)
+    return curve, origin, tuple(sizes), float(boards.mean()) if len(boards) else None
 
 
-def _check(options: argparse.Namespace, guess: GuessedCurve) -> None:
+def _check(options: argparse.Namespace, guess: Guess) -> None:
     """Refuse what would fail after minutes, or give nonsense."""
-    (low, high), a50 = guess.sizes, guess.curve.size_at(0.5)
+    curve, _, (low, high), board_m2 = guess
+    a50, a90 = curve.size_at(0.5), curve.size_at(0.9)
     wrong = next((number for number in options.targets if not LEAST <= number <= MOST), None)
     # NaN compares false with everything, so every rule is written as what has to hold.
     rules = (
         (0 <= low < high < float("inf"), f"--sizes {low:g} {high:g}", "0 <= FROM < TO"),
         (low < a50 < high, f"sizes of {low:g} to {high:g} do not hold a50 = {a50:.4g}", "--sizes FROM < a50 < TO"),
-        (not guess.curve.log_size or low > 0, "--sizes from 0 under a logarithm", "FROM above 0"),
+        (not curve.log_size or low > 0, "--sizes from 0 under a logarithm", "FROM above 0"),
         (wrong is None, f"--targets {wrong}", f"{LEAST} to {MOST}; MIL-HDBK-1823A asks for 60 at least"),
         (LEAST <= options.studies <= MOST_STUDIES, f"--studies {options.studies}", f"{LEAST} to {MOST_STUDIES}"),
     )
     for holds, said, legal in rules:
         if not holds:
             raise UserError(said, legal=legal)
-    a90 = guess.curve.size_at(0.9)
     if options.goal is not None and not options.goal > a90:
         fix = "no study can be sure to demonstrate less than the truth: improve the detector, or want less"
         said = f"--goal {options.goal:g} is not above the guess's own {a90:.4g}"
         raise UserError(said, legal=f"more than {a90:.4g}", fix=fix)
-    if options.false_calls_per_m2 is not None and options.board_m2 is None and guess.board_m2 is None:
+    if options.false_calls_per_m2 is not None and options.board_m2 is None and board_m2 is None:
         raise UserError("--false-calls-per-m2 needs --board-m2: boards of which face?", legal="square metres")
-
-
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
 
 
 if __name__ == "__main__":

@@ -110,8 +110,7 @@ def main(options: argparse.Namespace, command: str) -> int:
         print(f"rendered {sum(len(one.implants) for one in made)} of {options.targets} damages", file=sys.stderr)
     longest = max(len(scan.frames) for scan in scans)
     frames = sorted(set(options.frames or (1, longest)))
-    found = judge_scans(scans, made, family, options.camera, judging, frames)
-    warnings = [COMPARED, *found.warnings]
+    tables, set_ups, warnings = judge_scans(scans, made, family, options.camera, judging, frames)
 
     area_m2 = sum(scan.area_m2 for scan in scans)
     said = f"{len(scans)} recording{'s' * (len(scans) > 1)} of {longest} frames, {area_m2:.3g} m² judged"
@@ -124,7 +123,7 @@ def main(options: argparse.Namespace, command: str) -> int:
         "detector": {"name": options.detector, "settings": settings},
         "family": family.to_data(),
     }
-    origin = record(command) | {"warnings": warnings, "seed": options.seed, "failures": []}
+    origin = record(command) | {"warnings": [COMPARED, *warnings], "seed": options.seed, "failures": []}
     title = f"Virtual damage in {said}"
     calls = f"{options.false_calls or DEFAULT_FALSE_CALLS:g} false calls a capture: the median over groups of frames."
     own = f"Set by the undamaged frames as harness.detect sets it, by noise towards the camera, for {calls}"
@@ -136,15 +135,15 @@ def main(options: argparse.Namespace, command: str) -> int:
         hit_radius_mm=options.hit_radius,
         false_calls_per_m2=None,
         provenance={**known, "thresholds": thresholds},
-        set_ups=found.set_ups,
+        set_ups=set_ups,
     )
     provenance = {**origin, "results_version": RESULTS_VERSION, "experiment": "implant", "digest": study.digest}
-    result = evaluate_study(study, found.tables, facts)
+    result = evaluate_study(study, tables, facts)
     write_text(options.out / STUDY.name, record_text(study))
     write_tables(options.out, {table: table.frame(rows) for table, rows in study_tables(result).items()}, provenance)
     write_text(options.out / PROVENANCE.name, json.dumps(provenance, indent=2) + "\n")
     page = write_study_report(options.out, result, (), provenance, to_yaml(facts), title)
-    show([*(f"warning: {text}" for text in warnings), *study_parts(result)])
+    show([*(f"warning: {text}" for text in (COMPARED, *warnings)), *study_parts(result)])
     print(f"report: {page}")
     return 0
 

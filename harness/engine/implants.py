@@ -233,20 +233,12 @@ def damages_placed(scan: Scan, family: DrawnTargetConfig, camera: str, purpose: 
     return drawn.model_copy(update=left)
 
 
-@dataclass(frozen=True, eq=False)
-class JudgedScans:
-    """The study's tables and records, one set-up for each number of frames; ``warnings``: full sentences."""
-
-    tables: ResultTables
-    set_ups: tuple[SetUpRecord, ...]
-    warnings: tuple[str, ...]
-
-
 def judge_scans(
     scans: Sequence[Scan], made: Sequence[Implanted], family: DrawnTargetConfig, camera: str, judging: Judging,
     frames: Sequence[int],
-) -> JudgedScans:  # fmt: skip
-    """Set a threshold for each number of frames, count false calls on the undamaged frames, and judge all placements.
+) -> tuple[ResultTables, tuple[SetUpRecord, ...], tuple[str, ...]]:  # fmt: skip
+    """Set a threshold for each number of frames, count false calls on the undamaged frames, and judge all placements;
+    return tables, a set-up for each number of frames, and warnings.
     Where a recording has two groups of so many frames or more, every second sets the threshold and the others are
     judged; else the same frames do both, and a warning says so."""
     rows: Rows = {name: [] for name in ("runs", "holes", *STUDY_TABLES)}
@@ -299,7 +291,7 @@ def judge_scans(
                 **judged_facts(holes, runs),
             )
         )
-    return JudgedScans(tables, tuple(set_ups), tuple(warnings))
+    return tables, tuple(set_ups), tuple(warnings)
 
 
 def _add(rows: Rows, judging: Judging, known: KnownCloud, threshold: float, named: dict[str, str | int]) -> None:
