@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import os
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -47,9 +46,7 @@ class PlugIns:
 
     def offers(self) -> tuple[Offer, ...]:
         """Return every offer, by name; a name that two packages claim stands there twice."""
-        # the folders in which packages are looked for, with the times of their last changes: installing changes them
-        places = tuple((place, _changed_ns(place or os.curdir)) for place in sys.path)
-        return _offers(self.group, tuple(self.built_in().items()), places)
+        return _offers(self.group, tuple(self.built_in().items()), tuple(sys.path))
 
     def names(self) -> tuple[str, ...]:
         """Every known name, sorted; a name that is taken twice is one of them."""
@@ -92,17 +89,8 @@ class PlugIns:
         return UserError(said, fix=fix)
 
 
-def _changed_ns(folder: str) -> int:
-    try:
-        return os.stat(folder).st_mtime_ns
-    except OSError:
-        return 0
-
-
 @lru_cache(maxsize=8)
-def _offers(
-    group: str, built_in: tuple[tuple[str, str], ...], _places: tuple[tuple[str, int], ...]
-) -> tuple[Offer, ...]:
+def _offers(group: str, built_in: tuple[tuple[str, str], ...], _path: tuple[str, ...]) -> tuple[Offer, ...]:
     """Return tofpod's own offers and the group's. Remembered: reading every installed package takes 7 ms."""
     from harness import __version__
 
