@@ -78,8 +78,7 @@ def categories_of(experiment: Experiment) -> dict[str, Point]:
     names, found = names_of(axes), dict[str, Point]()
     for point in points.values():
         said = []
-        for path in axes:
-            own = point.values[path]
+        for path, own in ((path, point.values[path]) for path in axes):
             text = value_text(path, differing(own, (value for value in values[path] if value != own)))
             said.append(f"{names[path]} {text}" if text[:1].isdigit() else text)
         name = re.sub(r"[^A-Za-z0-9.]+", "_", " ".join(said)).strip("_.") or experiment.config.name

@@ -43,10 +43,9 @@ def judge_captures(experiment: Experiment, out: Path, command: str) -> int:
             "provenance": record(command),
         }
         write_findings(folder / name, found, about, point.label or name, beside=pictures(choice))
-        counts = {"frames_used": cloud.n_frames, "frames_left_out": len(cloud.left_out)}
-        threshold = {"threshold_k": k, "threshold_mm": round(k * found.evidence.scale_m / MM, 4)}
-        rows.append({"point": name, "variant": point.variant, "what": point.label, **counts, **threshold})
-        rows[-1]["findings"] = len(found.findings)
+        row = {"point": name, "variant": point.variant, "what": point.label, "frames_used": cloud.n_frames}
+        row |= {"frames_left_out": len(cloud.left_out), "findings": len(found.findings), "threshold_k": k}
+        rows.append(row | {"threshold_mm": round(k * found.evidence.scale_m / MM, 4)})
         print_warnings(f"{name}: {text}" for text in (*(choice.warnings if choice else ()), *found.evidence.warnings))
         print(f"{name} {point.label}: {len(found.findings)} findings beyond {rows[-1]['threshold_mm']:.2f} mm")
         for left in cloud.left_out:

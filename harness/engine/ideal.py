@@ -70,23 +70,15 @@ def board_views(batch: Batch, points: tuple[Point, ...]) -> dict[int, BoardView]
     signals_m = _signatures_m(set_up, clear_z_m, surface, intact)
     seen = ndimage.binary_erosion(set_up.on_board, iterations=2) & np.isfinite(clear_z_m)
     inside = np.concatenate(list(set_up.outlines.values()))
-    views = {}
+    board, names = batch.board or 0, tuple(str(damage.id) for damage in set_up.truth)
+    facts = (float(np.prod(set_up.pitch_mm)) * MM**2, float((~np.isfinite(clear_z_m.ravel()[inside])).mean()))
+    shown, views = (np.nan_to_num(signals_m[:, *cut]), surface[:, *cut]), {}
     for point in {point.config.capture.frames: point for point in points}.values():
-        noise_m, known = _noise_m(set_up, clear_z_m, batch.board or 0, point, surface, intact)
+        noise_m, known = _noise_m(set_up, clear_z_m, board, point, surface, intact)
         deviation_m = _deviation_m(noise_m, known)
         sums = noise_sums(noise_m[:, *cut] / deviation_m[cut], known[:, *cut])
-        views[point.config.capture.frames] = BoardView(
-            batch.board or 0,
-            tuple(str(damage.id) for damage in set_up.truth),
-            seen[cut],
-            deviation_m[cut],
-            np.nan_to_num(signals_m[:, *cut]),
-            surface[:, *cut],
-            sums,
-            UNITS_A_BOARD,
-            float(np.prod(set_up.pitch_mm)) * MM**2,
-            float((~np.isfinite(clear_z_m.ravel()[inside])).mean()),
-        )
+        view = BoardView(board, names, seen[cut], deviation_m[cut], *shown, sums, UNITS_A_BOARD, *facts)
+        views[point.config.capture.frames] = view
     return views
 
 

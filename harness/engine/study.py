@@ -339,13 +339,12 @@ def failures_by_point(
     plan: SweepPlan, failures: Iterable[Failure], thresholds: Mapping[str, float]
 ) -> dict[str, list[Failure]]:
     """Return the failed trials of each point, by its digest."""
-    by_key = {failure.what: failure for failure in failures}
-    found: dict[str, list[Failure]] = {}
-    for group in plan.groups if by_key else ():
-        for batch in group.batches:
-            for key, task in group.trials(batch, thresholds if batch in group.then else {}):
-                for asked in task.points if key in by_key else ():
-                    found.setdefault(asked.digest, []).append(by_key[key])
+    by_key, found = {failure.what: failure for failure in failures}, dict[str, list[Failure]]()
+    every = [(group, batch) for group in plan.groups for batch in group.batches] if by_key else []
+    for group, batch in every:
+        for key, task in group.trials(batch, thresholds if batch in group.then else {}):
+            for asked in task.points if key in by_key else ():
+                found.setdefault(asked.digest, []).append(by_key[key])
     return found
 
 
@@ -354,14 +353,12 @@ def without_limit(
 ) -> list[str]:
     """Return sentences on the points that are not among the ``judged`` set-ups, with their commonest failure."""
     known, said = {(one.variant, one.frames) for one in judged}, dict[str, list[str]]()
-    by_name = {failure.what: failure for failure in outcome.failures}
-    for point in points:
-        if (point.variant, point.config.capture.frames) not in known:
-            own = [one for one in failed.get(point.digest, ()) if one.state != "skipped"]
-            causes = Counter(one.in_short for one in own).most_common(1)
-            threshold = by_name.get(f"threshold of {point.label}")
-            why = causes[0][0] if causes else threshold.in_short if threshold else "its trials did not end"
-            if own and all(one.state == "failed" and not one.is_bug for one in own):
-                why = f"the camera sees nothing of the board here that could be judged ({why})"
-            said.setdefault(why, []).append(point.label)
+    for point in (one for one in points if (one.variant, one.config.capture.frames) not in known):
+        own = [one for one in failed.get(point.digest, ()) if one.state != "skipped"]
+        causes = [one.in_short for one in own]
+        causes = causes or [one.in_short for one in outcome.failures if one.what == f"threshold of {point.label}"]
+        why = Counter([*causes, "its trials did not end"]).most_common(1)[0][0]
+        if own and all(one.state == "failed" and not one.is_bug for one in own):
+            why = f"the camera sees nothing of the board here that could be judged ({why})"
+        said.setdefault(why, []).append(point.label)
     return [f"no limit for {'; '.join(labels)}: {why}" for why, labels in said.items()]

@@ -119,10 +119,9 @@ def crop_from_text(text: str, target: int | None = None) -> dict[str, Any]:
     if kind in ("auto", "none") and not numbers:
         return {"kind": kind} if target is None else {"kind": kind, "target": target}
     if kind == "box" and len(numbers) == 6:
-        for axis, (low, high) in zip("xyz", pairs, strict=True):
-            if not low < high:
-                what = f"--crop {text}: {axis}0 = {low:g} is not below {axis}1 = {high:g}"
-                raise UserError(what, legal=LEGAL_CROP, fix="state the smaller bound of each axis first")
+        if not all(low < high for low, high in pairs):
+            what = f"--crop {text}: a lower bound is not below the upper one"
+            raise UserError(what, legal=LEGAL_CROP, fix="state the smaller bound of each axis first")
         return {"kind": "box", "x_mm": pairs[0], "y_mm": pairs[1], "z_mm": pairs[2], "range_max_m": None}
     if kind == "polygon" and len(numbers) >= 6 and len(numbers) % 2 == 0:
         return {"kind": "polygon", "vertices_px": pairs}
