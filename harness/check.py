@@ -50,11 +50,13 @@ def _options(parser: argparse.ArgumentParser) -> None:
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0, 1 where a set-up is worse or missing, 2 on a mistake of the user, 130 after Ctrl-C."""
-    from harness.compare import FILES, print_comparison, write_comparison
+    from harness.compare import FILES, write_comparison
     from harness.engine.study import run_study
     from harness.evaluation.study.record import read_record, record_text
     from harness.evaluation.study.verdict import ALPHA, compare_studies, fewest_boards
     from harness.experiment.load import load_experiment
+    from harness.report.compare import compare_parts
+    from harness.tables.text import show
     from harness.vocabulary.files import write_text
 
     experiment = load_experiment(options.experiment, options.overrides)
@@ -81,7 +83,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     comparison = None if baseline is None else compare_studies(baseline, found)
     if comparison is not None:
         print()
-        print_comparison(comparison)
+        show(compare_parts(comparison))
         write_comparison(comparison, folder, command)
         print(f"comparison with the baseline: {folder / FILES[1]}")
     if options.update or comparison is None:
