@@ -144,8 +144,7 @@ def threshold_of(point: Point, quiet: Iterable[tuple[float, float]]) -> float | 
 Report = Callable[[Outcome], None]
 AHEAD = 4096
 """Trials that may wait to be run: enough for a thousand workers, and a few megabytes whatever the plan's size."""
-TRIES = 2
-"""Tries of a render (two may have been too much for the memory), and of trials that set a threshold."""
+TRIES = 2  # Tries of a render (two may have been too much for the memory), and of trials that set a threshold
 PARTS_AT_ONCE = 200  # parts that are looked up in the journal before the engine is asked again: some 0.1 s
 TOLD_WHOLE = 200  # failures whose traceback is kept in memory; of the others the journal has it
 

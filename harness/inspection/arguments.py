@@ -168,8 +168,7 @@ LEGAL_POSES = (
     " `timestamp tx ty tz qx qy qz qw`, one for each view"
 )
 RIGID_WITHIN = 1e-4  # tolerance of R R' = 1 and of the quaternion's length: poses are written with four digits and more
-FARTHEST_M = 100.0
-"""Largest distance of two views of one target: poses in millimetres lie beyond."""
+FARTHEST_M = 100.0  # Largest distance of two views of one target: poses in millimetres lie beyond
 
 
 def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:

@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 
 GAUGE_VERSION = 1
 FEWEST_MARKS = 3
-SIDES = 8
-"""Directions around a hole in which judged points must lie: else a miss says nothing of its size."""
+SIDES = 8  # Directions around a hole in which judged points must lie: else a miss says nothing of its size
 WORST_FIT_MM = 2.0
 """Root mean square distance of marks from where the board has them, beyond which the board's place is doubtful."""
 Length = Annotated[float, Field(gt=0, le=5e3)]
