@@ -90,15 +90,14 @@ class ClusterEngine:
         self._digests = {stage: source_digest(*which) for stage, which in self._code.items()}
         self._client: Any = None
         self._nodes: dict[str, _Node] = {}
-        self._refused: dict[str, UserError] = {}
-        """Nodes that would give other numbers than this machine, by address: left out while others are there."""
+        self._refused: dict[str, UserError] = {}  # nodes of other numbers: left out while others are there
         self._asked: set[str] = set()  # addresses of nodes that were asked what they are
         self._waiting: dict[Stage, deque[Job]] = {"renders": deque(), "trials": deque()}
         self._done: list[tuple[Job, Ended]] = []
         self._out: Counter[Stage] = Counter()
         self._tries: Counter[str] = Counter()
+        # (address, number of the bundle, answer) of a node; without a number the answer is what the node is
         self._events: queue.SimpleQueue[tuple[str, int | None, Any]] = queue.SimpleQueue()
-        """(address, number of the bundle, answer) of a node; without a number the answer is what the node is."""
         self._number = 0
         self._mean_s = BUNDLE_S  # mean duration of a trial; at first as if each were worth a bundle of its own
         self._looked = float("-inf")
@@ -241,7 +240,7 @@ class ClusterEngine:
                 self._over(job, ended)
         elif isinstance(said, UserError):  # its processes run other code, or cannot start
             self._refuse(address, UserError(f"the worker at {_bare(address)}: {said.message}", fix=said.fix))
-            self._return(bundle.jobs)
+            self._waiting[bundle.jobs[0].stage].extendleft(reversed(bundle.jobs))
             self._gone(address)
         else:
             self._look_for_nodes()
@@ -287,14 +286,9 @@ class ClusterEngine:
         """Jobs that were at a node as it died run again; after `TRIES` such deaths they are taken for the cause."""
         self._tries.update(job.name for job in jobs)
         hopeless = [job for job in jobs if self._tries[job.name] >= TRIES]
-        self._return(tuple(job for job in jobs if job not in hopeless))
+        self._waiting[jobs[0].stage].extendleft(job for job in reversed(jobs) if job not in hopeless)
         for job in hopeless:
             self._over(job, Ended("crashed", why=why, worker=_bare(address)))
-
-    def _return(self, jobs: tuple[Job, ...]) -> None:
-        """Put jobs to the front of the queue."""
-        for job in reversed(jobs):
-            self._waiting[job.stage].appendleft(job)
 
     def _over(self, job: Job, ended: Ended) -> None:
         self._out[job.stage] -= 1
