@@ -405,8 +405,8 @@ def _compare(before: Look, after: Look, pixels: np.ndarray, T_after_before: np.n
     changed = int((np.isfinite(was) != np.isfinite(now)).sum())
     require(changed <= CROP_TOLERANCE * now.size, f"{how}, {changed} of {now.size} pixels gained or lost their score")
     tolerance = SCORE_TOLERANCE * max(float(np.nanmax(was)), 1e-12)
-    apart = {"a score": float(np.nanmax(np.abs(was - now))), "the quiet threshold": abs(before.quiet - after.quiet)}
-    for what, difference in apart.items():
+    changes = {"a score": float(np.nanmax(np.abs(was - now))), "the quiet threshold": abs(before.quiet - after.quiet)}
+    for what, difference in changes.items():
         require(difference <= tolerance, f"{how}, {what} changed by {difference:g} (allowed {tolerance:g})")
 
     # findings in the middle of the widest gap between scores from a fifth of the quiet threshold to it; where none is
