@@ -88,8 +88,7 @@ def _told(name: str, rest: list[str]) -> int:
 
 
 def _completion() -> str:
-    """Return a script that completes programs, their options and the experiments that come with tofpod; everything else
-    is a file's name."""
+    """Return a script that completes programs, options and experiments; all else is a file's name."""
     experiments, cases = sorted(path.stem for path in shipped("experiments").glob("*.yaml")), []
     for program in programs():
         actions = importlib.import_module(f"harness.{program}").main.parser()._actions

@@ -17,9 +17,8 @@ Build a target, render what a camera sees of it, draw noisy frames, average them
     (1, 'hole')
     >>> figure = tofpod.plot(found)  # a Figure of Matplotlib
 
-Examples below go on from this one. A real capture goes the same way from `load`. Whole experiments, with calibrated
-thresholds and intervals, are run by `sweep`. What a program refuses with a message is a `UserError` here.
-Units are SI; where they are not, names say so.
+Examples below go on from this one. A real capture goes the same way from `load`; whole experiments are run by `sweep`.
+What a program refuses with a message is a `UserError` here. Units are SI; where they are not, names say so.
 """
 
 from __future__ import annotations
@@ -179,8 +178,7 @@ def sweep(experiment: str | Path, *changes: str, out: str | Path = "results", jo
 
 
 def table(folder: str | Path, name: str) -> pd.DataFrame:
-    """Read a table of a folder of results; `results/README.md` explains them. Raises UserError where it has none of
-    that name."""
+    """Read a table of a folder of results (`results/README.md` explains them). Raises UserError where it has none."""
     import pandas as pd
 
     tables = {path.stem: path for path in sorted(Path(folder).glob("*.parquet"))}

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from harness.evaluation.atlas import LimitSurface
 
 STORED = "atlas.parquet"
-KINDS = {"hole": "through", "through-hole": "through", "blind-hole": "blind"}
+KINDS = {"hole": "through", "through-hole": "through", "blind-hole": "blind", "crack": "slot"}
 BEST = "matched"
 
 
@@ -51,16 +51,15 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.evaluation.atlas import surfaces_of
     from harness.tables.atlas import ATLAS, curves
     from harness.tables.schema import write_table
+    from scenes.sensor.camera import load_camera
 
     asked = sum(given is not None for given in (options.size, options.distance))
     if asked == 1 or (not asked and options.out is None):
-        raise UserError(
-            "a question needs --size and --distance",
-            legal="--damage hole --size 5mm --distance 1m, or --out DIR for the whole atlas",
-        )
+        legal = "--damage hole --size 5mm --distance 1m, or --out DIR for the whole atlas"
+        raise UserError("a question needs --size and --distance", legal=legal)
     limits, about = _read(options.atlas or shipped("baselines") / STORED)
     surfaces = surfaces_of(limits)
-    titles = _titles(surfaces)
+    titles = {name: load_camera(name).title for name in dict.fromkeys(surface.camera for surface in surfaces)}
     if asked:
         _answer(options, surfaces, titles, about)
     if options.out is not None:
@@ -95,13 +94,6 @@ def _read(path: Path) -> tuple[Any, dict[str, Any]]:
     if missing := [name for name in needed if name not in table.column_names]:
         raise UserError(f"{file}: it lacks the columns {', '.join(missing)}", legal=legal)
     return table.to_pandas(), json.loads((table.schema.metadata or {}).get(b"tofpod", b"{}"))
-
-
-def _titles(surfaces: Sequence[LimitSurface]) -> dict[str, str]:
-    """Return the cameras' titles by their names."""
-    from scenes.sensor.camera import load_camera
-
-    return {name: load_camera(name).title for name in dict.fromkeys(surface.camera for surface in surfaces)}
 
 
 def _warnings(cameras: Iterable[str]) -> list[str]:
@@ -150,24 +142,22 @@ def _answer(options: argparse.Namespace, surfaces: Sequence[LimitSurface], title
         print(f"warning: {text}")
     verdicts = [row.answer.verdict(size_mm) for row in rows]
     said = ", ".join(f"{name} for {verdicts.count(name)}" for name in ("no", "undecided") if name in verdicts)
-    answer = (
-        f"{damage_words(kind).capitalize()}s of {size_mm:g} mm at {distance_m:g} m are found nine times out of ten in "
-        f"{verdicts.count('yes')} of {many(len(rows), 'set-up')}" + (f" ({said})." if said else ".")
-    )
+    of_all = f"{verdicts.count('yes')} of {many(len(rows), 'set-up')}" + (f" ({said})." if said else ".")
+    asked_for = f"{damage_words(kind).capitalize()}s of {size_mm:g} mm at {distance_m:g} m"
+    answer = f"{asked_for} are found nine times out of ten in {of_all}"
     errors = [row.surface.error for row in rows if np.isfinite(row.surface.error)]
-    missed = (
-        f"; the surfaces miss set-ups left out by {100 * max(errors):.0f} % of a90 at the most (rms)" if errors else ""
-    )
-    notes = [
-        f"Simulated: one unit of each camera under the conditions of {about.get('experiment', 'the study')}.yaml"
-        f"{missed}.",
-        *(f"not answered: {reason}" for reason in refused),
-    ]
+    left_out = f"the surfaces miss set-ups left out by {100 * max(errors, default=0):.0f} % of a90 at the most (rms)"
+    missed = f"; {left_out}" if errors else ""
+    study = about.get("experiment", "the study")
+    notes = [f"Simulated: one unit of each camera, under the conditions of {study}.yaml{missed}."]
+    notes += [f"not answered: {reason}" for reason in refused]
     show([answer, ATLAS.grid(rows, terminal=True), *notes, f"computed exactly: {_exactly(rows[0], about)}"])
 
 
 def _chosen(options: argparse.Namespace, surfaces: Sequence[LimitSurface], kind: str) -> list[LimitSurface]:
     """Return the surfaces that a question is about. Raises UserError where a name is not in the atlas."""
+    from harness.vocabulary.declaration.diagnose import nearest
+
     detectors = list(dict.fromkeys(surface.detector for surface in surfaces))
     detector = options.detector or (BEST if BEST in detectors else detectors[0])
     given = (("camera", options.camera or ()), ("kind", [kind]), ("detector", [detector]))
@@ -175,8 +165,12 @@ def _chosen(options: argparse.Namespace, surfaces: Sequence[LimitSurface], kind:
         there = dict.fromkeys(getattr(surface, name) for surface in surfaces)
         if unknown := [one for one in wanted if one not in there]:
             option = "--damage" if name == "kind" else f"--{name}"
-            words = [word for word, kind in KINDS.items() if name == "kind" and kind in there]
-            raise UserError(f"{option} {', '.join(unknown)}: not in the atlas", legal=", ".join((*words, *there)))
+            legal = [*(word for word, kind in KINDS.items() if name == "kind" and kind in there), *there]
+            near = nearest(unknown[0], (*legal, *(KINDS if name == "kind" else ())))
+            meant = f"; did you mean {near!r}?" if near and near != unknown[0] else ""
+            said = f"{option} {', '.join(unknown)}: not in the atlas{meant}"
+            fix = "run a study of damage that is not in the atlas, such as tofpod sweep crack"
+            raise UserError(said, legal=", ".join(legal), fix=fix if name == "kind" else None)
     cameras = options.camera or [surface.camera for surface in surfaces]
     return [one for one in surfaces if one.kind == kind and one.detector == detector and one.camera in cameras]
 
@@ -193,11 +187,8 @@ def _exactly(row: Any, about: dict[str, Any]) -> str:
     """Return the command that computes one set-up of the answer by a study of its own."""
     from harness.evaluation import atlas
 
-    axes = {
-        atlas.CAMERA: row.surface.camera,
-        **{atlas.AXES[axis]: row.place[axis] for axis in ("distance_m", "frames")},
-    }
-    axes["capture.frames"] = int(axes.pop("frames"))
+    axes: dict[str, Any] = {atlas.CAMERA: row.surface.camera, "capture.frames": int(row.place["frames"])}
+    axes[atlas.AXES["distance_m"]] = row.place["distance_m"]
     parts = [f"tofpod sweep {about.get('experiment', 'atlas')}"]
     depth = row.place.get("depth_mm")
     if depth is not None or row.surface.kind != "through":

@@ -11,8 +11,7 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
 
 CAMERA_FILE = "my_camera.yaml"
-REPEATED = 0.15
-"""Relative error of the simulated noise from which on the camera file counts as wrong."""
+REPEATED = 0.15  # Relative error of the simulated noise from which on the camera file counts as wrong
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -27,9 +26,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--albedo", type=float, default=0.6, help="albedo that the surfaces are taken to have (default: 0.6)")
     add("--rate", type=float, metavar="FPS", help="frames per second (default: of --like, or 30)")
     add("--title", default="my camera", help="the camera's and the unit's name on page and certificate")
-    add(
-        "--certificate", action="store_true", help="write two pages to file or to send, certificate.html and .json, too"
-    )
+    add("--certificate", action="store_true", help="write two pages to send, certificate.html and .json, too")
     study = "results of harness.sweep with a study, or of harness.implant, whose limits the certificate quotes"
     add("--study", type=Path, metavar="DIR", help=study)
     about = "what the certificate says of the unit, such as serial=1234, firmware=1.6, warm-up='40 minutes'; repeat it"
@@ -95,8 +92,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     worst = max(np.nan_to_num(off, nan=1.0), default=0.0)
     warnings = [*(warning for recording in recordings for warning in recording.warnings), *found.doubts]
     if worst > REPEATED:
-        warnings.insert(0, f"{CAMERA_FILE} does not repeat the captures' noise, which it has wrong by up to"
-                           f" {100 * worst:.0f} %: limits that are simulated with it are wrong, too")  # fmt: skip
+        wrong = f"{CAMERA_FILE} has the captures' noise wrong by up to {100 * worst:.0f} %"
+        warnings.insert(0, f"{wrong}: limits that are simulated with it are wrong, too")
     elif noise:
         answer += f" {CAMERA_FILE} repeats it within {100 * worst:.0f} %."
     print_warnings(warnings)

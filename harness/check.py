@@ -5,13 +5,11 @@ set-up fails if its a90 or its rate of false calls has grown, or its signals ove
 than 10 % and the tests say that it is not by chance (0.1 % for the whole check); or if it has no limit any more, more
 failed trials, or is missing.
 
-What it sees, by `tests/validation/gate_power.py`, for 24 boards of ten blind holes and 24 of ten through-holes, 24
-hole-free boards, 48 to calibrate on: with 1.2 and 1.4 times the camera's noise and with 1.2 times the threshold all of
-100 checks each fail; with another draw of all noise alone 4 of 1,000 (95 %: 0.1 to 1.0 %). The depth of blind holes
-grows in proportion to noise and threshold; the diameter of through-holes hardly does (d ln a90 / d ln threshold is 0.04
-to 0.25), so it stands for what happens to few pixels. Where both thresholds were calibrated anew, a90 must grow by more
-than two standard errors of that above the 10 % (`harness.evaluation.study.verdict.limit_margin`).
-With the same seed and code nothing fails that is the same.
+Of 100 checks each with 1.2 and 1.4 times the camera's noise and with 1.2 times the threshold all fail; with another
+draw of all noise alone 4 of 1,000 (95 %: 0.1 to 1.0 %; `tests/validation/gate_power.py`, boards as of regression.yaml).
+The diameter of through-holes hardly follows noise and threshold, the depth of blind holes does in proportion. Where
+both thresholds were calibrated anew, a90 must grow by more than two standard errors of that above the 10 %
+(`harness.evaluation.study.verdict.limit_margin`). With the same seed and code nothing fails that is the same.
 """
 
 from __future__ import annotations
@@ -29,8 +27,7 @@ from harness.vocabulary.program import program
 if TYPE_CHECKING:
     from harness.evaluation.study.record import StudyRecord
 
-BASELINES = shipped("baselines")
-"""Folder of the committed baselines, one ``<name of the experiment>.json`` each."""
+BASELINES = shipped("baselines")  # Folder of the committed baselines, one ``<name of the experiment>.json`` each
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -53,11 +50,13 @@ def _options(parser: argparse.ArgumentParser) -> None:
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0, 1 where a set-up is worse or missing, 2 on a mistake of the user, 130 after Ctrl-C."""
-    from harness.compare import FILES, print_comparison, write_comparison
+    from harness.compare import FILES, write_comparison
     from harness.engine.study import run_study
     from harness.evaluation.study.record import read_record, record_text
     from harness.evaluation.study.verdict import ALPHA, compare_studies, fewest_boards
     from harness.experiment.load import load_experiment
+    from harness.report.compare import compare_parts
+    from harness.tables.text import show
     from harness.vocabulary.files import write_text
 
     experiment = load_experiment(options.experiment, options.overrides)
@@ -84,7 +83,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     comparison = None if baseline is None else compare_studies(baseline, found)
     if comparison is not None:
         print()
-        print_comparison(comparison)
+        show(compare_parts(comparison))
         write_comparison(comparison, folder, command)
         print(f"comparison with the baseline: {folder / FILES[1]}")
     if options.update or comparison is None:

@@ -21,9 +21,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     results.add_argument("name", metavar="NAME[/DIGEST]", help="as python -m harness.ls results names it")
     results.set_defaults(run=_clean_results)
     for part in (cache, results):
-        part.add_argument(
-            "--out", type=Path, default=Path("results"), metavar="DIR", help="where results are (default: results)"
-        )
+        where = "where results are (default: results)"
+        part.add_argument("--out", type=Path, default=Path("results"), metavar="DIR", help=where)
         part.add_argument("--dry-run", action="store_true", help="say what would be removed; remove nothing")
         part.add_argument("--yes", action="store_true", help="do not ask")
 

@@ -24,7 +24,6 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("second", type=Path, metavar="B", help="likewise; the question is whether B is worse or better than A")
     level = "level of the tests, all set-ups together (default: 0.05)"
     add("--alpha", type=float, default=0.05, metavar="P", help=level)
-    add("--json", action="store_true", help="print JSON instead of the table")
     add("--out", type=Path, metavar="DIR", help=f"write {' and '.join(FILES)} there as well")
 
 
@@ -40,6 +39,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0 whatever the comparison says, 2 on a mistake of the user, 130 after Ctrl-C."""
     from harness.evaluation.study.record import read_record
     from harness.evaluation.study.verdict import compare_studies, paired_set_ups
+    from harness.report.compare import compare_parts
+    from harness.tables.text import show
 
     if not 1e-6 <= options.alpha <= 0.5:
         raise UserError(f"--alpha {options.alpha:g}", legal="1e-6 to 0.5")
@@ -50,23 +51,11 @@ def main(options: argparse.Namespace, command: str) -> int:
         legal = "set-ups of the same name, or at the same values on the axes, and frames; or one set-up in each"
         raise UserError(said, legal=legal, fix="run both studies with the same `sweep`, or each with a single set-up")
     comparison = compare_studies(first, second, options.alpha)
-    print_comparison(comparison, as_json=options.json)
+    show(compare_parts(comparison))
     if options.out is not None:
         write_comparison(comparison, options.out, command)
-        # On stdout it would be no JSON any more.
-        print(f"wrote {', '.join(str(options.out / name) for name in FILES)}", file=sys.stderr)
+        print(f"wrote {', '.join(str(options.out / name) for name in FILES)}")
     return 0
-
-
-def print_comparison(comparison: Comparison, *, as_json: bool = False) -> None:
-    """Print the table, in colour on a terminal; or JSON."""
-    from harness.report.compare import compare_data, compare_parts
-    from harness.tables.text import show
-
-    if as_json:
-        print(json.dumps(compare_data(comparison), indent=2, allow_nan=False))
-    else:
-        show(compare_parts(comparison))
 
 
 def write_comparison(comparison: Comparison, folder: Path, command: str) -> None:

@@ -19,10 +19,8 @@ if TYPE_CHECKING:
 
 TILTS_DEG, GOAL_TILTS_DEG = (-40.0, -20.0, 0.0, 20.0, 40.0), (-30.0, 0.0, 30.0)
 """Tilts about x and about y among which poses are suggested, and among which a goal is sought."""
-GOAL_DISTANCES = (0.7, 1.0, 1.4)
-"""Distances, over the experiment's own, at which a goal is sought."""
-MOST_POSES, MOVE_S = 6, 10.0
-"""Poses of one way to a goal at most, and seconds to move the camera between two of them."""
+GOAL_DISTANCES = (0.7, 1.0, 1.4)  # Distances, over the experiment's own, at which a goal is sought
+MOST_POSES, MOVE_S = 6, 10.0  # Poses of one way to a goal at most, and seconds to move the camera between two of them
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -33,14 +31,9 @@ def _options(parser: argparse.ArgumentParser) -> None:
     pose = "distance in metres and tilts of the part about x and y in degrees, such as 0.7,20,-10; may be repeated"
     add("--pose", action="append", type=_pose, metavar="M,DEG,DEG", help=f"{pose} (default: the experiment's, frontal)")
     add("--size", metavar="LENGTH", help="the wanted size, as 5mm (default: the largest of the experiment)")
-    grid = f"tilts of {TILTS_DEG[0]:g} to {TILTS_DEG[-1]:g}° about x and about y in steps of 20°, not both at the ends"
-    best = f"add the best N poses, one after another, of {grid}"
+    best = "add the best N poses, one after another, of tilts from -40 to 40° about x and about y"
     add("--suggest", type=whole_number(20), default=0, metavar="N", help=best)
-    goal = (
-        "seek the least time of capture that finds this size on the wanted share: all set-ups of the experiment, at "
-        f"{', '.join(f'{one:g}' for one in GOAL_DISTANCES)} of its distance, tilts of -30, 0 and 30°, up to "
-        f"{MOST_POSES} poses with {MOVE_S:g} s between them"
-    )
+    goal = "seek the least time of capture that finds this size on the share: all set-ups, distances, tilts and poses"
     add("--goal", metavar="LENGTH", help=goal)
     add("--share", type=float, default=0.9, help="of the face, for --goal (default: 0.9)")
     add("--out", type=Path, metavar="DIR", help="default: results/coverage/ and the experiment's name")
@@ -70,7 +63,7 @@ def _pose(text: str) -> Pose:
 def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0 (also where a goal is not reached), 2 on a mistake of the user, 130 after Ctrl-C."""
     from harness.ask import length_m
-    from harness.engine.coverage import declared, survey
+    from harness.engine.coverage import declared, refuse_size, survey
     from harness.engine.tables import write_tables
     from harness.engine.work import EngineOptions, engine_of, locked
     from harness.experiment.load import load_experiment, resolved_yaml
@@ -94,6 +87,8 @@ def main(options: argparse.Namespace, command: str) -> int:
         raise UserError(said, fix="choose one by --set, such as sweep={} and the values of its axes")
     asked = options.goal or options.size
     size_mm = length_m("--goal" if options.goal else "--size", asked) / MM if asked else None
+    for point in experiment.points if size_mm else ():
+        refuse_size(point.config, size_mm)
     given, further = _poses(options, declared(experiment.config)[1].distance_m)
     folder, cache = options.out or options.results / "coverage" / name, options.results / ".cache" / "renders"
     write_text(folder / EXPERIMENT.name, resolved_yaml(experiment))
@@ -103,9 +98,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     one, goals = surveys[0], []
     if options.goal:
         ways = (way for one in surveys for way in _ways(one, one.found.wanted_mm(size_mm), options.share))
-        goals = sorted(
-            ways, key=lambda way: (not way["reached"], way["capture_s"] if way["reached"] else -way["total_share"])
-        )
+        order = {True: "capture_s", False: "missing_share"}
+        goals = sorted(ways, key=lambda way: (not way["reached"], way[order[way["reached"]]]))
         one = goals[0]["survey"]
     wanted = one.found.wanted_mm(size_mm)
     poses = goals[0]["rows"] if goals else _rows(one, list(one.seen), wanted, len(given), options.suggest)
@@ -113,9 +107,8 @@ def main(options: argparse.Namespace, command: str) -> int:
         raise UserError(f"{name}: damage of {wanted:.3g} mm is found nowhere, in no pose", fix="ask for a larger size")
     each_mm, patches = np.stack([row["limits_mm"] for row in poses]), one.patches
     best, limits_mm = np.nan_to_num(each_mm, nan=np.inf).argmin(axis=0), np.fmin.reduce(each_mm)
-    facts = np.stack(
-        [[seen.deviation_m, seen.cosine, seen.range_m] for seen in (one.seen[row["pose"]] for row in poses)]
-    )
+    seen = [one.seen[row["pose"]] for row in poses]
+    facts = np.stack([[each.deviation_m, each.cosine, each.range_m] for each in seen])
     columns = [*(patches.points_m / MM).T, patches.areas_m2, limits_mm, best + 1]
     noise_m, cosine, range_m = facts[best, :, np.arange(len(best))].T
     columns += [noise_m / MM, np.degrees(np.arccos(cosine)), range_m]
@@ -125,10 +118,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     provenance = {**record(command), "results_version": RESULTS_VERSION, "experiment": name}
     provenance |= {"digest": experiment.digest, "seed": experiment.config.seed}
     write_tables(folder, {table: table.frame(each) for table, each in rows.items()}, provenance)
-    said, warnings = (
-        answer(one.found, patches, limits_mm, wanted, len(poses)),
-        warnings_of(one.found, one.seen),
-    )
+    warnings, said = warnings_of(one.found, one.seen), answer(one.found, patches, limits_mm, wanted, len(poses))
     if goals:
         word = "Cheapest" if goals[0]["reached"] else "The goal is not reached; nearest"
         frames = many(goals[0]["frames"], "frame")
@@ -184,7 +174,7 @@ def _ways(one: Survey, size_mm: float, share: float) -> list[dict[str, Any]]:
         way = {"set_up": in_words(one.point.variant), "camera": camera_title(camera.name), "frames": frames}
         way |= {"distance_m": distance_m, "poses": len(rows), "tilts": tilts}
         way |= {"total_share": covered, "capture_s": seconds}
-        ways.append({**way, "reached": covered >= share, "rows": rows, "survey": one})
+        ways.append({**way, "reached": covered >= share, "missing_share": 1 - covered, "rows": rows, "survey": one})
     return ways
 
 

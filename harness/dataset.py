@@ -58,7 +58,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     about = _about(experiment, options.licence, samples, command)
     if (out / INDEX).exists():
         if read_index(out)["content"] != about["content"]:
-            said = f"{out}: holds another data set: another experiment, number of boards or version of the code"
+            said = f"{out}: holds a data set of another experiment, number of boards or version of the code"
             raise UserError(said, fix="name a new folder with --out")
     elif out.is_dir() and any(out.iterdir()):
         raise UserError(f"{out}: is not empty, and nothing is written over", fix="name a new folder with --out")
@@ -125,10 +125,9 @@ def _written(out: Path, samples: list[Sample], engine: JobEngine) -> list[str]:
         def carry_out(jobs: list[Job], counts: StageCounts) -> dict[str, Any]:
             values = {}
             for job, ended in carried_out(jobs, engine):
-                done = ended.state == "done"
-                counts.done, counts.failed = counts.done + done, counts.failed + (not done)
-                values[job.name] = ended.value
-                failures.extend([] if done else [f"{job.name}: {ended.why.strip()}"])
+                values[job.name], is_done = ended.value, ended.state == "done"
+                counts.done, counts.failed = counts.done + is_done, counts.failed + (not is_done)
+                failures.extend([] if is_done else [f"{job.name}: {ended.why.strip()}"])
                 show(outcome)
             return values
 
@@ -140,10 +139,7 @@ def _written(out: Path, samples: list[Sample], engine: JobEngine) -> list[str]:
         for sample in samples:
             by_category.setdefault(sample.category, []).append(regions[sample.render.path.stem])
         windows = {category: joined(seen) for category, seen in by_category.items()}
-        boards = []
-        for sample in missing:
-            arguments = (out, sample, windows[sample.category])
-            boards.append(Job(sample.name, "trials", write_board, arguments))
+        boards = [Job(one.name, "trials", write_board, (out, one, windows[one.category])) for one in missing]
         carry_out(boards, outcome.trials)
     return failures
 

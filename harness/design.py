@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,21 +12,12 @@ from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
     from harness.evaluation.pod.curve import PodCurve
-    from harness.report.design import StudyDesign
 
 LINKS = ("logit", "probit", "cloglog", "loglog")
 FILES = ("design.json", "design.png", "design.html")
 TARGETS = (30, 40, 60, 120)
-MOST_STUDIES = 100_000
-"""Simulated studies are kept in memory."""
-LEAST, MOST = 10, 10_000
-"""Targets of a study: as many rows as python -m harness.pod asks for; nobody makes more."""
-FURTHEST = 2.0
-"""Times the largest size inspected: a90 beyond it is no plan's guess."""
-LEAST_SHARE = 0.1
-"""Share of a50 for the smallest size: a curve against the size itself may begin to rise below 0."""
-OWNERS = {"set_up": "study", "board_m2": "false_calls_per_m2"}
-"""Options that mean nothing without another."""
+MOST_STUDIES = 100_000  # Simulated studies are kept in memory
+LEAST, MOST = 10, 10_000  # Targets of a study: as many rows as python -m harness.pod asks for; nobody makes more
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -44,25 +34,15 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--targets", type=int, nargs="+", default=list(TARGETS), metavar="N", help="default: 30 40 60 120")
     goal = "the a90/95 wanted: recommend the fewest targets that are sure of it"
     add("--goal", type=float, metavar="SIZE", help=goal)
-    add("--pod", type=float, default=0.9, help="the 90 of a90/95 (default: 0.9)")
-    add("--confidence", type=float, default=0.95, help="the 95 of a90/95 (default: 0.95)")
     add("--studies", type=int, default=200, metavar="N", help="simulated for each plan (default: 200)")
-    add("--seed", type=int, default=1, help="of the simulated studies (default: 1)")
     put = parser.add_argument_group("hole-free boards").add_argument
     put("--false-calls-per-m2", type=float, metavar="RATE", help="wanted rate: how much has to be inspected for it")
     put("--board-m2", type=float, metavar="AREA", help="face of one hole-free board (default: the study's)")
-    add("--json", action="store_true", help="print JSON instead of the table")
     add("--out", type=Path, metavar="DIR", help=f"write {', '.join(FILES)} there as well")
 
 
-@dataclass(frozen=True)
-class GuessedCurve:
-    """A curve, where it is from, sizes to choose from; face of a hole-free board, None if not known."""
-
-    curve: PodCurve
-    origin: str
-    sizes: tuple[float, float]
-    board_m2: float | None = None
+Guess = tuple["PodCurve", str, tuple[float, float], float | None]
+"""A curve, where it is from, sizes to choose from; face of a hole-free board in m2, None if not known."""
 
 
 @program(
@@ -77,35 +57,30 @@ def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0 (also where no plan shows a limit), 2 on a mistake of the user, 130 after Ctrl-C."""
     import json
 
-    from harness.report.design import design_data, design_html, design_parts, save_design_png
+    from harness.evaluation.pod import design as plan
+    from harness.report.design import StudyDesign, design_data, design_html, design_parts, save_design_png
     from harness.tables.text import show
+    from harness.vocabulary.files import write_text
     from harness.vocabulary.provenance import RESULTS_VERSION
 
     _refuse_what_does_not_belong(options)
-    if options.study is not None:
-        guess = _from_study(options)
-    else:
-        from harness.evaluation.pod.design import curve_through
-
-        curve = curve_through(options.a50, options.a90, options.link or "logit", log_size=bool(options.log))
-        guess = GuessedCurve(curve, "as told", tuple(options.sizes))
+    guess = _guess(options)
     _check(options, guess)
-    design = _designed(options, guess)
-    told = {"results_version": RESULTS_VERSION, **design_data(design), "command": command}
-    data_text = json.dumps(told, indent=2, allow_nan=False)
-    if options.json:
-        print(data_text)
-    else:
-        show(design_parts(design))
+    (curve, origin, sizes, board_m2), wanted = guess, options.false_calls_per_m2
+    board_m2 = board_m2 if options.board_m2 is None else options.board_m2
+    # its mistakes come before the simulation's minute; `_check` has asked for the area
+    free = plan.hole_free(wanted, board_m2 or 0.0) if wanted is not None else None
+    plans = plan.design(curve, sorted(set(options.targets)), sizes, studies=options.studies, seed=1)
+    found = (plans, plan.recommend(plans, options.goal), options.goal, free)
+    design = StudyDesign(curve, origin, "mm" if options.unit is None else options.unit, sizes, *found)
+    show(design_parts(design))
     if options.out is not None:
-        from harness.vocabulary.files import write_text
-
         data, picture, page = (options.out / name for name in FILES)
-        write_text(data, data_text + "\n")
+        told = {"results_version": RESULTS_VERSION, **design_data(design), "command": command}
+        write_text(data, json.dumps(told, indent=2, allow_nan=False) + "\n")
         save_design_png(picture, design)
         write_text(page, design_html(design, command))
-        # On stdout it would be no JSON any more.
-        print(f"wrote {data}, {picture.name}, {page.name}", file=sys.stderr)
+        print(f"wrote {data}, {picture.name}, {page.name}")
     return 0
 
 
@@ -119,18 +94,21 @@ def _refuse_what_does_not_belong(options: argparse.Namespace) -> None:
         legal = "--a50 SIZE --a90 SIZE --sizes FROM TO, or --study DIR"
         fix = "guess from what is known; a plan for a guess too good is a study that demonstrates nothing"
         raise UserError(f"{', '.join(missing)}: not told", legal=legal, fix=fix)
-    for name, owner in OWNERS.items():
-        if getattr(options, name) is not None and getattr(options, owner) is None:
-            raise UserError(f"{_flag(name)} belongs to {_flag(owner)}", fix=f"add {_flag(owner)}, or leave it out")
+    for name, owner in (("set-up", "study"), ("board-m2", "false-calls-per-m2")):
+        given, of = (getattr(options, each.replace("-", "_")) for each in (name, owner))
+        if given is not None and of is None:
+            raise UserError(f"--{name} belongs to --{owner}", fix=f"add --{owner}, or leave it out")
 
 
-def _from_study(options: argparse.Namespace) -> GuessedCurve:
-    """The curve of the named set-up, or of the only one, and the sizes that the study inspected, widened to the curve's
-    whole rise where they do not hold its a50 or its a90."""
-    from harness.evaluation.pod.design import RISE
+def _guess(options: argparse.Namespace) -> Guess:
+    """Return the curve that was told, or a study's, with the sizes that were told or inspected."""
+    from harness.evaluation.pod.design import curve_through
     from harness.evaluation.study.limit import limit_of
     from harness.evaluation.study.record import read_record, set_up_named
 
+    if options.study is None:
+        curve = curve_through(options.a50, options.a90, options.link or "logit", log_size=bool(options.log))
+        return curve, "as told", tuple(options.sizes), None
     study = read_record(options.study)
     record = set_up_named(study, options.set_up)
     limit = limit_of(record)
@@ -139,69 +117,32 @@ def _from_study(options: argparse.Namespace) -> GuessedCurve:
         raise UserError(f"{options.study}: {record.label} has no curve to guess from: {limit.why}", fix=fix)
     curve, origin = limit.statement.curve, f"fitted to {study.name}, {record.label}"
     seen, boards = record.inspected.size_mm, record.unflawed.area_m2
-    low, high = inspected = float(seen.min()), float(seen.max())
-    if options.sizes is not None:
-        low, high = options.sizes
-    else:
-        a50, a90 = curve.size_at(0.5), curve.size_at(0.9)
-        if not a50 > 0 or a90 > FURTHEST * high:
-            said = (
-                f"the curve {origin} has a50 = {a50:.4g} and a90 = {a90:.4g} mm, and the study inspected {low:.4g} to"
-            )
-            fix = "run the study with damage of other sizes, or tell a guess: --a50 SIZE --a90 SIZE --sizes FROM TO"
-            raise UserError(f"{said} {high:.4g} mm: it says too little about the rise of the curve", fix=fix)
-        if not low < a50:
-            low = max(curve.size_at(RISE[0]), LEAST_SHARE * a50)
-        if not a90 < high:
-            high = min(max(high, curve.size_at(RISE[1])), FURTHEST * high)
-        if (low, high) != inspected:
-            origin += f"; sizes beyond the {inspected[0]:.4g} to {inspected[1]:.4g} mm that it inspected"
-    return GuessedCurve(curve, origin, (low, high), float(boards.mean()) if len(boards) else None)
+    sizes = options.sizes or (float(seen.min()), float(seen.max()))
+    return curve, origin, tuple(sizes), float(boards.mean()) if len(boards) else None
 
 
-def _check(options: argparse.Namespace, guess: GuessedCurve) -> None:
+def _check(options: argparse.Namespace, guess: Guess) -> None:
     """Refuse what would fail after minutes, or give nonsense."""
-    (low, high), a50 = guess.sizes, guess.curve.size_at(0.5)
+    curve, _, (low, high), board_m2 = guess
+    a50, a90 = curve.size_at(0.5), curve.size_at(0.9)
     wrong = next((number for number in options.targets if not LEAST <= number <= MOST), None)
     # NaN compares false with everything, so every rule is written as what has to hold.
     rules = (
         (0 <= low < high < float("inf"), f"--sizes {low:g} {high:g}", "0 <= FROM < TO"),
-        (low < a50 < high, f"--sizes {low:g} {high:g} do not hold a50 = {a50:.4g}", f"FROM < {a50:.4g} < TO"),
-        (not guess.curve.log_size or low > 0, "--sizes from 0 under a logarithm", "FROM above 0"),
+        (low < a50 < high, f"sizes of {low:g} to {high:g} do not hold a50 = {a50:.4g}", "--sizes FROM < a50 < TO"),
+        (not curve.log_size or low > 0, "--sizes from 0 under a logarithm", "FROM above 0"),
         (wrong is None, f"--targets {wrong}", f"{LEAST} to {MOST}; MIL-HDBK-1823A asks for 60 at least"),
-        (0 < options.pod < 1, f"--pod {options.pod:g}", "0 < pod < 1"),
-        (0.5 < options.confidence < 1, f"--confidence {options.confidence:g}", "0.5 < confidence < 1"),
         (LEAST <= options.studies <= MOST_STUDIES, f"--studies {options.studies}", f"{LEAST} to {MOST_STUDIES}"),
     )
     for holds, said, legal in rules:
         if not holds:
             raise UserError(said, legal=legal)
-    a_pod = guess.curve.size_at(options.pod)
-    if options.goal is not None and not options.goal > a_pod:
-        legal = f"more than {a_pod:.4g}"
+    if options.goal is not None and not options.goal > a90:
         fix = "no study can be sure to demonstrate less than the truth: improve the detector, or want less"
-        raise UserError(f"--goal {options.goal:g} is not above the guess's own {a_pod:.4g}", legal=legal, fix=fix)
-    if options.false_calls_per_m2 is not None and options.board_m2 is None and guess.board_m2 is None:
+        said = f"--goal {options.goal:g} is not above the guess's own {a90:.4g}"
+        raise UserError(said, legal=f"more than {a90:.4g}", fix=fix)
+    if options.false_calls_per_m2 is not None and options.board_m2 is None and board_m2 is None:
         raise UserError("--false-calls-per-m2 needs --board-m2: boards of which face?", legal="square metres")
-
-
-def _designed(options: argparse.Namespace, guess: GuessedCurve) -> StudyDesign:
-    from harness.evaluation.pod import design as plan
-    from harness.report.design import StudyDesign
-
-    asked = {name: getattr(options, name) for name in ("pod", "confidence", "studies", "seed")}
-    area = guess.board_m2 if options.board_m2 is None else options.board_m2
-    wanted = options.false_calls_per_m2
-    # Its mistakes come before the simulation's minute; `_check` has asked for the area.
-    free = plan.hole_free(wanted, area or 0.0, options.confidence) if wanted is not None else None
-    plans = plan.design(guess.curve, sorted(set(options.targets)), guess.sizes, **asked)
-    recommended = plan.recommend(plans, options.goal)
-    unit, found = "mm" if options.unit is None else options.unit, (plans, recommended, options.goal, free)
-    return StudyDesign(guess.curve, guess.origin, unit, guess.sizes, *found)
-
-
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
 
 
 if __name__ == "__main__":

@@ -17,38 +17,22 @@ def _options(parser: argparse.ArgumentParser) -> None:
         " .bin; a ROS bag (folder, .mcap, .db3, .bag); a Stray Scanner folder; with --pitch a height map"
     )
     add("paths", nargs="+", type=Path, metavar="PATH", help=formats)
-    files = (
-        "write findings.csv, findings.json, annotated.png, targets.png (the surfaces to choose from), blind.png"
-        " (where nothing returned) and cloud.ply here; of several views merged.ply, registrations.json and view3d.html"
-        " (turns in the browser) too"
-    )
-    add("--out", type=Path, metavar="DIR", help=files)
-    unit = "unit of the stored distances: mm, m, cm, um, tum (5000/m) or N/m; default: what the file, the camera or"
-    add("--unit", help=f"{unit} the data say, which is printed")
-    lens = "the lens of the depth pixels: a file, or a camera's nominal lens by name"
-    add("--intrinsics", metavar="FILE|CAMERA", help=lens)
-    crop = (
-        f"which part is the target: {LEGAL_CROP}; default auto, the nearest large smooth surface less the 3 pixels"
-        " of its rim where the camera mixes in what is behind (depth aligned to a finer colour camera:"
-        " --set crop.inset_px=8)"
-    )
+    add("--out", type=Path, metavar="DIR", help="write tables, pictures and clouds here (docs/recordings.md)")
+    add("--unit", help="of the stored distances: mm, m, cm, um, tum (5000/m) or N/m; default: as the data say")
+    add("--intrinsics", metavar="FILE|CAMERA", help="lens of the depth pixels: a file, or a camera's nominal one")
+    crop = f"the target: {LEGAL_CROP}; auto: the nearest large smooth surface less 3 pixels of its rim (crop.inset_px)"
     add("--crop", default="auto", metavar="KIND", help=crop)
-    target = "with --crop auto: take surface N of those that a run lists and that targets.png, in --out, shows"
+    target = "with --crop auto: take surface N of those that a run lists and that targets.png shows"
     add("--target", type=whole_number(10**9), metavar="N", help=target)
     add("--detector", default=DEFAULT_DETECTOR, help=f"detector's name (default: {DEFAULT_DETECTOR})")
     setting = "detector's setting by dotted path: surface.degree=5"
     add("--set", action="append", default=[], metavar="KEY=VALUE", help=setting)
-    mesh = (
-        "the part's own mesh as its undamaged surface, laid onto the cloud; --set surface.reference.unit=m, .front=-y"
-    )
+    mesh = "the undamaged part's mesh, laid onto the cloud; --set surface.reference.unit=m, .front=-y"
     add("--reference", metavar="MESH", help=mesh)
     averages = ("mean", "median", "clipped")
     add("--average", choices=averages, default="mean", help="how frames are averaged (default: mean)")
     add("--max-frames", type=whole_number(10**9), metavar="N", help="use the first N frames only")
-    calls = (
-        "set the threshold so that N false calls are expected in this capture, by the noise that it shows towards"
-        f" the camera (default: {DEFAULT_FALSE_CALLS:g})"
-    )
+    calls = f"false calls expected here, by the noise towards the camera (default: {DEFAULT_FALSE_CALLS:g})"
     add("--false-calls", type=float, metavar="N", help=calls)
     add("--threshold", type=float, metavar="K", help="threshold in units of score instead")
     flat = "take this unit's fixed pattern, as harness.flatfield measured it, off each capture"
@@ -63,22 +47,16 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--raw", metavar="LAYOUT", help="of a file of bare numbers: WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]], 640x480:u2")
     add = parser.add_argument_group(
         "several views of one target",
-        "Each PATH is then one view. --crop cuts the target out of each; the detector judges all that is merged, unless"
-        " --set crop.kind=.. says otherwise. --set mapping.KEY=VALUE sets what the arguments below do not name, such as"
-        " mapping.merge.cell_mm=1, mapping.marks.dictionary=DICT_4X4_50 or mapping.registration.points=target (icp and"
-        " cpd then use the whole target; else the points of the marks, which need colour).",
+        "Each PATH is one view, --crop cuts the target out of each, and the detector judges all that is merged (or"
+        " --set crop.kind=..). --set mapping.KEY=VALUE sets the rest: mapping.merge.cell_mm=1,"
+        " mapping.marks.dictionary=DICT_4X4_50, mapping.registration.points=target (icp and cpd on the whole target,"
+        " not on the points of the marks).",
     ).add_argument
     add("--register", choices=METHODS, metavar="METHOD", help=f"register the views by {', '.join(METHODS)}")
     add("--merge", choices=MERGES, metavar="KIND", help=f"merge them by {', '.join(MERGES)} (default: fusion)")
-    marks = (
-        "the fiducial marks: colour (strips of any colour that stands apart; default), red (the thesis' rule),"
-        " coded (ArUco, AprilTag)"
-    )
+    marks = "marks: colour (strips that stand apart; default), red (the thesis' rule), coded (ArUco, AprilTag)"
     add("--marks", choices=MARKS, metavar="KIND", help=marks)
-    poses = (
-        "where the views are thought to stand: JSON, a list of 4x4 matrices to one common frame in metres, or"
-        " lines of TUM's groundtruth.txt, one a view; only a start for the registration"
-    )
+    poses = "where the views may stand, for a start: JSON with 4x4 matrices in metres, or TUM's groundtruth.txt"
     add("--poses", type=Path, metavar="FILE", help=poses)
 
 

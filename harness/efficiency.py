@@ -5,16 +5,11 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from harness.engine.work import add_engine_options, engine_options
 from harness.tables.outputs import EFFICIENCY_PAGE, EXPERIMENT, STUDY
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
-
-if TYPE_CHECKING:
-    from harness.evaluation.study.record import StudyRecord
-    from harness.experiment.schema import Experiment
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -40,6 +35,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.evaluation.study.efficiency import efficiency_of, warnings_of
     from harness.evaluation.study.limit import limit_of
     from harness.evaluation.study.record import read_record
+    from harness.experiment.load import load_experiment
     from harness.report.efficiency import efficiency_html, efficiency_parts
     from harness.tables.efficiency import DAMAGES, EFFICIENCY, damage_rows
     from harness.tables.text import show
@@ -52,8 +48,16 @@ def main(options: argparse.Namespace, command: str) -> int:
         raise UserError("--shard: efficiency needs the whole study", fix="leave it out")
     folder = options.results.resolve()
     study = read_record(folder)
-    experiment = _experiment(folder)
-    rate = _rate(study, experiment)
+    if not (folder / EXPERIMENT.name).is_file():
+        fix = f"name the folder in which the sweep left {EXPERIMENT.name} and {STUDY.name}"
+        raise UserError(f"{folder}: has no {EXPERIMENT.name}, which says what to simulate", fix=fix)
+    experiment, rate = load_experiment(folder / EXPERIMENT.name), study.false_calls_per_m2
+    if any(point.config.mapping is not None or point.config.simulated.views for point in experiment.points):
+        fix = "name a study of single views"
+        raise UserError(f"{study.name}: judges maps of several views, for which there is no ideal observer", fix=fix)
+    if rate is None:
+        fix = "run the study with threshold.calibrate"
+        raise UserError(f"{study.name}: its threshold was given, so there is no wanted rate of false calls", fix=fix)
     cache = folder.parents[1] / ".cache" / "renders"
     plan = plan_of(experiment, cache)
     detectors = {point.config.detector.name for point in experiment.points}
@@ -63,7 +67,14 @@ def main(options: argparse.Namespace, command: str) -> int:
             said = f"{folder}: {EXPERIMENT.name} has no set-up {unknown[0]}, which {STUDY.name} has"
             raise UserError(said, fix="name a folder as the sweep left it, or run the study again")
         rows = [efficiency_of(limit_of(one), ideal[one.variant, one.frames]) for one in study.set_ups]
-        first, warnings = _held_for(experiment, rate, rows[0].ideal.units), warnings_of(rows)
+        cameras, warnings = [point.config.simulated.camera for point in experiment.points], warnings_of(rows)
+        names = ", ".join(dict.fromkeys(one.name for one in cameras))
+        seeds = ", ".join(dict.fromkeys(str(one.unit_seed) for one in cameras))
+        first = (
+            f"The ideal observer is for a new unit of {names}, by the noise of {rows[0].ideal.units} units, at "
+            f"{rate:g} false call{'' if rate == 1 else 's'} per m², size and depth known; the detectors' hits are on "
+            f"unit {seeds}. Not in it: missing returns, tails that are not Gaussian, noise that differs within damage."
+        )
         if study.digest != experiment.digest:
             changed = "hits are those of another version of the camera or of a detector than the one installed now"
             warnings.insert(0, f"{changed}: run the study again")
@@ -75,38 +86,6 @@ def main(options: argparse.Namespace, command: str) -> int:
     show(efficiency_parts(rows, first, warnings))
     print(f"page: {folder / EFFICIENCY_PAGE.name}")
     return 0
-
-
-def _experiment(folder: Path) -> Experiment:
-    from harness.experiment.load import load_experiment
-
-    if not (folder / EXPERIMENT.name).is_file():
-        fix = f"name the folder in which the sweep left {EXPERIMENT.name} and {STUDY.name}"
-        raise UserError(f"{folder}: has no {EXPERIMENT.name}, which says what to simulate", fix=fix)
-    return load_experiment(folder / EXPERIMENT.name)
-
-
-def _rate(study: StudyRecord, experiment: Experiment) -> float:
-    """The wanted false calls per square metre. Raises UserError for studies that the ideal observer cannot judge."""
-    if any(point.config.mapping is not None or point.config.simulated.views for point in experiment.points):
-        fix = "name a study of single views"
-        raise UserError(f"{study.name}: judges maps of several views, for which there is no ideal observer", fix=fix)
-    if study.false_calls_per_m2 is None:
-        fix = "run the study with threshold.calibrate"
-        raise UserError(f"{study.name}: its threshold was given, so there is no wanted rate of false calls", fix=fix)
-    return study.false_calls_per_m2
-
-
-def _held_for(experiment: Experiment, rate: float, units: int) -> str:
-    """The first line: for what the ideal observer's figures hold, and what is not in them."""
-    cameras = [point.config.simulated.camera for point in experiment.points]
-    names = ", ".join(dict.fromkeys(one.name for one in cameras))
-    seeds = ", ".join(dict.fromkeys(str(one.unit_seed) for one in cameras))
-    return (
-        f"The ideal observer is for a new unit of {names}, by the noise of {units} units, at {rate:g} false call"
-        f"{'' if rate == 1 else 's'} per m², size and depth known; the detectors' hits are on unit {seeds}. Not in it: "
-        "missing returns, tails that are not Gaussian, noise that differs within damage."
-    )
 
 
 if __name__ == "__main__":

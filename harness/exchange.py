@@ -1,5 +1,4 @@
-"""Simulated captures in the forms that other people's programs read: TUM RGB-D sequences, ROS 2 bags, MCAP; pictures
-and masks of data sets."""
+"""Simulated captures as other programs read them: TUM RGB-D, ROS 2, MCAP; pictures and masks of data sets."""
 
 from __future__ import annotations
 
@@ -20,14 +19,12 @@ START_NS = 1_000_000_000 * 10**9
 """Time of the first frame: a round number in 2001, because 0 means "the latest" to ROS' tf."""
 PAUSE_NS = 10**9  # time between the last frame of a view and the first of the next, in which the camera is carried on
 BOARD_FRAME = "board"
-"""Name of the world's frame: x along the row of holes, y up the face, z out of it to the camera, origin at its centre.
-"""
+"""Name of the world's frame: x along the row of holes, y up the face, z out of it, origin at its centre."""
 
 
 @dataclass(frozen=True)
 class ExportedView:
-    """Frames of one view. ``source`` has a lens and a pixel grid; ``T_board_camera`` (4, 4): where the camera stands in
-    the board's frame."""
+    """Frames of one view. ``source`` has a lens and a pixel grid; ``T_board_camera`` (4, 4): the camera's place."""
 
     name: str
     source: FrameSource
@@ -48,8 +45,7 @@ class ExportedView:
         return self.start_ns + round(frame * 1e9 / self.frames_per_second)
 
     def exposures(self) -> Iterator[tuple[int, Frame]]:
-        """Yield the time of each frame and the frame on the whole sensor, as float32: no range, black and no amplitude
-        outside the simulated region."""
+        """Yield time and frame on the whole sensor, as float32: without range, black, beyond the simulated region."""
         lens, region = self.lens, self.source.region
 
         def on_sensor(values: np.ndarray, outside: float) -> np.ndarray:
@@ -139,8 +135,7 @@ def depth_units(z_m: np.ndarray) -> np.ndarray:
 
 
 def undistorted(lens: Lens, picture: np.ndarray) -> np.ndarray:
-    """Return a picture (h, w[, 3]) as the pinhole sees it: each pixel the nearest one of the lens' own image, else
-    0."""
+    """Return a picture (h, w[, 3]) as the pinhole sees it: the nearest pixel of the lens' own image, else 0."""
     matrix, size = lens.matrix, (lens.width, lens.height)
     u, v = cv2.initUndistortRectifyMap(matrix, np.array(lens.distortion), np.eye(3), matrix, size, cv2.CV_32FC1)
     return cv2.remap(np.ascontiguousarray(picture), np.rint(u), np.rint(v), cv2.INTER_NEAREST)
@@ -154,22 +149,14 @@ def seconds_text(stamp_ns: int) -> str:
 
 def calibration_text(lens: Lens) -> str:
     """Return the pinhole as RTAB-Map's calibration file (OpenCV's YAML with ROS' names)."""
-
-    def matrix(name: str, values: np.ndarray) -> tuple[str, ...]:
-        data = ", ".join(map(repr, values.astype(float).ravel().tolist()))
-        return f"{name}:", f"   rows: {values.shape[0]}", f"   cols: {values.shape[1]}", f"   data: [ {data} ]"
-
-    lines = (
-        *("%YAML:1.0", "---", "camera_name: rtabmap_calib"),
-        *(f"image_width: {lens.width}", f"image_height: {lens.height}"),
-        *matrix("camera_matrix", lens.matrix),
-        "distortion_model: plumb_bob",
-        *matrix("distortion_coefficients", np.zeros((1, 5))),
-        *matrix("rectification_matrix", np.eye(3)),
-        *matrix("projection_matrix", np.concatenate([lens.matrix, np.zeros((3, 1))], axis=1)),
-        *matrix("local_transform", OPTICAL_ROTATION),
-    )
-    return "\n".join((*lines, ""))
+    storage = cv2.FileStorage(".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    facts: dict[str, Any] = {"camera_name": "rtabmap_calib", "image_width": lens.width, "image_height": lens.height}
+    facts |= {"camera_matrix": lens.matrix, "distortion_model": "plumb_bob"}
+    facts |= {"distortion_coefficients": np.zeros((1, 5)), "rectification_matrix": np.eye(3)}
+    facts |= {"projection_matrix": np.pad(lens.matrix, ((0, 0), (0, 1))), "local_transform": OPTICAL_ROTATION * 1.0}
+    for name, value in facts.items():
+        storage.write(name, value)
+    return str(storage.releaseAndGetString())
 
 
 # ---------------------------------------------------------------- ROS 2 bags
@@ -187,8 +174,7 @@ FOREVER = (9223372036, 854775807)  # seconds and nanoseconds that ROS 2 writes f
 
 
 def write_bag(folder: Path, view: ExportedView, is_mcap: bool) -> None:
-    """Write one view's bag into ``folder``, which must not exist, as compressed MCAP or as SQLite. Raises OSError as
-    files do."""
+    """Write one view's bag into a new ``folder``, as compressed MCAP or as SQLite. Raises OSError as files do."""
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -223,11 +209,8 @@ def write_bag(folder: Path, view: ExportedView, is_mcap: bool) -> None:
 
 
 def frame_name(view: ExportedView) -> str:
-    """Return the name of a camera's optical frame; each view has its own, so that bags can be played together."""
+    """Return the name of a view's own optical frame, so that bags can be played together."""
     return f"{view.name}_depth_optical_frame"
-
-
-# ---- messages --------------------------------------------------------------------------------------------------------
 
 
 def _header(types: dict[str, Any], frame: str, stamp_ns: int) -> Any:
@@ -271,7 +254,7 @@ def _info_message(types: dict[str, Any], lens: Lens, header: Any) -> Any:
         d=np.array(lens.distortion if distorted else (0.0,) * 5),
         k=lens.matrix.ravel(),
         r=np.eye(3).ravel(),
-        p=np.concatenate([lens.matrix, np.zeros((3, 1))], axis=1).ravel(),
+        p=np.pad(lens.matrix, ((0, 0), (0, 1))).ravel(),
         binning_x=0,
         binning_y=0,
         roi=region,
@@ -303,8 +286,7 @@ def _qos(latched: bool) -> tuple[Any, ...]:
 
 
 def picture_bytes(kind: Literal[".png", ".tiff"], picture: np.ndarray) -> bytes:
-    """Return a picture (h, w[, 3]) as a file: PNG of 8 or 16 bits, or TIFF of float32 without compression; three
-    channels are stored in OpenCV's order, the last one first."""
+    """Return a picture (h, w[, 3]) as PNG of 8 or 16 bits or plain TIFF of float32; channels in OpenCV's order."""
     plain = [cv2.IMWRITE_TIFF_COMPRESSION, 1] if kind == ".tiff" else []
     coded, content = cv2.imencode(kind, np.ascontiguousarray(picture), plain)
     assert coded

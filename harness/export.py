@@ -12,14 +12,13 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program, whole_number
 
 if TYPE_CHECKING:
+    from harness.engine.trial import Role
     from harness.exchange import ExportedView
-    from harness.experiment.schema import Experiment, SimulatedSource
-    from scenes.sensor.source import SimulatedCapture
+    from harness.experiment.schema import Experiment
     from scenes.target.custom import TargetConfig
 
 FORMATS = ("tum", "ros2", "mcap")
-REPEAT = 0
-"""The trial whose noise is exported: the same frames as an experiment's first repeat."""
+REPEAT = 0  # The trial whose noise is exported: the same frames as an experiment's first repeat
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -30,12 +29,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     change = "change one value of the file, such as source.target.distance_m=0.9; may be repeated"
     add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
     add("--views", type=whole_number(10_000), metavar="N", help="the first N views only (default: all)")
-    add(
-        "--frames",
-        type=whole_number(10_000),
-        metavar="N",
-        help="frames of each view (default: the experiment's capture.frames)",
-    )
+    frames = "frames of each view (default: the experiment's capture.frames)"
+    add("--frames", type=whole_number(10_000), metavar="N", help=frames)
     add("--hole-free", action="store_true", help="the same target without its damage")
     results = "where experiments' results go: renders are taken from there, and kept there (default: results)"
     add("--results", type=Path, default=Path("results"), metavar="DIR", help=results)
@@ -49,31 +44,38 @@ def _options(parser: argparse.ArgumentParser) -> None:
 )
 def main(arguments: argparse.Namespace, command: str) -> int:
     """Returns its exit code (0, 2 for the user's mistake, 130 for Ctrl-C)."""
+    from harness.engine.plan import batch_of
     from harness.exchange import in_turn, write_bag, write_tum
     from harness.experiment.load import load_experiment
     from harness.vocabulary.files import atomic_folder
-    from scenes.perspectives import poses_of
+    from scenes.render.cache import cached_view
     from scenes.sensor.camera import camera_of
+    from scenes.sensor.source import SimulatedUnit
 
     experiment = load_experiment(arguments.experiment, arguments.overrides)
-    source = experiment.config.simulated
-    target = source.target.declare()
-    target = target.hole_free() if arguments.hole_free else target
-    poses = (target.pose,) if source.views is None else poses_of(source.views, target.pose)
-    if arguments.views is not None and arguments.views > len(poses):
-        raise UserError(f"--views {arguments.views}: the experiment has {len(poses)}", legal=f"1 to {len(poses)}")
-    # the target before the camera of each view, the first being the reference
-    targets = [target.model_copy(update={"pose": pose}) for pose in poses[: arguments.views]]
-    frames = arguments.frames or experiment.config.capture.frames
+    source, seed = experiment.config.simulated, experiment.config.seed
+    role: Role = "hole_free" if arguments.hole_free else "damaged"
+    camera, cache = camera_of(source.camera), arguments.results / ".cache" / "renders"
+    batch = batch_of(source.target.declare(), role, source, cache)
+    count = len(batch.renders) if arguments.views is None else arguments.views
+    if count > len(batch.renders):
+        legal = f"1 to {len(batch.renders)}"
+        raise UserError(f"--views {count}: the experiment has {len(batch.renders)}", legal=legal)
+    frames, captures = arguments.frames or experiment.config.capture.frames, []
     with atomic_folder(arguments.out) as folder:
-        captures = [_captured(arguments, experiment, source, each, number) for number, each in enumerate(targets)]
-        rate = camera_of(source.camera).unit.frames_per_second.value
+        for number, job in enumerate(batch.renders[:count]):
+            view, found = cached_view(job.target, camera.optics, job.config, cache)
+            print(f"view {number}: {'render from the cache' if found else f'rendered in {view.seconds:.1f} s'}")
+            unit, labels = SimulatedUnit(camera, job.camera, view), ("view", number) if number else ()
+            captures.append(unit.capture(frames, seed, role, REPEAT, *labels))
+        targets = [job.target for job in batch.renders[:count]]
+        rate = camera.unit.frames_per_second.value
         views = in_turn(captures, [each.pose.T_camera_board for each in targets], frames, rate)
         if arguments.format == "tum":
             write_tum(folder, views)
-        for view in () if arguments.format == "tum" else views:
-            write_bag(folder / view.name, view, arguments.format == "mcap")
-        _write_beside(folder, arguments, experiment, source, targets, views, command)
+        for each in () if arguments.format == "tum" else views:
+            write_bag(folder / each.name, each, arguments.format == "mcap")
+        _write_beside(folder, arguments, experiment, targets, views, command)
     swept = [path for path in experiment.config.sweep if path.startswith("source.")]
     if swept:
         print(f"note: {', '.join(swept)} as the file's source states it, not as swept; --set chooses another value")
@@ -82,31 +84,10 @@ def main(arguments: argparse.Namespace, command: str) -> int:
     return 0
 
 
-def _captured(
-    arguments: argparse.Namespace, experiment: Experiment, source: SimulatedSource, target: TargetConfig, number: int
-) -> SimulatedCapture:
-    """Return the frames of one view, equal to those of the experiment's first trial; they are made when written."""
-    from scenes.render.cache import cached_view
-    from scenes.sensor.camera import camera_of
-    from scenes.sensor.source import SimulatedUnit
-
-    camera = camera_of(source.camera)
-    view, found = cached_view(target, camera.optics, source.render, arguments.results / ".cache" / "renders")
-    print(f"view {number}: {'render from the cache' if found else f'rendered in {view.seconds:.1f} s'}")
-    labels: tuple[str | int, ...] = (_role(arguments), REPEAT, *(("view", number) if number else ()))
-    frames = arguments.frames or experiment.config.capture.frames
-    return SimulatedUnit(camera, source.camera, view).capture(frames, experiment.config.seed, *labels)
-
-
-def _role(arguments: argparse.Namespace) -> str:
-    return "hole_free" if arguments.hole_free else "damaged"
-
-
 def _write_beside(
     folder: Path,
     arguments: argparse.Namespace,
     experiment: Experiment,
-    source: SimulatedSource,
     targets: list[TargetConfig],
     views: tuple[ExportedView, ...],
     command: str,
@@ -122,16 +103,18 @@ def _write_beside(
     from scenes.target.truth import truth_of
 
     nominal, poses = [np.eye(4)], tuple(target.pose for target in targets)
+    source, role = experiment.config.simulated, "hole_free" if arguments.hole_free else "damaged"
     if source.views is not None:
-        role = _role(arguments)
         nominal = [guessed_T_reference_view(source.views, poses, n, role, REPEAT) for n in range(len(poses))]
+    frames = {
+        "board": "x along the row of holes, y up the face, z out of it to the camera, origin at its centre",
+        "camera": "x right, y down, z along the optical axis; of damages, the first view's camera",
+    }
+    damages = truth_of(targets[0], targets[0].pose.T_camera_board)
     files: dict[str, dict[str, Any]] = {
         "truth.json": {
-            "frames": {
-                "board": "x along the row of holes, y up the face, z out of it to the camera, origin at its centre",
-                "camera": "x right, y down, z along the optical axis; of damages, the first view's camera",
-            },
-            "damages": [damage.to_row() for damage in truth_of(targets[0], targets[0].pose.T_camera_board)],
+            "frames": frames,
+            "damages": [damage.to_row() for damage in damages],
             "views": [{"name": view.name, "T_board_camera": view.T_board_camera.tolist()} for view in views],
         },
         "nominal_poses.json": {POSES_KEY: [pose.tolist() for pose in nominal]},
@@ -140,8 +123,6 @@ def _write_beside(
             "experiment": experiment.config.name,
             "seed": experiment.config.seed,
             "hole_free": arguments.hole_free,
-            "format": arguments.format,
-            "frames_per_view": views[0].n_frames,
             "frames_per_second": views[0].frames_per_second,
             "rounding_step_mm": 1e3 * views[0].source.z_step_m,
             "notes": [

@@ -1,9 +1,9 @@
 """``python -m harness.export_noise CAMERA --out DIR``: a camera's noise as a table and one file of code.
 
-The files are for other simulators (Isaac Sim, Gazebo, MuJoCo, BlenderProc), which render ideal depth: ``NAME.npz`` with
-the table, and ``depth_noise.py`` (NumPy, or torch), a copy of `scenes.sensor.tabled`, which says what is not modelled.
-The table is measured on the full model before tilted planes of many brightnesses: deviation of single pixels, chance of
-a return, correlation of neighbours, fixed pattern. """
+For simulators that render ideal depth (Isaac Sim, Gazebo, MuJoCo, BlenderProc): ``NAME.npz`` with the table, and
+``depth_noise.py`` (NumPy, or torch), a copy of `scenes.sensor.tabled`, which says what is not modelled. The table is
+measured on the full model before planes of many brightnesses: deviation, chance of a return, correlation of neighbours,
+fixed pattern."""
 
 from __future__ import annotations
 
@@ -20,15 +20,13 @@ from harness.vocabulary.program import program
 if TYPE_CHECKING:
     from scenes.sensor.camera import AnyCamera
 
-ALBEDO = 0.6
-"""Albedo of the planes; beyond the range of the camera, darker and brighter planes stand for distance."""
+ALBEDO = 0.6  # Albedo of the planes; beyond the range of the camera, darker and brighter planes stand for distance
 DARKEST = 0.02
 MEASURED, PER_OCTAVE = 2, 16
 """Brightnesses that are measured in each octave, and entries of the table, between which it takes the nearest."""
 FRAMES, FRAMES_OF_CORRELATION = 40, 100
 """Frames of 3,000 pixels whose noise is common in squares of 25: they give a deviation to 1 %."""
-LONGEST_LAG = 12
-"""Pixels to which the correlation of neighbours is followed."""
+LONGEST_LAG = 12  # Pixels to which the correlation of neighbours is followed
 
 
 def _options(parser: argparse.ArgumentParser) -> None:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import numpy as np
     from matplotlib.figure import Figure
 
-    from detectors.flat_captures import FlatCapture, Separated
+    from detectors.flat_captures import FlatCapture
     from detectors.recordings import Recording
     from harness.vocabulary.geometry import Lens
 
@@ -31,10 +31,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--unit", help="unit of the stored distances: mm, m, cm, um, tum (5000/m) or N/m")
     add("--intrinsics", metavar="FILE|CAMERA", help="the lens: a file, or a camera's nominal lens by name")
     add("--crop", default="auto", metavar="KIND", help="the part that shows the wall, as for harness.detect")
-    poses = (
-        "where the camera stood, as for harness.detect: the surface's own shape is then parted from the pattern"
-        " by least squares; without, it counts as noise"
-    )
+    poses = "where the camera stood, as for harness.detect: the surface's own shape then counts as no noise"
     add("--poses", type=Path, metavar="FILE", help=poses)
 
 
@@ -51,7 +48,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0 (also where the pattern is not stable), 2 on a mistake of the user, 130 after Ctrl-C."""
     from detectors.flat_captures import separated
     from detectors.flat_field import save_flat_field
-    from harness.inspection.told import print_warnings
+    from harness.inspection.told import mm, print_warnings
     from harness.report.blocks import save_png
     from harness.report.findings import plain_json
     from harness.tables.flat_field import FLAT_CAPTURES, FLAT_FIGURES, figures_of
@@ -63,7 +60,10 @@ def main(options: argparse.Namespace, command: str) -> int:
         raise UserError(f"--out {options.out}: is no name of a flat field", legal="a name that ends in .npz")
     lens, captures = _captures(options)
     found = separated(captures, lens)
-    answer, figures, error_m = _answer(found), list(figures_of(found)), found.field.error_m
+    near, far = found.field.distances_m
+    at = f"{near:.2f} m" if far < near * 1.01 else f"{near:.2f} to {far:.2f} m"
+    answer = f"fixed pattern {mm(found.field.rms_m)} rms at {at}, known to {mm(found.noise_m)}"
+    figures, error_m = list(figures_of(found)), found.field.error_m
     print_warnings(found.field.warnings)
     print(answer)
     show([FLAT_CAPTURES.grid(captures, terminal=True), FLAT_FIGURES.grid(figures, terminal=True)])
@@ -90,14 +90,6 @@ def _draw(figure: Figure, error_m: np.ndarray, title: str) -> None:
     figure.suptitle(title, fontsize=10, parse_math=False)
 
 
-def _answer(found: Separated) -> str:
-    from harness.inspection.told import mm
-
-    near, far = found.field.distances_m
-    at = f"{near:.2f} m" if far < near * 1.01 else f"{near:.2f} to {far:.2f} m"
-    return f"fixed pattern {mm(found.field.rms_m)} rms at {at}, known to {mm(found.noise_m)}"
-
-
 def _captures(options: argparse.Namespace) -> tuple[Lens, list[FlatCapture]]:
     """Return the lens and the captures, less their smooth fits; a lone capture as its two halves, which show whether
     the pattern is stable. Raises UserError for faults of the files, and for captures of different cameras."""
@@ -116,9 +108,8 @@ def _captures(options: argparse.Namespace) -> tuple[Lens, list[FlatCapture]]:
         if recording.lens is None:
             raise UserError(f"{path}: the lens is not known", fix="name a file or a camera with --intrinsics")
         if recording.lens != first.lens:
-            raise UserError(
-                f"{path}: is of another lens than {options.paths[0]}", legal="captures of one unit and mode"
-            )
+            said = f"{path}: is of another lens than {options.paths[0]}"
+            raise UserError(said, legal="captures of one unit and mode")
     found = []
     for recording, pose in zip(recordings, poses, strict=True):
         for part in _halves(recording) if len(recordings) == 1 else (recording,):

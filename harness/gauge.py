@@ -23,8 +23,7 @@ MARK_MM, DRILLS_MM, SEED = 32.0, 0.5, 1
 CLEAR_MM, EDGE_MM = 6.0, 18.0
 """White around a mark, without which a code cannot be read, and between marks and holes; and least distance of a hole's
 rim from the board's edge, for which the automatic crop would take it."""
-HIT_SHARE = 0.4
-"""Hit radius as a share of the distance between holes, so that no finding can count for two."""
+HIT_SHARE = 0.4  # Hit radius as a share of the distance between holes, so that no finding can count for two
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -69,10 +68,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     # evenly spread: sizes crowded where the study's curve rises tell nothing where the real curve rises elsewhere
     (chosen,) = plan.design(curve, [options.targets], (low, high), placements=("uniform",), studies=100, seed=SEED)
     if not low < (wrong_mm := PRIOR_SIZE * curve.size_at(0.9)) < high:
-        print(
-            f"warning: were the curve's a90 too small by a factor of {PRIOR_SIZE:g}, it would be {wrong_mm:.3g} mm, "
-            f"and no hole of {low:g} to {high:g} mm would show it: choose other --diameters"
-        )
+        were = f"were the curve's a90 too small by a factor of {PRIOR_SIZE:g}, it would be {wrong_mm:.3g} mm"
+        print(f"warning: {were}, and no hole of {low:g} to {high:g} mm would show it: choose other --diameters")
     gauge = _laid_out(options, chosen.sizes)
     text = json.dumps({"gauge_version": GAUGE_VERSION, **gauge.to_data()}, indent=1)
     write_text(options.out / "gauge.json", text + "\n")
@@ -119,9 +116,8 @@ def _laid_out(options: argparse.Namespace, sizes: np.ndarray) -> Gauge:
         raise UserError(f"--board {options.board}: is no size", legal="WIDTHxHEIGHT in mm: 270x175") from error
     side, apart = MARK_MM, options.apart
     if not 0 < options.diameters[1] < apart - 4:
-        raise UserError(
-            f"--apart {apart:g}: holes of {options.diameters[1]:g} mm meet", legal="their diameter and 5 more"
-        )
+        said = f"--apart {apart:g}: holes of {options.diameters[1]:g} mm meet"
+        raise UserError(said, legal="their diameter and 5 more")
     inset = np.array([width, height]) / 2 - side / 2 - CLEAR_MM
     corners = inset * [(-1, 1), (1, 1), (1, -1), (-1, -1)]
     rim = options.diameters[1] / 2 + EDGE_MM
@@ -149,12 +145,10 @@ def _laid_out(options: argparse.Namespace, sizes: np.ndarray) -> Gauge:
             GaugeHole(id=k + 1, diameter_mm=float(own[k]), depth_mm=deep[k], x_mm=places[at][0], y_mm=places[at][1])
             for k, at in enumerate(chosen.tolist())
         )
-        marks = tuple(
-            GaugeMark(code=4 * number + k, x_mm=x, y_mm=y, side_mm=side) for k, (x, y) in enumerate(corners.tolist())
-        )
-        boards.append(
-            GaugeBoard(name=f"board-{number + 1}", width_mm=width, height_mm=height, marks=marks, holes=holes)
-        )
+        corner = enumerate(corners.tolist(), start=4 * number)
+        marks = tuple(GaugeMark(code=code, x_mm=x, y_mm=y, side_mm=side) for code, (x, y) in corner)
+        name = f"board-{number + 1}"
+        boards.append(GaugeBoard(name=name, width_mm=width, height_mm=height, marks=marks, holes=holes))
     return Gauge(dictionary=DICTIONARY, hit_radius_mm=HIT_SHARE * apart, boards=tuple(boards))
 
 

@@ -40,9 +40,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--frames", type=int, nargs="+", metavar="N", help="frames to average (default: 1 and all)")
     add("--targets", type=int, default=60, metavar="N", help="damages in all (default: 60, as MIL-HDBK-1823A asks)")
     add("--hit-radius", type=float, default=15.0, metavar="MM", help="a finding this near is a hit (default: 15)")
-    add(
-        "--apart", type=float, metavar="MM", help="least distance of two damages (default: hit radius times 2, plus 10)"
-    )
+    add("--apart", type=float, metavar="MM", help="least distance of damages (default: hit radius times 2, plus 10)")
     add("--seed", type=int, default=1, help="of places, sizes and noise (default: 1)")
     calls = f"expected in a capture, which sets the threshold as harness.detect does (default: {DEFAULT_FALSE_CALLS:g})"
     add("--false-calls", type=float, metavar="N", help=calls)
@@ -109,12 +107,10 @@ def main(options: argparse.Namespace, command: str) -> int:
     made = []
     for placement in placements(scans, family, options.camera, options.targets, options.seed, cache):
         made.append(placement)
-        done = sum(len(one.implants) for one in made)
-        print(f"rendered {done} of {options.targets} damages", file=sys.stderr)
+        print(f"rendered {sum(len(one.implants) for one in made)} of {options.targets} damages", file=sys.stderr)
     longest = max(len(scan.frames) for scan in scans)
     frames = sorted(set(options.frames or (1, longest)))
-    found = judge_scans(scans, made, family, options.camera, judging, frames)
-    warnings = [COMPARED, *found.warnings]
+    tables, set_ups, warnings = judge_scans(scans, made, family, options.camera, judging, frames)
 
     area_m2 = sum(scan.area_m2 for scan in scans)
     said = f"{len(scans)} recording{'s' * (len(scans) > 1)} of {longest} frames, {area_m2:.3g} m² judged"
@@ -127,30 +123,27 @@ def main(options: argparse.Namespace, command: str) -> int:
         "detector": {"name": options.detector, "settings": settings},
         "family": family.to_data(),
     }
-    origin = record(command) | {"warnings": warnings, "seed": options.seed, "failures": []}
+    origin = record(command) | {"warnings": [COMPARED, *warnings], "seed": options.seed, "failures": []}
     title = f"Virtual damage in {said}"
-    thresholds = (
-        f"Given as {options.threshold:g}."
-        if options.threshold
-        else "Set by the undamaged frames as harness.detect sets it, by noise that stands out towards the camera, for "
-        f"{options.false_calls or DEFAULT_FALSE_CALLS:g} false calls a capture: the median over groups of frames."
-    )
+    calls = f"{options.false_calls or DEFAULT_FALSE_CALLS:g} false calls a capture: the median over groups of frames."
+    own = f"Set by the undamaged frames as harness.detect sets it, by noise towards the camera, for {calls}"
+    thresholds = f"Given as {options.threshold:g}." if options.threshold else own
+    known = {key: origin[key] for key in ("commit", "dirty", "versions", "seed", "command")}
     study = StudyRecord(
         name="implant",
         digest=digest(facts),
         hit_radius_mm=options.hit_radius,
         false_calls_per_m2=None,
-        provenance={**{key: origin[key] for key in ("commit", "dirty", "versions", "seed", "command")},
-                    "thresholds": thresholds},
-        set_ups=found.set_ups,
-    )  # fmt: skip
+        provenance={**known, "thresholds": thresholds},
+        set_ups=set_ups,
+    )
     provenance = {**origin, "results_version": RESULTS_VERSION, "experiment": "implant", "digest": study.digest}
-    result = evaluate_study(study, found.tables, facts)
+    result = evaluate_study(study, tables, facts)
     write_text(options.out / STUDY.name, record_text(study))
     write_tables(options.out, {table: table.frame(rows) for table, rows in study_tables(result).items()}, provenance)
     write_text(options.out / PROVENANCE.name, json.dumps(provenance, indent=2) + "\n")
     page = write_study_report(options.out, result, (), provenance, to_yaml(facts), title)
-    show([*(f"warning: {text}" for text in warnings), *study_parts(result)])
+    show([*(f"warning: {text}" for text in (COMPARED, *warnings)), *study_parts(result)])
     print(f"report: {page}")
     return 0
 
@@ -192,27 +185,22 @@ def _family(options: argparse.Namespace, scans: list[Scan]) -> DrawnTargetConfig
 
 
 def _shares(options: argparse.Namespace, said: str, peaks_mm: list[float]) -> list[str]:
-    """Return sentences on what is measured, what is simulated, and what the limit holds for; ``peaks_mm``: the largest
-    change of distance that each damage makes."""
+    """Return sentences on what is measured and simulated, and for what the limit holds; ``peaks_mm``: depths shown."""
     import numpy as np
 
     low, middle, high = np.quantile(peaks_mm, (0.1, 0.5, 0.9))
     return [
         f"Measured: {said}, with their surface, noise, fixed pattern, texture and missing returns.",
         f"Simulated: the damage, by the model of {options.camera}, on the tangent plane at its place, with an albedo "
-        f"of {options.albedo:g}; noise is added where the damage weakens the light.",
+        f"of {options.albedo:g}; noise is added where the damage weakens the light, never taken off.",
         f"Virtual damage shows a depth of {middle:.2g} mm at the median ({low:.2g} to {high:.2g} mm for eight in ten). "
         "If real damage of such sizes shows more or less in recordings of this camera, the limit is wrong by as much: "
         "check it with a gauge board.",
-        "Where damage should make pixels quieter than the recording they keep its noise: it is then a little harder to "
-        "find than it would be.",
         "A board, here, is one placement of damage in a group of recorded frames. Placements share the recording's "
         "surface and fixed pattern, and its noise where it has few frames: intervals are over places and sizes in this "
         "recording, not over other parts, units or days.",
-        "No damage was placed within the hit radius of a finding in the average of all undamaged frames, so that "
-        "nothing else passes for it.",
-        "The undamaged recording is the hole-free board. Where false calls are counted on the frames that set the "
-        "threshold, a warning says so.",
+        "No damage was placed within the hit radius of a finding in the average of all undamaged frames. The undamaged "
+        "recording is the hole-free board; a warning says where the same frames set the threshold.",
     ]
 
 

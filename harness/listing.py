@@ -1,5 +1,4 @@
-"""Plug-ins, folders of results and stored renders, as `harness.ls` lists and `harness.clean` removes them: only files
-that tofpod wrote, inside ``--out``. Listing only reads, and no link is followed."""
+"""What `harness.ls` lists and `harness.clean` removes: only what tofpod wrote in ``--out``, never through a link."""
 
 from __future__ import annotations
 
@@ -17,8 +16,8 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from harness.tables.outputs import EXPERIMENT, JOURNAL, LATEST, LOCK_NAME, PROVENANCE, REPORT, is_output
-from harness.tables.text import many
+from harness.tables.outputs import EXPERIMENT, JOURNAL, LATEST, LOCK_NAME, PROVENANCE, is_output
+from harness.tables.text import Grid, many
 from harness.vocabulary.declaration.yaml_source import read_yaml
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, lock, opened_lock, strict_json
@@ -31,15 +30,6 @@ from scenes.render.cache import StoredFile, leftovers, longest_unused, removed, 
 BYTES = {"kB": 1e3, "MB": 1e6, "GB": 1e9, "TB": 1e12}  # powers of ten, as disks are sold
 
 
-def table_lines(rows: Sequence[Sequence[str]], indent: str = "  ") -> Iterator[str]:
-    """Yield lines with columns below each other; the last cell of a row is as long as it likes."""
-    columns = range(max((len(row) for row in rows), default=0))
-    widths = [max((len(row[k]) for row in rows if k < len(row) - 1), default=0) for k in columns]
-    for row in rows:
-        cells = [cell.ljust(widths[column]) for column, cell in enumerate(row[:-1])]
-        yield (indent + "  ".join([*cells, row[-1]])).rstrip()
-
-
 def bytes_of(text: str) -> int:
     """Read a size such as ``5GB`` or ``500 MB``. Raises UserError."""
     found = re.fullmatch(r"([0-9]{1,12}(?:\.[0-9]{1,6})?) ?([A-Za-z]{1,3})", text.strip())
@@ -47,9 +37,6 @@ def bytes_of(text: str) -> int:
     if found is None or found[2].lower() not in factors:
         raise UserError(f"{text!r} is not a size", legal="such as 500MB, 5GB or 1.5TB")
     return round(float(found[1]) * factors[found[2].lower()])
-
-
-# ---------------------------------------------------------------- detectors and cameras
 
 
 Row = Mapping[str, Any]
@@ -85,23 +72,28 @@ def offered(kind: str) -> list[Row]:
 
 
 def shown(kind: str, name: str) -> Row:
-    """Return an offer's row with all that can be set. Raises UserError where the name is unknown, taken twice or
-    broken."""
+    """Return an offer's row with all that can be set. Raises UserError where it is unknown, taken twice or broken."""
     settable = _detector_settings(name) if kind == "detectors" else _numbers(name)
     return {**_origin(plug_ins(kind).offer(name)), **_facts(kind, name), SETTABLE[kind]: settable}
 
 
-def cells(kind: str, row: Row) -> tuple[str, ...]:
-    """Return a row as text."""
-    head = (row["name"], f"{row['package']} {row['package_version']}".strip())
-    if "broken" in row:
-        return (*head, f"broken: {row['broken']}")
+def grid_of(kind: str, rows: Sequence[Row]) -> Grid:
+    """Return rows of offers as a table."""
     if kind == "detectors":
-        mark = "(tests the harness, finds no damage) " if row["tests_the_harness"] else ""
-        return (*head, "" if row["version"] is None else f"version {row['version']}", f"{mark}{row['about']}")
+        heads, told = ("version", "what it does"), lambda row: (row["version"] or "-", row["about"])
+    else:
+        heads, told = ("pixels", "range", "light", "title"), _camera_cells
+    lines = []
+    for row in rows:
+        said = ("-",) * (len(heads) - 1) + (f"broken: {row['broken']}",) if "broken" in row else told(row)
+        lines.append((row["name"], f"{row['package']} {row['package_version']}".strip(), *said))
+    return Grid.of(("name", "package", *heads), lines, left=2 + len(heads))
+
+
+def _camera_cells(row: Row) -> tuple[str, ...]:
     near, far = row["nearest_m"], row["farthest_m"]
     reach = f"from {near:.4g} m" if far is None else f"{near:.4g} to {far:.4g} m"
-    return (*head, f"{row['columns']} x {row['rows']} px", reach, f"{row['wavelength_nm']:.4g} nm", row["title"])
+    return f"{row['columns']} x {row['rows']}", reach, f"{row['wavelength_nm']:.4g} nm", row["title"]
 
 
 def _origin(offer: Offer) -> Row:
@@ -117,9 +109,8 @@ def _facts(kind: str, name: str) -> Row:
             version = load_detector(name, {}).version
         except UserError:  # not known without settings
             version = None
-        about = (inspect.getdoc(loaded) or "").strip().partition("\n")[0]
-        tests = bool(getattr(loaded, "tests_the_harness", False))
-        return {"version": version, "about": about, "tests_the_harness": tests}
+        tests = "(tests the harness, finds no damage) " if getattr(loaded, "tests_the_harness", False) else ""
+        return {"version": version, "about": tests + (inspect.getdoc(loaded) or "").strip().partition("\n")[0]}
     from scenes.sensor.camera import load_camera
 
     camera = load_camera(name)
@@ -135,8 +126,7 @@ def _facts(kind: str, name: str) -> Row:
 
 
 def _detector_settings(name: str) -> list[dict[str, Any]]:
-    """Every setting with its default and what is legal. Of a setting that is one of several kinds, those of the
-    default's kind."""
+    """Every setting with default and what is legal; of a setting of several kinds, those of the default's kind."""
     from pydantic import ValidationError
 
     from detectors import detector_type
@@ -179,8 +169,7 @@ def leaves(data: Mapping[str, Any], path: tuple[str, ...] = ()) -> Iterator[tupl
 
 
 def reference() -> str:
-    """Return every key of an experiment and every setting of tofpod's detectors, in Markdown: what is legal there, the
-    default, the meaning. Kinds with keys in common are told apart in the keys' names."""
+    """Return every key of an experiment and of tofpod's detectors in Markdown: legal, default, meaning."""
     from detectors import detector_type
     from harness.experiment.schema import ExperimentConfig
     from harness.vocabulary.declaration.shape import default_at, every_key, legal_at, plain
@@ -215,8 +204,7 @@ SHOWN_SETTINGS = 6
 
 
 def result_folders(out: Path, experiment: str | None = None) -> list[dict[str, Any]]:
-    """Describe every folder of results below ``out``, or of one experiment: `described`, ``limits`` of a study,
-    ``differs`` (settings that are not the same in all runs of the experiment) and ``is_latest``."""
+    """Return `described` of every folder with ``limits``, settings in which it ``differs``, ``is_latest``."""
     found = []
     for parent in folders_in(out, EXPERIMENT_NAME):
         if experiment is not None and parent.name != experiment:
@@ -279,24 +267,23 @@ def _limits(run: Path) -> list[dict[str, Any]]:
 
 
 def described(run: Path) -> dict[str, Any]:
-    """Describe a folder of results as JSON's types. ``state``: complete, unfinished, running or broken, with ``note``
-    in words; ``done``, ``failed``, ``planned``: trials as the provenance has them, None without one; ``records``: of
-    the journal; ``version``: of the results."""
+    """Describe a folder of results as JSON's types. ``state``: complete, unfinished, running or broken."""
     from harness.engine.journal import Journal
 
-    try:
-        records = len(Journal(run / "journal"))
-    except UserError:  # of a newer tofpod, or reached through a link
-        records = 0
+    size_bytes = 0
+    for path in files_below(run):
+        with contextlib.suppress(OSError):
+            size_bytes += path.lstat().st_size
     row: dict[str, Any] = {"path": str(run), "experiment": run.parent.name, "digest": run.name, "state": "broken"}
-    row |= {"note": "", "size_bytes": sum(map(_disk_bytes, files_below(run))), "records": records}
-    row |= {"has_report": (run / REPORT.name).is_file()}
-    row |= dict.fromkeys(("date", "commit", "dirty", "done", "failed", "planned", "version"))
+    row |= {"note": "", "size_bytes": size_bytes, "date": None}
     try:
         said = strict_json(bounded_bytes(run / PROVENANCE.name, TEXT_BYTES), nan=True)
         if not isinstance(said, dict):
             raise ValueError("is no provenance")
     except FileNotFoundError:  # a run that is not over
+        records = 0
+        with contextlib.suppress(UserError):  # of a newer tofpod, or reached through a link
+            records = len(Journal(run / "journal"))
         if not records and not (run / EXPERIMENT.name).is_file():
             return row | {"note": "broken: it has neither an experiment nor records"}
         state = "running" if in_use(run) else "unfinished"
@@ -305,20 +292,15 @@ def described(run: Path) -> dict[str, Any]:
         return row | {"note": f"broken: provenance.json: {error}"}
     trials = said.get("trials")
     trials = trials if isinstance(trials, dict) else {}
-    done, resumed, failed = (_whole(trials.get(name)) for name in ("done", "resumed", "failed"))
+    counts = [trials.get(name) for name in ("done", "resumed", "failed")]
+    done, resumed, failed = (count if type(count) is int and count >= 0 else 0 for count in counts)
     state = "running" if in_use(run) else "unfinished" if failed else "complete"
-    note = state
-    if done is not None:
-        done, failed = done + (resumed or 0), failed or 0
-        row |= {"done": done, "failed": failed, "planned": done + failed}
-        of_all = f"{done} of {many(done + failed, 'trial')} done, {failed} failed"
-        note += ": " + (of_all if failed else many(done, "trial"))
-    version, dirty = _whole(said.get("results_version")), said.get("dirty")
-    if version is not None and version != RESULTS_VERSION:
-        age = "newer" if version > RESULTS_VERSION else "older"
-        note += f" ({age}: results version {version}, this tofpod writes {RESULTS_VERSION})"
-    facts = {"date": _line(said.get("started")), "commit": _line(said.get("commit")), "version": version}
-    return row | {"state": state, "note": note, "dirty": dirty if isinstance(dirty, bool) else None, **facts}
+    note = f"{state}: {many(done + resumed, 'trial')}" + (f", {failed} failed" if failed else "")
+    version, started = said.get("results_version"), said.get("started")
+    if type(version) is int and version != RESULTS_VERSION:
+        note += f" (results version {version}, this tofpod writes {RESULTS_VERSION})"
+    date = started[:40] if isinstance(started, str) and started.isprintable() else None
+    return row | {"state": state, "note": note, "date": date}
 
 
 def in_use(run: Path) -> bool:
@@ -347,28 +329,8 @@ def files_below(folder: Path) -> Iterator[Path]:
     return (Path(inner, name) for inner, _, names in os.walk(folder) for name in names)
 
 
-def _disk_bytes(path: Path) -> int:
-    with contextlib.suppress(OSError):
-        file = path.lstat()
-        return int(getattr(file, "st_blocks", -(-file.st_size // 512)) * 512)
-    return 0
-
-
-def _line(value: Any) -> str | None:
-    """One short line of a file that anybody may have written, or None."""
-    return value[:40] if isinstance(value, str) and value.isprintable() else None
-
-
-def _whole(value: Any) -> int | None:
-    return value if type(value) is int and value >= 0 else None
-
-
-# ---------------------------------------------------------------- the newest run
-
-
 def latest_run(parent: Path) -> str | None:
-    """Return the name of the run that ``parent/latest`` points to, whether it is there or not; None where there is no
-    such link of tofpod's."""
+    """Return the name of the run that ``parent/latest`` points to; None where there is no such link of tofpod's."""
     path = Path(parent) / LATEST
     said = os.readlink(path) if path.is_symlink() else ""
     return said if DIGEST_NAME.fullmatch(said) else None
@@ -394,7 +356,6 @@ def point_to(run: Path) -> None:
 OURS = b"# tofpod experiment "  # first words of an experiment.yaml that a sweep wrote
 UNFINISHED_NAME = re.compile(r"\.(?P<stem>.+)\.\w{8}\.part(?P<suffix>\.\w+)")
 """A file that a killed process was writing (`harness.vocabulary.files.atomic_path`)."""
-UNFINISHED_LINK = re.compile(rf"\.{LATEST}\.[0-9a-f]{{8}}\.part")
 
 
 def refuse_links(*paths: Path) -> None:
@@ -406,8 +367,7 @@ def refuse_links(*paths: Path) -> None:
 
 
 def cache_removal(folder: Path, limit_bytes: int | None) -> list[StoredFile]:
-    """Return the longest unused renders, so that the rest fits into the limit, and what killed processes left a day and
-    more ago; None: all of both."""
+    """Return the longest unused renders, so that the rest fits, and old leftovers; None: all of both."""
     if limit_bytes is None:
         return stored_renders(folder) + leftovers(folder, 0.0)
     return longest_unused(stored_renders(folder), limit_bytes, ()) + leftovers(folder)
@@ -458,23 +418,14 @@ def removable(folder: Path) -> list[StoredFile]:
 
 
 def remove_results(folders: Sequence[Path], files: Iterable[StoredFile]) -> list[StoredFile]:
-    """Remove files, then folders that are empty, the experiment's own included; `latest` goes or moves on where the run
-    that it names is gone. Returns what is gone."""
+    """Remove files, empty folders, and `latest` where its run is gone. Returns what is gone."""
     gone = removed(files)
     for folder in folders:
         _remove_empty(*folders_in(folder, re.compile(f"{JOURNAL}|{POINT_NAME.pattern}")), folder)
     for parent in {folder.parent for folder in folders}:
-        for left in parent.glob(f".{LATEST}.*.part"):
-            if UNFINISHED_LINK.fullmatch(left.name) and left.is_symlink():
-                left.unlink(missing_ok=True)
-        runs = sorted(map(described, folders_in(parent, DIGEST_NAME)), key=lambda run: run["date"] or "")
-        reported = [Path(run["path"]) for run in runs if run["has_report"] or run["state"] == "complete"]
         named = latest_run(parent)
-        if named is not None and named not in {run.name for run in reported}:
-            if reported:
-                point_to(reported[-1])
-            else:
-                (parent / LATEST).unlink(missing_ok=True)
+        if named is not None and not (parent / named / EXPERIMENT.name).exists():
+            (parent / LATEST).unlink(missing_ok=True)
         _remove_empty(parent)
     return gone
 

@@ -32,14 +32,19 @@ def _options(parser: argparse.ArgumentParser) -> None:
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0 (also where something listed is broken), 2 on a mistake of the user."""
-    lists = {"results": _list_results, "cache": _list_cache, "keys": _list_keys}
+    if options.what == "keys":
+        from harness.listing import reference
+
+        print(reference())
+        return 0
+    lists = {"results": _list_results, "cache": _list_cache}
     return lists.get(options.what, _list_offers)(options)
 
 
 def _list_offers(options: argparse.Namespace) -> int:
-    """List detectors and cameras, or show those of a name with all that can be set. Raises UserError where there is
-    none, or where it is broken."""
-    from harness.listing import SETTABLE, cells, offered, plug_ins, shown, table_lines
+    """List detectors and cameras, or all that can be set of those of a name. Raises UserError for another."""
+    from harness.listing import SETTABLE, grid_of, offered, plug_ins, shown
+    from harness.tables.text import Grid, show
     from harness.vocabulary.declaration.diagnose import nearest
     from harness.vocabulary.seeds import canonical_json
 
@@ -48,9 +53,8 @@ def _list_offers(options: argparse.Namespace) -> int:
         rows = {kind: offered(kind) for kind in ([word] if word else SETTABLE)}
         if options.json:
             return _print_json(rows)
-        for number, (kind, found) in enumerate(rows.items()):
-            print(f"{chr(10) if number else ''}{kind} (entry points: {plug_ins(kind).group})")
-            print("\n".join(table_lines([cells(kind, row) for row in found])))
+        for kind, found in rows.items():
+            show([f"{kind} (entry points: {plug_ins(kind).group})", grid_of(kind, found), ""])
         return 0
     named = [word] if word in SETTABLE else [kind for kind in SETTABLE if word in plug_ins(kind).names()]
     if not named or (name is not None and word not in SETTABLE):
@@ -64,16 +68,16 @@ def _list_offers(options: argparse.Namespace) -> int:
     if options.json:
         return _print_json(details if name is None else details[word])
     for kind, row in details.items():
-        print("\n".join(table_lines([cells(kind, row)], indent="")))
         settable = [(each["path"], canonical_json(each["value"]), each["about"]) for each in row[SETTABLE[kind]]]
-        print("\n".join(table_lines(settable)))
+        what = ("setting", "default", "legal") if kind == "detectors" else ("number", "value", "tag and source")
+        show([grid_of(kind, [row]), "", Grid.of(what, settable, left=3)])
     return 0
 
 
 def _list_results(options: argparse.Namespace) -> int:
-    """List every folder of results with its state, the limit that it found and what tells it from others. Raises
-    UserError where an experiment was named that has none."""
-    from harness.listing import differs_text, limit_text, result_folders, table_lines
+    """List every folder of results with state, limit, differences. Raises UserError for an unknown experiment."""
+    from harness.listing import differs_text, limit_text, result_folders
+    from harness.tables.text import Grid
     from harness.vocabulary.files import size_text
 
     folders = result_folders(options.out, options.name)
@@ -82,6 +86,7 @@ def _list_results(options: argparse.Namespace) -> int:
         raise UserError(f"{options.out}: has no results of {options.name!r}", fix=fix)
     if options.json:
         return _print_json(folders)
+    latest = ", latest"
     print(f"results in {options.out}" + ("" if folders else ": none"))
     for name in sorted({run["experiment"] for run in folders}):
         print(f"  {name}")
@@ -90,23 +95,14 @@ def _list_results(options: argparse.Namespace) -> int:
             (
                 run["digest"],
                 (run["date"] or "")[:10],
-                (run["commit"] or "")[:7] + ("+" if run["dirty"] else ""),
                 size_text(run["size_bytes"]),
-                "report" if run["has_report"] else "no report",
-                run["note"] + (", latest" if run["is_latest"] else ""),
+                run["note"] + latest * run["is_latest"],
             )
             for run in shown
         ]
-        for run, line in zip(shown, table_lines(rows, indent="    "), strict=True):
+        for run, line in zip(shown, Grid.of(("run", "date", "size", "state"), rows, left=4).lines()[1:], strict=True):
             said = (limit_text(run["limits"]), differs_text(run["differs"]))
-            print("\n".join([line, *(f"      {text}" for text in said if text)]))
-    return 0
-
-
-def _list_keys(options: argparse.Namespace) -> int:
-    from harness.listing import reference
-
-    print(reference())
+            print("\n".join([f"    {line}", *(f"      {text}" for text in said if text)]))
     return 0
 
 
@@ -120,17 +116,16 @@ def _list_cache(options: argparse.Namespace) -> int:
         raise UserError(f"the cache has no part called {options.name!r}", fix="python -m harness.ls cache")
     folder = options.out / ".cache" / "renders"
     renders, left = stored_renders(folder), leftovers(folder)
-    ages_s = [max(time.time() - file.used_s, 0.0) for file in renders]
-    size_bytes, left_bytes = (sum(file.size_bytes for file in files) for files in (renders, left))
+    size_bytes = sum(file.size_bytes for file in renders)
+    unused_days = max((max(time.time() - file.used_s, 0.0) / DAY_S for file in renders), default=0.0)
     if options.json:
-        facts = {"folder": str(folder), "renders": len(renders), "size_bytes": size_bytes}
-        facts |= {"longest_unused_s": max(ages_s, default=None), "latest_use_s": min(ages_s, default=None)}
-        return _print_json(facts | {"leftovers": len(left), "leftovers_bytes": left_bytes})
+        facts = {"folder": str(folder), "renders": len(renders), "size_bytes": size_bytes, "leftovers": len(left)}
+        return _print_json(facts | {"longest_unused_days": unused_days})
     print(f"cache {folder}\n  renders: {len(renders)}, {size_text(size_bytes)}")
     if renders:
-        print(f"  used: latest {min(ages_s) / DAY_S:.1f}, longest ago {max(ages_s) / DAY_S:.1f} days ago")
+        print(f"  not used for the longest time: {unused_days:.1f} days")
     if left:
-        print(f"  left by processes that were killed: {len(left)}, {size_text(left_bytes)}")
+        print(f"  left by processes that were killed: {len(left)} files")
     return 0
 
 

@@ -52,18 +52,15 @@ def main(options: argparse.Namespace, command: str) -> int:
             print(f"{folder}: {counts['copied'] - before} trials copied")
     print(f"{goal.folder}: {counts['copied']} trials copied, {counts['known']} were there")
     if damaged:
-        some = ", ".join(damaged[:3])
-        print(f"{len(damaged)} damaged or older records left out, to be run again: {some}", file=sys.stderr)
+        told = f"{len(damaged)} damaged or older records left out, to be run again"
+        print(f"{told}: {', '.join(damaged[:3])}", file=sys.stderr)
     if counts["alike"]:
         alike = f"{counts['alike']} trials differ in last digits, as unlike processors make them"
         print(f"{alike}; the first copied was kept")
     if different:
-        some = ", ".join(different[:3])
-        print(
-            f"{len(different)} trials have different results in different folders, the first copied was kept: "
-            f"{some}. The machines do not compute alike (other processors, or versions?)",
-            file=sys.stderr,
-        )
+        told = f"{len(different)} trials have different results in different folders, the first copied was kept"
+        why = "The machines do not compute alike (other processors, or versions?)"
+        print(f"{told}: {', '.join(different[:3])}. {why}", file=sys.stderr)
         return 1
     out = into.parent.parent
     print(f"next: the sweep's command without --shard, with --out {out}: it runs what is missing and writes the report")
@@ -71,9 +68,8 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def merge_into(into: Journal, other: Journal, counts: Counter[str]) -> list[str]:
-    """Copy what ``into`` lacks, or has not done; count trials that were copied, that were known, and of these those
-    that are alike but for last digits. Returns the keys of those that differ. Raises UserError where a newer tofpod
-    wrote either."""
+    """Copy what ``into`` lacks or has not done; count trials copied, known, and of these alike but for last digits.
+    Returns the keys of those that differ. Raises UserError where a newer tofpod wrote either."""
     from harness.engine.journal import THRESHOLDS
 
     different = []
@@ -95,8 +91,7 @@ def merge_into(into: Journal, other: Journal, counts: Counter[str]) -> list[str]
 
 
 def _without_seconds(value: object) -> object:
-    """A record without its timings, which no two runs have in common, and without arrays that a detector has learned:
-    text whose last digits unlike processors change; what trials made of them is compared."""
+    """A record without timings and learned arrays, whose last digits differ; what trials made of them is compared."""
     if isinstance(value, dict):
         kept = {name: each for name, each in value.items() if not name.startswith("seconds") and name != "arrays"}
         return {name: _without_seconds(each) for name, each in kept.items()}
@@ -104,8 +99,7 @@ def _without_seconds(value: object) -> object:
 
 
 def _alike(first: Any, second: Any, *, in_tenth_um: bool = False) -> bool:
-    """Return whether two values agree as unlike processors make them agree: to a thousandth, or in mm to 1 um.
-    Whole numbers are counts, which must be equal, but for errors in tenths of a micrometre."""
+    """Return whether values agree as on unlike processors: to a thousandth, or 1 um; counts must be equal."""
     if isinstance(first, dict) and isinstance(second, dict) and first.keys() == second.keys():
         return all(_alike(first[name], second[name], in_tenth_um=name == "error_tenth_um") for name in first)
     if isinstance(first, list) and isinstance(second, list) and len(first) == len(second):

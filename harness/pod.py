@@ -23,13 +23,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add, switch = parser.add_argument, argparse.BooleanOptionalAction
     add("file", type=Path, metavar="FILE", help="CSV or Excel (.xlsx): a header row, then one row an inspection")
     add("--size", required=True, metavar="COL", help="column of the flaws' true sizes")
-    add(
-        "--hit",
-        metavar="COL",
-        action="append",
-        help="column of 1 (found) and 0 (missed), or yes and no, hit and miss; "
-        "may be repeated, once for each inspector",
-    )
+    hits = "column of 1 (found) and 0 (missed), yes and no, hit and miss; once for each inspector"
+    add("--hit", metavar="COL", action="append", help=hits)
     add("--ahat", metavar="COL", help="column of signals, instead of --hit; needs --decision")
     add("--target", metavar="COL", help="column of the flaws' names, where some were inspected more than once")
     add("--unit", default="", metavar="UNIT", help="of the sizes, for the labels: mm, inch, ...")
@@ -45,12 +40,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     put("--log-signal", action=switch, help=f"the straight line is of the signals' logarithm, or not {least}")
     told = "with --prior: model-assisted POD (MAPOD), a simulated curve corrected by these hits and misses"
     put = parser.add_argument_group(told).add_argument
-    put(
-        "--prior",
-        type=Path,
-        metavar="STUDY",
-        help="folder of a study, simulated or by virtual damage (harness.implant)",
-    )
+    prior = "folder of a study, simulated or by virtual damage (harness.implant)"
+    put("--prior", type=Path, metavar="STUDY", help=prior)
     put("--set-up", metavar="NAME", help='which set-up of the study: "50 frames"')
     put("--board", metavar="COL", help="column of the boards' names, in the order in which they were inspected")
 

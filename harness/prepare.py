@@ -13,17 +13,9 @@ from harness.vocabulary.program import program
 
 @program(lambda parser: None, "Compile the inner loops once.")
 def main(options: argparse.Namespace, command: str) -> int:
-    """Drive every compiled loop through small captures, and print each step as it begins. Returns 0."""
-    import numpy as np
-
+    """Drive the loops of single views through small captures (those of maps compile when first used). Returns 0."""
     from detectors import load_detector
     from detectors.average import AverageConfig, prefix_averages
-    from detectors.mapping.merge import merge
-    from detectors.mapping.settings import FusedMerge, GridMerge
-    from detectors.marks.mark import MarkSet
-    from detectors.registration.register import register
-    from detectors.registration.settings import PlainRegistration
-    from detectors.views import PreparedView, View
     from harness.engine.trial import FEWEST_FRAMES, averages_of
     from harness.vocabulary.geometry import Region
     from scenes.closed_form import plane_view
@@ -54,14 +46,6 @@ def main(options: argparse.Namespace, command: str) -> int:
             evidence = detector.analyse(cloud)
             for detection in detector.find(cloud, evidence, detector.quiet_threshold(cloud, evidence) / 2):
                 detector.measure(cloud, evidence, detection)
-    print("compiling maps ..", flush=True)  # one small view stands for two
-    nothing = MarkSet((), np.zeros(0, np.int64))
-    views = [PreparedView(View(name, cloud, np.eye(4)), cloud.valid, nothing) for name in ("first", "second")]
-    registrations = register(views, PlainRegistration(method="nominal"))
-    merge(views, registrations, GridMerge())
-    merged = merge(views, registrations, FusedMerge()).cloud
-    evidence = detector.analyse(merged)
-    detector.find(merged, evidence, detector.quiet_threshold(merged, evidence) / 2)
     print(f"inner loops compiled in {time.perf_counter() - began:.0f} s")
     return 0
 

@@ -3,9 +3,8 @@
     def test_the_limit_holds(tofpod_gate):
         tofpod_gate("limit.yaml")
 
-runs the study in ``limit.yaml`` beside the test and compares it with ``limit.baseline.json`` there, as `harness.check`
-does: the test fails where a limit or the rate of false calls got worse and not by chance. ``pytest --tofpod-update``
-writes the baseline. Renders and finished trials are kept in pytest's cache folder.
+runs the study beside the test and compares it with ``limit.baseline.json`` there, as `harness.check` does.
+``pytest --tofpod-update`` writes the baseline. Renders and finished trials are kept in pytest's cache folder.
 """
 
 from __future__ import annotations
@@ -26,8 +25,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.fixture
 def tofpod_gate(request: pytest.FixtureRequest) -> Callable[..., Path]:
-    """Return the gate: ``gate(experiment, *changes)`` runs a study (a YAML file beside the test, ``changes`` as of
-    ``--set``) and returns the folder of its results, or fails the test with what `harness.check` says."""
+    """Return ``gate(experiment, *changes)``: it returns a study's folder, or fails as `harness.check` does."""
 
     def gate(experiment: str, *changes: str) -> Path:
         from harness import check

@@ -1,9 +1,8 @@
 """``python -m harness.score PREDICTIONS --dataset DIR``: the detection limit of anybody's anomaly maps.
 
-A map is judged as a study judges a detector's score: the threshold is the lowest with the wanted rate of false calls on
-the good boards of ``validation``; pixels above it that chains of steps of at most `LINK_M` on the face join are a
-finding, which hits a damage by the experiment's rule (`harness.engine.judge.matched`); POD, a90 and a90/95 follow from
-hits and misses on ``test``, the rate of false calls from its good boards. Only pixels that are inspected count.
+A map is judged as a study judges a score: the threshold is the lowest with the wanted rate of false calls on the good
+boards of ``validation``; pixels above it that steps of at most `LINK_M` join are a finding, which hits a damage by the
+experiment's rule (`harness.engine.judge.matched`); limits follow from ``test``. Only inspected pixels count.
 
 AU-PRO is the area under the mean overlap of damages against the share of false pixels, up to `PRO_LIMIT` and divided by
 it (Bergmann et al., International Journal of Computer Vision 129 (2021), 1038), with each damage as a region.
@@ -31,10 +30,8 @@ if TYPE_CHECKING:
     from harness.evaluation.study.limit import SetUpLimit
 
 ENDINGS = (".npy", ".tiff", ".tif")
-JUDGED = ("validation", "test")
-"""Splits of which every board needs a map."""
-LINK_M = 0.010
-"""Longest step within a finding, as in `detectors.score_map`."""
+JUDGED = ("validation", "test")  # Splits of which every board needs a map
+LINK_M = 0.010  # Longest step within a finding, as in `detectors.score_map`
 PRO_LIMIT = 0.3
 MOST_NAMED = 3
 JUDGED_BY = ("inspected", "board_xy_m", "damage")
@@ -99,8 +96,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def _found(predictions: Path, dataset: Path, samples: list[str]) -> dict[str, Path]:
-    """The file of each board's map, every one of them of the right shape. Raises UserError that names all that is
-    missing, extra or wrong."""
+    """The file of each board's map. Raises UserError that names all that is missing, extra or wrong."""
     from harness.engine.boards import read_arrays
 
     wanted = {name for name in samples if name.split("/")[1] in JUDGED}
@@ -108,22 +104,21 @@ def _found(predictions: Path, dataset: Path, samples: list[str]) -> dict[str, Pa
     for path in sorted(predictions.rglob("*")) if predictions.is_dir() else ():
         if path.suffix.lower() in ENDINGS:
             files.setdefault(path.relative_to(predictions).with_suffix("").as_posix(), []).append(path)
-    faults = {
-        "missing": sorted(wanted - files.keys()),
-        "of no board of validation or test": sorted(files.keys() - wanted),
-        "there twice": sorted(name for name, found in files.items() if len(found) > 1),
-        "not as they must be": [],
-    }
-    for name in sorted(wanted & files.keys()):
-        (inspected,) = read_arrays(dataset, name, "inspected")
-        if fault := _fault(files[name][0], inspected):
-            faults["not as they must be"].append(f"{name} ({fault})")
-    said = [
-        f"{len(names)} maps are {what}: {', '.join(names[:MOST_NAMED])}{', ...' * (len(names) > MOST_NAMED)}"
-        for what, names in faults.items()
-        if names
-    ]
-    if said:
+    faults: dict[str, list[str]] = {}
+    for name in sorted(wanted | files.keys()):
+        if name not in files:
+            faults.setdefault("missing", []).append(name)
+        elif name not in wanted:
+            faults.setdefault("of no board of validation or test", []).append(name)
+        elif len(files[name]) > 1:
+            faults.setdefault("there twice", []).append(name)
+        elif fault := _fault(files[name][0], *read_arrays(dataset, name, "inspected")):
+            faults.setdefault("not as they must be", []).append(f"{name} ({fault})")
+    if faults:
+        said = [
+            f"{len(names)} maps are {what}: {', '.join(names[:MOST_NAMED])}{', ...' * (len(names) > MOST_NAMED)}"
+            for what, names in faults.items()
+        ]
         legal = "for each board of validation and test one .npy or .tiff of real numbers, of the pictures' size"
         raise UserError(f"{predictions}: {'; '.join(said)}", legal=legal, fix="write maps for all boards anew")
     return {name: files[name][0] for name in wanted}
@@ -158,14 +153,10 @@ def _read(path: Path) -> np.ndarray:
     return np.asarray(found, float)
 
 
-# ---------------------------------------------------------------- judging
-
-
 def _judged(
     category: str, maps: dict[str, Path], options: argparse.Namespace, index: dict[str, Any], rate: float
 ) -> tuple[SetUpLimit, dict[str, Any]]:
-    """Judge the maps of a category, at a threshold that its good boards of ``validation`` set: their limit, and a row
-    of the table of scores."""
+    """Judge the maps of a category, at a threshold by its good boards of ``validation``: limit, and scores."""
     import pandas as pd
 
     from harness.engine.boards import read_arrays, read_truth
@@ -186,20 +177,17 @@ def _judged(
     quiet = [(np.nanmax(scores), area_m2) for _, scores, _, _, area_m2 in boards("validation")]
     highest, areas_m2 = np.array(quiet, float).T
     threshold = threshold_for_rate(highest, float(areas_m2.mean()), rate).value
-    radius_m, truths = index["hit_radius_mm"] * MM, []
+    radius_m, overlap, truths = index["hit_radius_mm"] * MM, index["hit_overlap"], []
     holes, runs = list[dict[str, Any]](), list[dict[str, Any]]()
-    pixels: list[np.ndarray] = []
-    regions: list[np.ndarray] = []
-    tops: list[tuple[float, bool]] = []
+    pixels, regions, tops = list[np.ndarray](), list[np.ndarray](), list[tuple[float, bool]]()
     for name, scores, places_m, damage, area_m2 in boards("test"):
         truth = read_truth(options.dataset, name)
         damages, board = truth["damages"], truth["board"]
         truths.append([board, damages])
         lines = [np.array(one["line_m"]) for one in damages]
-        found, overlap = _findings(places_m, scores > threshold), index["hit_overlap"]
-        areas = (
-            [] if overlap is None else smeared([np.flatnonzero(damage == one["id"]) for one in damages], damage.shape)
-        )
+        found = _findings(places_m, scores > threshold)
+        outlines = [np.flatnonzero(damage == one["id"]) for one in damages]
+        areas = [] if overlap is None else smeared(outlines, damage.shape)
         ((pairs, parts),) = matched_places(lines, areas, lambda centres_m: centres_m, [found], radius_m, overlap)
         signals = highest_within(places_m, scores, lines, radius_m)
         common: dict[str, Any] = {"board": board, "repeat": 0, "threshold": float(threshold), "scale_mm": np.nan}
@@ -231,10 +219,9 @@ def _judged(
     )
     scores, of = np.concatenate(pixels), np.unique(np.concatenate(regions), return_inverse=True)[1]
     damaged, (top, is_flawed) = (of > 0) * 1.0, np.array(tops, float).T
-    overlap = damaged / np.bincount(of)[of]
     return limit_of(record), {
         "category": category,
-        "au_pro": area_under(scores, overlap, 1 - damaged, PRO_LIMIT),
+        "au_pro": area_under(scores, damaged / np.bincount(of)[of], 1 - damaged, PRO_LIMIT),
         "pixel_auroc": area_under(scores, damaged, 1 - damaged),
         "board_auroc": area_under(top, is_flawed, 1 - is_flawed),
     }
@@ -254,9 +241,8 @@ def _findings(places_m: np.ndarray, above: np.ndarray) -> Findings:
 
 
 def area_under(scores: np.ndarray, found: np.ndarray, false: np.ndarray, limit: float = 1.0) -> float:
-    """Return the area under the share of the weights ``found`` (n,) above a threshold against that of the weights
-    ``false`` (n,), up to ``limit`` of the latter and divided by it; NaN where either has no weight. Equal scores are
-    one threshold."""
+    """Return the area under the share of the weights ``found`` (n,) above a threshold against that of ``false`` (n,),
+    up to ``limit`` and divided by it; NaN where either has no weight. Equal scores are one threshold."""
     order = np.argsort(-scores, kind="stable")
     last = np.append(np.flatnonzero(np.diff(scores[order])), len(scores) - 1)
     up, across = (np.append(0.0, np.cumsum(each[order])[last]) for each in (found, false))

@@ -35,6 +35,7 @@ def main(arguments: argparse.Namespace, command: str) -> int:
     """Returns 0, 2 on a mistake of the user."""
     config = declared(arguments.target, arguments.board)
 
+    from harness.tables.text import Grid, show
     from scenes.target.mesh import build_target, write_mesh, write_truth
 
     target = build_target(config.hole_free() if arguments.hole_free else config)
@@ -42,20 +43,18 @@ def main(arguments: argparse.Namespace, command: str) -> int:
         if path is not None:
             write(target, path)
             print(f"wrote {path}")
-    titles = ("id", "kind", "diameter mm", "depth mm", "volume mm3", "x camera mm", "y camera mm", "z camera mm")
-    print("  ".join(f"{title:>11}" for title in titles) if target.truth else "no damage")
-    for damage in target.truth:
-        row = damage.to_row()
-        numbers = [row["diameter_mm"], row["depth_mm"], row["volume_mm3"], *(row[f"{a}_camera_mm"] for a in "xyz")]
-        print("  ".join([f"{row['id']:>11}  {row['kind']:>11}", *(f"{number:11.3f}" for number in numbers)]))
+    rows = [damage.to_row() for damage in target.truth]
+    keys = ("diameter_mm", "depth_mm", "volume_mm3", *(f"{axis}_camera_mm" for axis in "xyz"))
+    cells = [(row["id"], row["kind"], *(f"{row[key]:.3f}" for key in keys)) for row in rows]
+    heads = ("id", "kind", *(key.replace("_", " ") for key in keys))
+    show([Grid.of(heads, cells, left=2)] if rows else ["no damage"])
     triangles = sum(len(part.mesh.faces) for part in target.parts)
     print(f"{triangles} triangles: {', '.join(part.name for part in target.parts)}")
     return 0
 
 
 def declared(what: str | Path | Mapping[str, Any], board: int) -> TargetConfig:
-    """Return the target of a name, of a file, or of a declaration as plain data; of a family the ``board`` asked for.
-    Raises UserError with every mistake of the declaration."""
+    """Return the target of a name, a file or a declaration; of a family one ``board``. Raises UserError."""
     from harness.vocabulary.declaration.diagnose import read_as, settings_of
     from harness.vocabulary.declaration.yaml_source import read_yaml
     from scenes.target.drawn import DrawnTargetConfig

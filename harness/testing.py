@@ -23,25 +23,10 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from detectors.interface import Calibratable, Detection, Detector, Evidence, Measurement
-from harness.synthetic_clouds import (
-    DAMAGE,
-    DISTANCE_M,
-    LENS,
-    SHAPE,
-    cylinder,
-    plane,
-    synthetic_clouds,
-    with_gaps,
-    without,
-)
+from harness.synthetic_clouds import plane, synthetic_clouds, with_gaps, without
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud, Lens, MapViews, Region, transform_points
-
-__all__ = [
-    "CHECKS", "DAMAGE", "DISTANCE_M", "LENS", "SHAPE", "check_detector", "cylinder", "plane", "synthetic_clouds",
-    "with_gaps", "without",
-]  # fmt: skip
 
 
 def check_detector(
@@ -53,13 +38,10 @@ def check_detector(
     """Run every check on every cloud. Raises AssertionError where the contract of `detectors.interface` is broken; what
     the detector itself raises is passed on. A note on the exception names the check.
 
-    ``make``: a detector's class, whose ``settings`` (plain data, as YAML holds it) are then validated by its
-    ``settings_type``; or a function without arguments that makes a detector anew at each call. ``clouds``: what it is
-    checked on, by default three small synthetic ones 0.7 m before the camera, within 90 mm of its axis, each with
-    damage of centimetres (`harness.synthetic_clouds`). Something must be found on one of them at least, at any
-    threshold, or nothing would have been checked.
-
-    Not checked: whether the detector is any good, which is what a study measures.
+    ``make``: a detector's class, whose ``settings`` (plain data, as YAML holds it) its ``settings_type`` validates; or
+    a function that makes a detector anew at each call. ``clouds``: what it is checked on, by default
+    `harness.synthetic_clouds`: three clouds 0.7 m before the camera, each with damage of centimetres, some of which
+    must be found at some threshold. Not checked: whether the detector is any good, which a study measures.
     """
     settings_type, build = getattr(make, "settings_type", None), cast("Callable[..., Detector]", make)
     if settings_type is None and settings is not None:
@@ -79,9 +61,6 @@ def check_detector(
     detector = made()
     loud = any(detector.quiet_threshold(cloud, detector.analyse(cloud)) > 0 for cloud in tried)
     require(loud, "nothing was found on any cloud at any threshold, so that next to nothing was checked")
-
-
-# ---------------------------------------------------------------- checks
 
 
 STRONGEST = 5  # findings of one cloud that are looked at one by one
@@ -151,9 +130,6 @@ class Look:
         return self.evidence, quiet, found, [self.measured(finding) for finding in found[:STRONGEST]]
 
 
-# ---- the checks ------------------------------------------------------------------------------------------------------
-
-
 def declares_itself(make: Make, cloud: Cloud) -> None:
     """A name, a version from 1, and settings that are a Config whose defaults are legal and survive being stored."""
     detector = make()
@@ -177,10 +153,8 @@ def gives_the_same_twice(make: Make, cloud: Cloud) -> None:
     """The same bits for the same cloud: again, after another cloud, and from a detector made anew."""
     detector = make()
     first = Look.at(detector, cloud).everything()
-    again = Look.at(detector, cloud).everything()
-    require(_same(first, again), "the second time the same cloud gave another result")
-    other = Look.at(detector, with_gaps(cloud, seed=9))
-    other.find(other.quiet / 2)
+    require(_same(first, Look.at(detector, cloud).everything()), "the second time the same cloud gave another result")
+    Look.at(detector, with_gaps(cloud, seed=9)).everything()
     again = Look.at(detector, cloud).everything()
     require(_same(first, again), "after another cloud the same one gave another result")
     require(_same(first, Look.at(make(), cloud).everything()), "a detector made anew gave another result")
@@ -219,8 +193,7 @@ def orders_findings_by_score(make: Make, cloud: Cloud) -> None:
 
 
 def is_silent_at_the_quiet_threshold(make: Make, cloud: Cloud) -> None:
-    """Nothing is found there, something just below it, and it is the strongest finding's score; 0 where nothing can be
-    found."""
+    """Nothing is found there, something just below; it is the strongest finding's score, or 0 for none."""
     look = Look.at(make(), cloud)
     quiet = look.quiet
     require(np.isfinite(quiet) and quiet >= 0, f"the quiet threshold is {quiet:g}: a number from 0 is wanted")
@@ -249,18 +222,15 @@ def finds_no_more_at_higher_thresholds(make: Make, cloud: Cloud) -> None:
 def finds_valid_pixels(make: Make, cloud: Cloud) -> None:
     """Pixels are ascending flat indices of valid points; centres are finite and lie within the cloud."""
     look = Look.at(make(), cloud)
-    for threshold in look.thresholds():
-        for finding in look.find(threshold):
-            _sound_finding(cloud, finding)
+    _sound_findings(look, *look.thresholds())
 
 
 def survives_missing_pixels(make: Make, cloud: Cloud) -> None:
     """Evidence and findings stay sound where a twentieth of the pixels, a block and a column are gone."""
     look = Look.at(make(), with_gaps(cloud, seed=5))
     _sound(look)
-    for finding in look.find(look.quiet / 2):
-        _sound_finding(look.cloud, finding)
-        look.measured(finding)
+    _sound_findings(look, look.quiet / 2)
+    look.everything()
 
 
 def refuses_an_empty_cloud(make: Make, cloud: Cloud) -> None:
@@ -318,13 +288,10 @@ def learns_plain_arrays(make: Make, cloud: Cloud) -> None:
 
 
 def turns_with_the_cloud(make: Make, cloud: Cloud) -> None:
-    """The camera turned about its optical axis by 90 and by 180 degrees, grid and lens with it."""
-    look = Look.at(make(), cloud)
-    pixels = np.arange(cloud.valid.size).reshape(cloud.valid.shape)
-    turned, T_turned_cloud = cloud, np.eye(4)
-    for degrees in (90, 180):
-        turned, pixels, T_turned_cloud = turned_once(turned), _grid_turned(cloud, pixels), QUARTER_TURN @ T_turned_cloud
-        _compare(look, Look.at(make(), turned), pixels, T_turned_cloud, f"turned by {degrees} degrees")
+    """The camera turned about its optical axis by 90 degrees, grid and lens with it."""
+    pixels = _grid_turned(cloud, np.arange(cloud.valid.size).reshape(cloud.valid.shape))
+    turned = Look.at(make(), turned_once(cloud))
+    _compare(Look.at(make(), cloud), turned, pixels, QUARTER_TURN, "turned by 90 degrees")
 
 
 def moves_with_the_cloud(make: Make, cloud: Cloud) -> None:
@@ -339,24 +306,10 @@ def moves_with_the_cloud(make: Make, cloud: Cloud) -> None:
 
 
 CHECKS = (
-    declares_itself,
-    gives_sound_evidence,
-    gives_the_same_twice,
-    keeps_its_input,
-    orders_findings_by_score,
-    is_silent_at_the_quiet_threshold,
-    finds_no_more_at_higher_thresholds,
-    finds_valid_pixels,
-    survives_missing_pixels,
-    refuses_an_empty_cloud,
-    survives_pickling,
-    learns_plain_arrays,
-    turns_with_the_cloud,
-    moves_with_the_cloud,
-)
-
-
-# ---- what several checks ask -----------------------------------------------------------------------------------------
+    declares_itself, gives_sound_evidence, gives_the_same_twice, keeps_its_input, orders_findings_by_score,
+    is_silent_at_the_quiet_threshold, finds_no_more_at_higher_thresholds, finds_valid_pixels, survives_missing_pixels,
+    refuses_an_empty_cloud, survives_pickling, learns_plain_arrays, turns_with_the_cloud, moves_with_the_cloud,
+)  # fmt: skip
 
 
 def _sound(look: Look) -> None:
@@ -373,19 +326,21 @@ def _sound(look: Look) -> None:
     require(np.isfinite(scale) and scale > 0, f"`scale_m` is {scale:g}: a length above 0 is wanted")
 
 
-def _sound_finding(cloud: Cloud, finding: Detection) -> None:
-    pixels, centre = np.asarray(finding.pixels), np.asarray(finding.centre_m)
-    require(pixels.ndim == 1 and pixels.dtype.kind in "iu", "a finding's pixels are no (n,) whole numbers")
-    require(len(pixels) > 0, "a finding has no pixels")
-    require((np.diff(pixels.astype(np.int64)) > 0).all(), "a finding's pixels do not ascend, or one is named twice")
-    require(pixels[0] >= 0 and pixels[-1] < cloud.valid.size, "a finding's pixels reach beyond the cloud's grid")
-    invalid = int((~cloud.valid.reshape(-1)[pixels]).sum())
-    require(invalid == 0, f"{invalid} pixels of a finding have no point")
-    require(centre.shape == (3,) and np.isfinite(centre).all(), "a finding's `centre_m` is no (3,) finite numbers")
+def _sound_findings(look: Look, *thresholds: float) -> None:
+    cloud = look.cloud
     points = cloud.points_m[cloud.valid]
     low, high = points.min(axis=0) - CENTRE_MARGIN_M, points.max(axis=0) + CENTRE_MARGIN_M
-    is_inside = bool(((low <= centre) & (centre <= high)).all())
-    require(is_inside, f"a finding's centre {np.round(centre, 4).tolist()} m lies outside the cloud")
+    for finding in (each for threshold in thresholds for each in look.find(threshold)):
+        pixels, centre = np.asarray(finding.pixels), np.asarray(finding.centre_m)
+        require(pixels.ndim == 1 and pixels.dtype.kind in "iu", "a finding's pixels are no (n,) whole numbers")
+        require(len(pixels) > 0, "a finding has no pixels")
+        require((np.diff(pixels.astype(np.int64)) > 0).all(), "a finding's pixels do not ascend, or one is named twice")
+        require(pixels[0] >= 0 and pixels[-1] < cloud.valid.size, "a finding's pixels reach beyond the cloud's grid")
+        invalid = int((~cloud.valid.reshape(-1)[pixels]).sum())
+        require(invalid == 0, f"{invalid} pixels of a finding have no point")
+        require(centre.shape == (3,) and np.isfinite(centre).all(), "a finding's `centre_m` is no (3,) finite numbers")
+        is_inside = bool(((low <= centre) & (centre <= high)).all())
+        require(is_inside, f"a finding's centre {np.round(centre, 4).tolist()} m lies outside the cloud")
 
 
 def _pixels_of(found: tuple[Detection, ...]) -> np.ndarray:
@@ -420,22 +375,23 @@ def _read_only(array: np.ndarray) -> np.ndarray:
 
 
 def turned_once(cloud: Cloud) -> Cloud:
-    """The cloud that the same camera gives when it is turned by 90 degrees about its optical axis."""
+    """Return the cloud that the same camera gives when it is turned by 90 degrees about its optical axis."""
     names = ("reason", "count", "variance_m2", "rgb", "amplitude", "mean_variance_m2")
     images = {name: getattr(cloud, name) for name in names}
     turned: dict[str, Any] = {name: _grid_turned(cloud, image) for name, image in images.items() if image is not None}
     turned["points_m"] = _grid_turned(cloud, transform_points(QUARTER_TURN, cloud.points_m))
-    lens, region, views = cloud.lens, cloud.region, cloud.map_views
-    if cloud.organised:
-        width = lens.width if lens is not None else region.col1
-        turned["region"] = Region(width - region.col1, width - region.col0, region.row0, region.row1)
+    if (views := cloud.map_views) is not None:
+        turned["map_views"] = MapViews(QUARTER_TURN @ views.T_cloud_cameras, views.shares, views.pixel_m[::-1])
+    if not cloud.organised:
+        return replace(cloud, lens=None, **turned)
+    lens, region = cloud.lens, cloud.region
+    width = lens.width if lens is not None else region.col1
+    turned["region"] = Region(width - region.col1, width - region.col0, region.row0, region.row1)
     if lens is not None:
         k1, k2, p1, p2, *further = lens.distortion
         distortion = (k1, k2, -p2, p1, *further)
-        lens = Lens(lens.height, lens.width, lens.fy, lens.fx, lens.cy, lens.width - 1 - lens.cx, distortion)
-    if views is not None:
-        views = MapViews(QUARTER_TURN @ views.T_cloud_cameras, views.shares, views.pixel_m[::-1])
-    return replace(cloud, lens=lens if cloud.organised else None, map_views=views, **turned)
+        turned["lens"] = Lens(lens.height, width, lens.fy, lens.fx, lens.cy, width - 1 - lens.cx, distortion)
+    return replace(cloud, **turned)
 
 
 def _grid_turned(cloud: Cloud, image: np.ndarray) -> np.ndarray:
@@ -449,10 +405,9 @@ def _compare(before: Look, after: Look, pixels: np.ndarray, T_after_before: np.n
     changed = int((np.isfinite(was) != np.isfinite(now)).sum())
     require(changed <= CROP_TOLERANCE * now.size, f"{how}, {changed} of {now.size} pixels gained or lost their score")
     tolerance = SCORE_TOLERANCE * max(float(np.nanmax(was)), 1e-12)
-    difference = float(np.nanmax(np.abs(was - now)))
-    require(difference <= tolerance, f"{how}, a score changed by {difference:g} (allowed {tolerance:g})")
-    quiet = abs(before.quiet - after.quiet)
-    require(quiet <= tolerance, f"{how}, the quiet threshold changed by {quiet:g} (allowed {tolerance:g})")
+    changes = {"a score": float(np.nanmax(np.abs(was - now))), "the quiet threshold": abs(before.quiet - after.quiet)}
+    for what, difference in changes.items():
+        require(difference <= tolerance, f"{how}, {what} changed by {difference:g} (allowed {tolerance:g})")
 
     # findings in the middle of the widest gap between scores from a fifth of the quiet threshold to it; where none is
     # wider than the tolerance on both sides, a tolerable change of a score can change findings

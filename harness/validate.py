@@ -35,8 +35,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     epilog="Exit code 1: a figure fails whose entry in the file of figures does not say why.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Returns 0, 1 where a figure fails and its entry does not say why, 2 on a mistake of the user, 130 after
-    Ctrl-C."""
+    """Returns 0, 1 where a figure fails and its entry does not say why, 2 on a user's mistake, 130 after Ctrl-C."""
     if options.capture or options.board:
         if options.figures:
             raise UserError("--figures belongs to the scorecard, not to a capture")

@@ -147,6 +147,7 @@ def test_the_exact_command_is_a_valid_experiment(stored: Path, capsys: pytest.Ca
         (["--size", "5mm", "--distance", "9m"], "the atlas does not reach so far"),
         (["--size", "5mm", "--distance", "1m", "--camera", "kinect"], "--camera kinect: not in the atlas"),
         (["--size", "5mm", "--distance", "1m", "--damage", "crack"], "legal: hole, through-hole, "),
+        (["--size", "5mm", "--distance", "1m", "--damage", "crak"], "did you mean 'crack'?"),
         (["--size", "5mm", "--distance", "1m", "--damage", "blind"], "--depth is missing"),
         (["--size", "5mm", "--distance", "1m", "--depth", "2mm"], "--depth: the atlas has none for through-holes"),
     ],

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.engine.estimate import PLAIN_EVERY_S, duration, progress_display, rate_text
+from harness.engine.estimate import PLAIN_EVERY_S, progress_display
 from harness.engine.work import Outcome, StageCounts
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -43,7 +43,7 @@ def lines_of(states: list[tuple[float, Outcome]]) -> list[str]:
 
 def test_what_was_found_is_no_part_of_the_rate():
     states = [(s, at(trials=StageCounts(done=5 * s, found=500, total=1000))) for s in range(21)]
-    assert lines_of(states)[-1] == "renders 0/0, trials 600/1000 (500 found) 5/s about 80 s left"
+    assert lines_of(states)[-1] == "renders 0/0, trials 600/1000 (500 found) 5.00/s about 0:01:20 left"
 
 
 def test_no_number_before_there_is_a_base():
@@ -53,7 +53,7 @@ def test_no_number_before_there_is_a_base():
 def test_the_rate_is_that_of_the_last_minute():
     fast = [(s, at(trials=StageCounts(done=100 * s, total=100_000))) for s in range(101)]
     slow = [(100 + s, at(trials=StageCounts(done=10_000 + s, total=100_000))) for s in range(1, 101)]
-    assert " 1/s " in lines_of(fast + slow)[-1]
+    assert " 1.00/s " in lines_of(fast + slow)[-1]
 
 
 def test_the_wall_clock_may_jump(monkeypatch):
@@ -74,8 +74,8 @@ def test_lines_come_at_the_start_every_ten_seconds_and_at_the_end():
     states = [(tenth / 10, at(renders, StageCounts(done=tenth, total=255))) for tenth in range(256)]
     assert lines_of([*states, *50 * states[-1:]]) == [
         "renders 6/6 (3 found), trials 0/255",
-        "renders 6/6 (3 found), trials 100/255 10/s about 15 s left",
-        "renders 6/6 (3 found), trials 200/255 10/s about 5.5 s left",
+        "renders 6/6 (3 found), trials 100/255 10/s about 0:00:15 left",
+        "renders 6/6 (3 found), trials 200/255 10/s about 0:00:05 left",
         "renders 6/6 (3 found), trials 255/255",
     ]
     assert PLAIN_EVERY_S == 10
@@ -93,21 +93,6 @@ def test_the_last_state_is_told_where_it_is_interrupted():
 def test_failures_are_told_where_there_are_any():
     state = at(StageCounts(done=2, failed=1, total=4), StageCounts(done=3, failed=2, total=9))
     assert lines_of([(0, state)]) == ["renders 3/4 1 failed, trials 5/9 2 failed"]
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [(0.44, "0.4 s"), (45.2, "45 s"), (119, "119 s"), (150, "2.5 min"), (7100, "118 min"), (9000, "2.5 h")],
-)
-def test_durations(seconds, text):
-    assert duration(seconds) == text
-
-
-@pytest.mark.parametrize(
-    ("rate", "text"), [(123.4, "123/s"), (9.5, "9.5/s"), (0.8, "0.8/s"), (0.05, "3/min"), (0.002, "7.2/h")]
-)
-def test_rates(rate, text):
-    assert rate_text(rate) == text
 
 
 SHOWN = """

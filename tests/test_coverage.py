@@ -103,6 +103,8 @@ def test_the_program_says_where_the_camera_is_blind(
         (["detection_limit", "--size", "5mm"], "set-ups, and coverage is of one"),
         (["pipe", "--size", "5"], "no length with its unit"),
         (["pipe", "--goal", "5mm", "--suggest", "2"], "leave out --size"),
+        (["pipe", "--size", "99mm"], "inspects no damage of that size"),
+        (["pipe", "--goal", "99mm"], "inspects no damage of that size"),
         (["pipe", "--share", "2"], "a share above 0"),
     ],
 )

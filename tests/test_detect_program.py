@@ -287,7 +287,7 @@ def test_a_camera_may_lend_its_lens(tmp_path: Path, capsys: pytest.CaptureFixtur
     (
         (("--crop", "circle"), "--crop circle"),
         (("--crop", "box:1,2,3"), "box:x0,x1,y0,y1,z0,z1"),
-        (("--crop", "box:500,-500,-500,500,100,900"), "x0 = 500 is not below x1 = -500"),
+        (("--crop", "box:500,-500,-500,500,100,900"), "a lower bound is not below the upper one"),
         (("--crop", "box:a,2,3,4,5,6"), "not all of its values are numbers"),
         (("--crop", "box:-500,500,-500,500,5000,9000"), "holds none of the cloud's"),
         (("--crop", "polygon:200,1,300,1,200,90"), "none of the cloud's 6911 points"),
@@ -298,7 +298,7 @@ def test_a_camera_may_lend_its_lens(tmp_path: Path, capsys: pytest.CaptureFixtur
         (("--threshold", "0"), "above 0"),
         (("--threshold", "nan"), "above 0"),
         (("--threshold", "3", "--quiet-capture", "x"), "give one of them"),
-        (("--threshold", "3", "--false-calls", "1"), "--threshold and --false-calls both set the threshold"),
+        (("--threshold", "3", "--false-calls", "1"), "--threshold and --false-calls set the threshold"),
         (("--quiet-capture", "x", "--false-calls", "1"), "--quiet-capture and --false-calls both set"),
         (("--false-calls", "0"), "above 0"),
         (("--false-calls", "inf"), "above 0"),

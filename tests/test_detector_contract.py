@@ -14,7 +14,8 @@ from detectors.measure import measure_extents
 from detectors.score_map import ScoreMapConfig, ScoreMapDetector, above, on_grid
 from detectors.thesis import ThesisDetector
 from harness import testing as checks
-from harness.testing import CHECKS, check_detector, cylinder, plane, synthetic_clouds, turned_once, with_gaps
+from harness.synthetic_clouds import cylinder, plane, synthetic_clouds, with_gaps
+from harness.testing import CHECKS, check_detector, turned_once
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud

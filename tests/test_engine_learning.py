@@ -22,9 +22,10 @@ from harness.engine.work import Shard
 from harness.evaluation.study.limit import limit_of
 from harness.evaluation.study.record import StudyRecord
 from harness.experiment.load import load_experiment
+from harness.synthetic_clouds import plane
 from harness.tables.limits import limits_grid, quoted, study_answer
 from harness.tables.study import set_by, threshold_warnings
-from harness.testing import check_detector, learns_plain_arrays, plane
+from harness.testing import check_detector, learns_plain_arrays
 
 LEARNING = "detector={name: learning, settings: {crop: {kind: auto, inset_px: 4}}}"
 ONE_FRAME = ("sweep={}", "capture.frames=1")

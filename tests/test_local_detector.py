@@ -15,7 +15,8 @@ from detectors.interface import Detection
 from detectors.local import LocalConfig, LocalDetector
 from detectors.matched import MatchedDetector
 from detectors.whitening import inverse_times, noise_covariance, spectrum
-from harness.testing import LENS, check_detector, plane, with_gaps
+from harness.synthetic_clouds import LENS, plane, with_gaps
+from harness.testing import check_detector
 from harness.vocabulary.geometry import Cloud, Region
 
 SHAPE = (200, 240)

@@ -29,7 +29,7 @@ from detectors.whitening import (
     window_of,
     worths,
 )
-from harness.testing import SHAPE, plane, without
+from harness.synthetic_clouds import SHAPE, plane, without
 from harness.vocabulary.geometry import Cloud
 
 DETECTOR = MatchedDetector(MatchedDetector.settings_type.from_data({"crop": {"kind": "none"}}))

@@ -17,8 +17,8 @@ from detectors.missing import ALPHA, measure_missing, missing_returns, one_damag
 from harness.evaluation.study.limit import limit_of
 from harness.inspection.run import judged as judged_cloud
 from harness.report.findings import write_findings
+from harness.synthetic_clouds import LENS, SHAPE, plane, without
 from harness.tables.limits import LIMITS, notes_of
-from harness.testing import LENS, SHAPE, plane, without
 from harness.vocabulary.geometry import Cloud, Region
 from tests.synthetic_study import study_record
 

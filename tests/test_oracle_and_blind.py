@@ -12,7 +12,8 @@ from detectors import load_detector
 from detectors.controls import BlindDetector, Oracle, judged_area_m2
 from detectors.interface import ToldTheTruth, TrueDamage
 from harness import testing as checks
-from harness.testing import CHECKS, DISTANCE_M, LENS, SHAPE, cylinder, plane, with_gaps, without
+from harness.synthetic_clouds import DISTANCE_M, LENS, SHAPE, cylinder, plane, with_gaps, without
+from harness.testing import CHECKS
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud

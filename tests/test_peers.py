@@ -17,7 +17,8 @@ from detectors import load_detector
 from detectors.interface import Calibratable, Detector
 from detectors.peers import FpfhMemoryConfig, FpfhMemoryDetector, coreset, nearest
 from harness.ls import main as ls
-from harness.testing import check_detector, plane, with_gaps
+from harness.synthetic_clouds import plane, with_gaps
+from harness.testing import check_detector
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud, Region
 

@@ -253,9 +253,7 @@ def test_a_link_in_a_files_place_is_replaced_and_not_followed(tmp_path):
     assert (tmp_path / "precious").read_text() == "old" and (tmp_path / "report.html").read_text() == "new"
 
 
-@pytest.mark.parametrize(
-    "name", ["..", "../a", "a/b", "/etc", "a\\b", "a\0b", "a\n", " ", "", ".a", "x" * 65, "con", "LPT1"]
-)
+@pytest.mark.parametrize("name", ["..", "../a", "a/b", "/etc", "a\\b", "a\0b", "a\n", " ", "", ".a", "x" * 65])
 def test_an_experiments_name_is_plain(tmp_path, name):
     text = (ROOT / "experiments" / "smoke.yaml").read_text()
     lines = [f"name: {json.dumps(name)}" if line.startswith("name:") else line for line in text.splitlines()]

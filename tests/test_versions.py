@@ -157,10 +157,7 @@ def test_a_file_of_poses(tmp_path, version, told):
     assert read_poses(path, 1)[0].tolist() == [[float(i == j) for j in range(4)] for i in range(4)]
 
 
-def test_a_design_says_it(tmp_path, capsys):
+def test_a_design_says_it(tmp_path):
     asked = ["--a50", "6", "--a90", "8", "--sizes", "4", "10", "--studies", "10", "--targets", "60"]
     assert design.main([*asked, "--out", str(tmp_path)]) == 0
-    capsys.readouterr()
-    assert design.main([*asked, "--json"]) == 0
-    for text in ((tmp_path / "design.json").read_text(), capsys.readouterr().out):
-        assert json.loads(text)["results_version"] == RESULTS_VERSION
+    assert json.loads((tmp_path / "design.json").read_text())["results_version"] == RESULTS_VERSION

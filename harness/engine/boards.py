@@ -1,9 +1,8 @@
 """Boards of a data set: which there are, and the files of each; and how programs read them again.
 
-Every board is one average of frames of one unit of a camera. Boards of different splits are different boards, drawn
-with random streams of their own: those of ``validation``, ``test/good`` and of damage are the boards by which a study
-of the same experiment sets thresholds, counts false calls and finds limits. Not included: several views, real captures.
-"""
+Every board is one average of frames of one unit of a camera. Splits have boards of their own: those of ``validation``,
+``test/good`` and of damage are those with which a study of the same experiment sets thresholds, counts false calls and
+finds limits. Not included: several views, real captures."""
 
 from __future__ import annotations
 
@@ -35,8 +34,7 @@ from scenes.sensor.source import SimulatedUnit
 from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.truth import truth_of
 
-DATASET_VERSION = 1
-"""Stands in ``dataset.json``; raised when a file's meaning changes."""
+DATASET_VERSION = 1  # Stands in ``dataset.json``; raised when a file's meaning changes
 INDEX, TRUTH, CLOUD = "dataset.json", "truth.json", "cloud.npz"
 SPLITS: tuple[tuple[str, Role, float], ...] = (
     ("train", "learning", 0.3),
@@ -45,19 +43,15 @@ SPLITS: tuple[tuple[str, Role, float], ...] = (
     ("test", "damaged", 0.4),
 )
 """Split, purpose of its boards, and share of all boards of a category."""
-FEWEST = 10
-"""Boards of a category, with which every split has one."""
-INSET_PX = 4
-"""Rim of the board that is not inspected: as far as the cameras' windows and edges reach, and a pixel more."""
-BRIGHTEST = 0.995
-"""Quantile of a picture's intensity that pictures show as white."""
+FEWEST = 10  # Boards of a category, with which every split has one
+INSET_PX = 4  # Rim of the board that is not inspected: as far as the cameras' windows and edges reach, and a pixel more
+BRIGHTEST = 0.995  # Quantile of a picture's intensity that pictures show as white
 AGAIN = "run the command that wrote the data set again"
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One board of a data set: the render that it needs, and the trial whose average it is. ``label``: ``good``, the
-    kind of its damage, or ``combined`` where it has several."""
+    """One board: the render that it needs, and the trial whose average it is. ``label``: good, kind, combined."""
 
     category: str
     split: str
@@ -84,8 +78,7 @@ def categories_of(experiment: Experiment) -> dict[str, Point]:
     names, found = names_of(axes), dict[str, Point]()
     for point in points.values():
         said = []
-        for path in axes:
-            own = point.values[path]
+        for path, own in ((path, point.values[path]) for path in axes):
             text = value_text(path, differing(own, (value for value in values[path] if value != own)))
             said.append(f"{names[path]} {text}" if text[:1].isdigit() else text)
         name = re.sub(r"[^A-Za-z0-9.]+", "_", " ".join(said)).strip("_.") or experiment.config.name
@@ -131,8 +124,7 @@ def joined(regions: list[Region]) -> Region:
 
 
 def write_board(out: Path, sample: Sample, window: Region) -> None:
-    """Write all files of a board on the ``window`` of the sensor that all boards of its category share; the truth last,
-    by which a resumed run knows that the board is there."""
+    """Write all files of a board on the ``window`` that its category shares; the truth last, for resuming."""
     set_up, (point,) = load_set_up(sample.task.set_ups[0]), sample.task.points
     known = known_view(set_up, cloud_of(sample.task, point), hole_free=sample.task.hole_free)
     cloud, truth = known.cloud, () if sample.task.hole_free else known.truth
@@ -198,9 +190,6 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
         "damages": damages,
     }
     write_text(place / file / TRUTH, json.dumps(told, allow_nan=False) + "\n", durable=False)
-
-
-# ---------------------------------------------------------------- reading
 
 
 def read_index(folder: Path) -> dict[str, Any]:

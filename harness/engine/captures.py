@@ -22,10 +22,7 @@ from harness.vocabulary.provenance import RESULTS_VERSION, record
 
 
 def judge_captures(experiment: Experiment, out: Path, command: str) -> int:
-    """Judge every point's capture once and write its findings to ``<folder>/<number>/``, and a table of all points.
-
-    A capture has no repeats and no truth, so rates, sizes against the truth and claims are not given. Returns 0.
-    """
+    """Judge every point's capture and write its findings to ``<folder>/<number>/``, and a table of all. Returns 0."""
     folder = experiment.folder(out)
     write_text(folder / EXPERIMENT.name, resolved_yaml(experiment))
     rows = []
@@ -46,10 +43,9 @@ def judge_captures(experiment: Experiment, out: Path, command: str) -> int:
             "provenance": record(command),
         }
         write_findings(folder / name, found, about, point.label or name, beside=pictures(choice))
-        counts = {"frames_used": cloud.n_frames, "frames_left_out": len(cloud.left_out)}
-        threshold = {"threshold_k": k, "threshold_mm": round(k * found.evidence.scale_m / MM, 4)}
-        rows.append({"point": name, "variant": point.variant, "what": point.label, **counts, **threshold})
-        rows[-1]["findings"] = len(found.findings)
+        row = {"point": name, "variant": point.variant, "what": point.label, "frames_used": cloud.n_frames}
+        row |= {"frames_left_out": len(cloud.left_out), "findings": len(found.findings), "threshold_k": k}
+        rows.append(row | {"threshold_mm": round(k * found.evidence.scale_m / MM, 4)})
         print_warnings(f"{name}: {text}" for text in (*(choice.warnings if choice else ()), *found.evidence.warnings))
         print(f"{name} {point.label}: {len(found.findings)} findings beyond {rows[-1]['threshold_mm']:.2f} mm")
         for left in cloud.left_out:

@@ -1,9 +1,7 @@
-"""Jobs on a cluster by way of dask.distributed: each dask worker is a node that runs the local engine inside.
+"""Jobs on a cluster by dask.distributed: each dask worker is a node that runs the local engine inside.
 
-A node's processes do the jobs, enforce their limits and survive their deaths, as on this machine. The driver calls the
-nodes through the scheduler, with bundles of jobs, two at a time for each: dask neither queues nor retries them. When a
-node dies, its jobs go to others; a job that was aboard of `TRIES` nodes as they died counts as crashed.
-"""
+The driver calls the nodes through the scheduler with bundles of jobs, two at a time for each; dask neither queues nor
+retries them. When a node dies, its jobs go to others; a job that `TRIES` nodes had as they died counts as crashed."""
 
 from __future__ import annotations
 
@@ -23,6 +21,7 @@ import warnings
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +56,7 @@ class Bundle:
 
 @dataclass(frozen=True)
 class NodeFacts:
-    """A node's description of itself. ``digests``: of code and packages by stage, without those that are not installed;
+    """What a node says of itself. ``digests``: of code and packages by stage, without those that are not installed;
     ``processes``: jobs at once; ``sees``: content of the file that it was asked for."""
 
     python: str
@@ -72,9 +71,8 @@ class _Node:
     """A node that takes jobs. ``bundles``: those under way, by number, ``renders`` of them renders."""
 
     address: str
-    processes: int
+    facts: NodeFacts
     can_render: bool
-    offers_render: bool
     bundles: dict[int, Bundle] = field(default_factory=dict)
     renders: int = 0
 
@@ -92,15 +90,14 @@ class ClusterEngine:
         self._digests = {stage: source_digest(*which) for stage, which in self._code.items()}
         self._client: Any = None
         self._nodes: dict[str, _Node] = {}
-        self._refused: dict[str, UserError] = {}
-        """Nodes that would give other numbers than this machine, by address: left out while others are there."""
+        self._refused: dict[str, UserError] = {}  # nodes of other numbers: left out while others are there
         self._asked: set[str] = set()  # addresses of nodes that were asked what they are
         self._waiting: dict[Stage, deque[Job]] = {"renders": deque(), "trials": deque()}
         self._done: list[tuple[Job, Ended]] = []
         self._out: Counter[Stage] = Counter()
         self._tries: Counter[str] = Counter()
+        # (address, number of the bundle, answer) of a node; without a number the answer is what the node is
         self._events: queue.SimpleQueue[tuple[str, int | None, Any]] = queue.SimpleQueue()
-        """(address, number of the bundle, answer) of a node; without a number the answer is what the node is."""
         self._number = 0
         self._mean_s = BUNDLE_S  # mean duration of a trial; at first as if each were worth a bundle of its own
         self._looked = float("-inf")
@@ -135,7 +132,7 @@ class ClusterEngine:
     def room(self, stage: Stage) -> int:
         """Room for as much as keeps all nodes busy, and the next bundles ready."""
         each = 1 if stage == "renders" else WITH_NODE * self._bundle_size() + 1
-        return max(1, each * sum(one.processes for one in self._nodes.values())) + 1 - self._out[stage]
+        return max(1, each * sum(one.facts.processes for one in self._nodes.values())) + 1 - self._out[stage]
 
     def submit(self, job: Job) -> None:
         """Take a job."""
@@ -143,8 +140,7 @@ class ClusterEngine:
         self._waiting[job.stage].append(job)
 
     def ended(self) -> list[tuple[Job, Ended]]:
-        """Wait for jobs to end. Raises UserError where the scheduler is gone, or for long no node is left that could
-        do what waits."""
+        """Wait for jobs to end. Raises UserError where the scheduler, or every node that could do them, is gone."""
         while not self._done:
             self._hand_out()
             if not self._done:
@@ -159,19 +155,19 @@ class ClusterEngine:
     def _hand_out(self) -> None:
         """Send every node a bundle of trials, then a second one, and renders where it may render."""
         renders, trials = self._waiting["renders"], self._waiting["trials"]
-        some_offer = any(one.offers_render and one.can_render for one in self._nodes.values())
-        for most in range(WITH_NODE):
-            for to in list(self._nodes.values()):
-                may_render = to.can_render and (to.offers_render or not some_offer)
-                # a node of one process does one thing at a time: trials first, as renders make more of them, but
-                # where nodes are set aside for renders, these first there
-                may_render &= to.processes > 1 or not (to.bundles or (trials and not to.offers_render))
-                if renders and may_render and to.renders < min(MOST_RENDERERS, to.processes):
-                    self._send(to, (renders.popleft(),))
-                elif trials and len(to.bundles) - to.renders <= most and not (to.processes == 1 and to.renders):
-                    share = -(-len(trials) // (WITH_NODE * len(self._nodes)))
-                    count = min(self._bundle_size() * to.processes, max(share, to.processes), len(trials))
-                    self._send(to, tuple(trials.popleft() for _ in range(count)))
+        some_offer = any(one.facts.offers_render and one.can_render for one in self._nodes.values())
+        for most, to in product(range(WITH_NODE), list(self._nodes.values())):
+            processes, offers = to.facts.processes, to.facts.offers_render
+            # a node of one process does one thing at a time: trials first, as renders make more of them, but where
+            # nodes are set aside for renders, these first there
+            may_render = to.can_render and (offers or not some_offer)
+            may_render &= processes > 1 or not (to.bundles or (trials and not offers))
+            if renders and may_render and to.renders < min(MOST_RENDERERS, processes):
+                self._send(to, (renders.popleft(),))
+            elif trials and len(to.bundles) - to.renders <= most and not (processes == 1 and to.renders):
+                share = -(-len(trials) // (WITH_NODE * len(self._nodes)))
+                count = min(self._bundle_size() * processes, max(share, processes), len(trials))
+                self._send(to, tuple(trials.popleft() for _ in range(count)))
 
     def _send(self, to: _Node, jobs: tuple[Job, ...]) -> None:
         self._number += 1
@@ -188,9 +184,8 @@ class ClusterEngine:
             for pause_s in (0.0,) if number is not None else (0.0, 0.2, 1.0, 3.0):
                 await asyncio.sleep(pause_s)
                 try:
-                    calling = self._client.run(
-                        function, *arguments, workers=[address], on_error="return", asynchronous=True
-                    )
+                    given = {"workers": [address], "on_error": "return", "asynchronous": True}
+                    calling = self._client.run(function, *arguments, **given)
                     answers = await (calling if number is not None else asyncio.wait_for(calling, EXAMINED_S))
                     said = answers.get(address, OSError("no answer"))
                 except Exception as error:
@@ -245,7 +240,7 @@ class ClusterEngine:
                 self._over(job, ended)
         elif isinstance(said, UserError):  # its processes run other code, or cannot start
             self._refuse(address, UserError(f"the worker at {_bare(address)}: {said.message}", fix=said.fix))
-            self._return(bundle.jobs)
+            self._waiting[bundle.jobs[0].stage].extendleft(reversed(bundle.jobs))
             self._gone(address)
         else:
             self._look_for_nodes()
@@ -274,7 +269,7 @@ class ClusterEngine:
             self._refuse(address, UserError(message, fix="name a folder with --out that all machines share"))
         else:
             can_render = said.digests.get("renders") == self._digests.get("renders")
-            self._nodes[address] = _Node(address, said.processes, can_render, said.offers_render)
+            self._nodes[address] = _Node(address, said, can_render)
 
     def _refuse(self, address: str, why: UserError) -> None:
         self._refused[address] = why
@@ -291,14 +286,9 @@ class ClusterEngine:
         """Jobs that were at a node as it died run again; after `TRIES` such deaths they are taken for the cause."""
         self._tries.update(job.name for job in jobs)
         hopeless = [job for job in jobs if self._tries[job.name] >= TRIES]
-        self._return(tuple(job for job in jobs if job not in hopeless))
+        self._waiting[jobs[0].stage].extendleft(job for job in reversed(jobs) if job not in hopeless)
         for job in hopeless:
             self._over(job, Ended("crashed", why=why, worker=_bare(address)))
-
-    def _return(self, jobs: tuple[Job, ...]) -> None:
-        """Put jobs to the front of the queue."""
-        for job in reversed(jobs):
-            self._waiting[job.stage].appendleft(job)
 
     def _over(self, job: Job, ended: Ended) -> None:
         self._out[job.stage] -= 1
@@ -314,7 +304,7 @@ class ClusterEngine:
             lacking, fix = "worker", "start some with `dask worker ADDRESS --nthreads PROCESSES`"
         elif self._waiting["renders"] and not any(one.can_render for one in self._nodes.values()):
             lacking = "worker that can render (with Mitsuba, Dr.Jit and trimesh as here)"
-            fix = f"install tofpod on the workers just as here; {len(self._nodes)} that cannot render are there"
+            fix = "install tofpod on the workers just as here"
         if lacking != self._lacking:
             self._lacking, self._lacking_since = lacking, time.monotonic()
         if lacking == "worker" and self._scheduler.startswith("jobqueue:"):
@@ -410,8 +400,7 @@ def drop(driver: str) -> None:
 
 
 async def carry_out(bundle: Bundle, code: Mapping[Stage, Code], driver: str, dask_worker: Any) -> tuple[Ended, ...]:
-    """Do the jobs of a bundle; returns their ends, in order. Raises UserError where the node's processes run other code
-    or cannot start."""
+    """Do the jobs of a bundle; returns their ends. Raises UserError for other code or processes that cannot start."""
     key = repr(sorted(code.items()))
     if key not in _engines:
         _engines[key] = LocalEngine(dask_worker.state.nthreads, Limits(), code)

@@ -1,10 +1,9 @@
-"""A part before a camera, patch by patch: what noise it has there, how strong damage shows, and how often it is found.
+"""A part before a camera, patch by patch: its noise there, how strong damage shows, and how often it is found.
 
 Noise at a place is what the detector's residual on the undamaged part has about it: noise of the average, the unit's
-pattern, and what the fitted surface cannot follow. A damage's strength is d' of the ideal observer on it at a noise of
-1 m, from the difference of noise-free views with and without it. Strength and hits are learnt on boards of the family
-in random poses as wide as those that are asked for. Not modelled: an unknown surface in the strength, light that other
-parts throw back, information in missing returns."""
+pattern, and what the fitted surface cannot follow. Strength is d' of the ideal observer at a noise of 1 m, from
+noise-free views with and without the damage. Both are learnt on boards of the family in random poses as wide as those
+asked for. Not modelled: an unknown surface in the strength, light of other parts, information in missing returns."""
 
 from __future__ import annotations
 
@@ -36,27 +35,21 @@ from scenes.target.custom import BoardConfig, PoseConfig
 from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.truth import Damage, face_of
 
-BOARDS, LOOKS = 40, 3
-"""Damaged boards on which strength and hits are learnt, and averages in which each is inspected."""
-STEEPEST_DEG = 60.0
-"""Tilt about either axis of these boards, at most."""
+BOARDS, LOOKS = 40, 3  # Damaged boards on which strength and hits are learnt, and averages in which each is inspected
+STEEPEST_DEG = 60.0  # Tilt about either axis of these boards, at most
 DRAWS, AROUND_PX, NEAR_PX = 2, 31, 15
 """Averages from which noise is taken; the side of the square over which that of a pixel is, as far as boards move over
 the unit's pattern; and of that in which missing pixels count."""
 MOST_PATCHES = 3000
-SAME_MM = 1e-6
-"""Sizes that differ by less are one: then the size of damage is its depth."""
-ON_FACE_M = 5 * MM
-"""A patch is seen where the view's own z agrees with its z by this, or by two pixels along the slope."""
+SAME_MM = 1e-6  # Sizes that differ by less are one: then the size of damage is its depth
+ON_FACE_M = 5 * MM  # A patch is seen where the view's own z agrees with its z by this, or by two pixels along the slope
 
-Pose = tuple[float, float, float]
-"""Distance in metres, tilts of the part about its x and y in degrees."""
+Pose = tuple[float, float, float]  # Distance in metres, tilts of the part about its x and y in degrees
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """A set-up before a part: its ``task`` with the threshold, what it finds, and how it has ``seen`` the patches in
-    each pose."""
+    """A set-up before a part: ``task`` with the threshold, what it finds, how it has ``seen`` patches by pose."""
 
     point: Point
     task: PointTask
@@ -66,9 +59,8 @@ class Survey:
 
 
 def survey(experiment: Experiment, poses: Sequence[Pose], cache: Path, folder: Path, engine: JobEngine) -> list[Survey]:
-    """Return a survey for each set-up of an experiment. Views and trials that are there already, in ``cache``
-    and ``folder``, are not made again. Raises UserError where a point has no threshold, and as `declared` and
-    `findable` do."""
+    """Return a survey for each set-up. Views and trials that are in ``cache`` and ``folder`` are not made again. Raises
+    UserError where a point has no threshold, and as `declared` and `findable` do."""
     plan = SweepPlan(tuple(_widened(group, poses) for group in plan_of(experiment, cache, folder).groups))
     journal, rows = Journal(folder / "journal"), dict[tuple[str, int, int, str], list[bool]]()
     with progress_display() as report:
@@ -122,6 +114,19 @@ def declared(config: ExperimentConfig) -> tuple[SimulatedSource, DrawnTargetConf
         return source, source.target
     fix = "declare `study`, and `source.target: {name: drawn, damage: ..., board: ...}`, as experiments/pipe.yaml does"
     raise UserError(f"{config.name}: is no study of drawn damage, each seen in a single view", fix=fix)
+
+
+def refuse_size(config: ExperimentConfig, size_mm: float) -> None:
+    """Raise UserError for a size outside the range that is declared: of damage of one size in plan, of its depths."""
+    damage = declared(config)[1].damage
+    low, high = damage.size_mm
+    word = damage.size_of
+    if high - low < SAME_MM and damage.depths_mm:
+        word, (low, high) = "depth", damage.depths_mm
+    if not low <= size_mm <= high:
+        fix = "change the damage's range in the experiment: nothing is said of sizes that are not inspected"
+        said = f"{size_mm:.3g} mm: {config.name} inspects no damage of that size"
+        raise UserError(said, legal=f"{low:.3g} to {high:.3g} mm ({word})", fix=fix)
 
 
 def _widened(group: Group, poses: Sequence[Pose]) -> Group:
@@ -192,8 +197,7 @@ def _residuals(batch: Batch, point: PointTask, seed: int) -> tuple[np.ndarray, n
 def _board_learnt(
     batch: Batch, whole: Batch, point: PointTask, seed: int
 ) -> tuple[int, list[tuple[Damage, np.ndarray, tuple[float, float, float]]], NoiseSums]:
-    """A damaged board's number, its damages with their signatures (cut-outs, metres) and how each is seen, and the
-    noise of the board without them."""
+    """A damaged board's number, its damages with signatures (cut-outs, metres) and how each is seen, and its noise."""
     set_up, intact = (load_set_up(one.set_ups[0]) for one in (batch, whole))
     noise_m, known, deviation_m = _residuals(whole, point, seed)
     change_m = np.nan_to_num(noise_free_z_m(set_up) - noise_free_z_m(intact))

@@ -1,9 +1,8 @@
-"""Noise of units drawn at random, and each damage's signature: the input of the ideal observer on a study's set-ups.
+"""Noise of random units, and each damage's signature: the input of the ideal observer on a study's set-ups.
 
-Noise is what a unit's average shows on a damaged board beyond what a camera without noise, unit errors and rounding
-shows of the same view, away from damage and rim; a cubic of each field is taken out. The signature is what that
-noise-free camera shows near the damage beyond a cubic through the undamaged pixels.
-"""
+Noise is what a unit's average shows, away from damage and rim, beyond what a camera without noise, unit errors and
+rounding shows, less a cubic of each field. The signature is what that noise-free camera shows near the damage beyond a
+cubic through the undamaged pixels."""
 
 from __future__ import annotations
 
@@ -24,16 +23,11 @@ from harness.vocabulary.seeds import random_stream
 from scenes.sensor.camera import CameraConfig, EffectsConfig, camera_of
 from scenes.sensor.source import SimulatedUnit
 
-UNITS_A_BOARD = 10
-"""Units, drawn anew for every board, whose noise is taken there."""
-SMOOTHED_PX = 61
-"""Side of the square over which a pixel's variance is averaged."""
-DEGREE = 3
-"""Degree of the undamaged surface, as the thesis fits it."""
-FEWEST_PIXELS = 1000
-"""Undamaged pixels without which a board tells too little of the noise."""
-FINE_MM = 1e-4
-"""Rounding step of the noise-free camera."""
+UNITS_A_BOARD = 10  # Units, drawn anew for every board, whose noise is taken there
+SMOOTHED_PX = 61  # Side of the square over which a pixel's variance is averaged
+DEGREE = 3  # Degree of the undamaged surface, as the thesis fits it
+FEWEST_PIXELS = 1000  # Undamaged pixels without which a board tells too little of the noise
+FINE_MM = 1e-4  # Rounding step of the noise-free camera
 REACH_PX = 8
 """Pixels beyond a damage's outline to which its signature reaches: what the camera's window and rims smear out."""
 
@@ -76,23 +70,15 @@ def board_views(batch: Batch, points: tuple[Point, ...]) -> dict[int, BoardView]
     signals_m = _signatures_m(set_up, clear_z_m, surface, intact)
     seen = ndimage.binary_erosion(set_up.on_board, iterations=2) & np.isfinite(clear_z_m)
     inside = np.concatenate(list(set_up.outlines.values()))
-    views = {}
+    board, names = batch.board or 0, tuple(str(damage.id) for damage in set_up.truth)
+    facts = (float(np.prod(set_up.pitch_mm)) * MM**2, float((~np.isfinite(clear_z_m.ravel()[inside])).mean()))
+    shown, views = (np.nan_to_num(signals_m[:, *cut]), surface[:, *cut]), {}
     for point in {point.config.capture.frames: point for point in points}.values():
-        noise_m, known = _noise_m(set_up, clear_z_m, batch.board or 0, point, surface, intact)
+        noise_m, known = _noise_m(set_up, clear_z_m, board, point, surface, intact)
         deviation_m = _deviation_m(noise_m, known)
         sums = noise_sums(noise_m[:, *cut] / deviation_m[cut], known[:, *cut])
-        views[point.config.capture.frames] = BoardView(
-            batch.board or 0,
-            tuple(str(damage.id) for damage in set_up.truth),
-            seen[cut],
-            deviation_m[cut],
-            np.nan_to_num(signals_m[:, *cut]),
-            surface[:, *cut],
-            sums,
-            UNITS_A_BOARD,
-            float(np.prod(set_up.pitch_mm)) * MM**2,
-            float((~np.isfinite(clear_z_m.ravel()[inside])).mean()),
-        )
+        view = BoardView(board, names, seen[cut], deviation_m[cut], *shown, sums, UNITS_A_BOARD, *facts)
+        views[point.config.capture.frames] = view
     return views
 
 
@@ -132,8 +118,7 @@ def _noise_m(
 
 
 def _deviation_m(noise_m: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """(h, w): root mean square of the noise over units and a square about each pixel; where nothing is known about a
-    pixel, that of the nearest one."""
+    """(h, w): root mean square of the noise over units and a square about each pixel, else the nearest one's."""
     square, count = (ndimage.uniform_filter(image.sum(axis=0), SMOOTHED_PX) for image in (noise_m**2, known * 1.0))
     there = count > 0.5 * len(noise_m) / SMOOTHED_PX
     nearest = ndimage.distance_transform_edt(~there, return_distances=False, return_indices=True)

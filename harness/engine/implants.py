@@ -37,19 +37,15 @@ from scenes.target.truth import truth_of
 
 MOST_HOLE_FREE, MOST_SETTING = 20, 5
 """Averages of the undamaged recording on which false calls are counted, and that set a threshold, at most."""
-MOST_EMPTY = 200
-"""Placements in a row without a place for any damage, after which there is none."""
-NORMAL_PX = 4
-"""Half the side of the square of the surface whose plane is taken as the tangent plane."""
-TELLING_DEG = 5.0
-"""Steeper by so much than where damage is placed, the rim of what is judged has a limit of its own."""
+MOST_EMPTY = 200  # Placements in a row without a place for any damage, after which there is none
+NORMAL_PX = 4  # Half the side of the square of the surface whose plane is taken as the tangent plane
+TELLING_DEG = 5.0  # Steeper by so much than where damage is placed, the rim of what is judged has a limit of its own
 VARIANT = "main"
 
 
 @dataclass(frozen=True)
 class Judging:
-    """The rules by which clouds are judged: detector, settings, hit radius, and the ``threshold``; where that is None,
-    ``threshold_of`` an undamaged cloud returns it with warnings."""
+    """How clouds are judged. ``threshold`` None: ``threshold_of`` an undamaged cloud returns it, with warnings."""
 
     detector: str
     settings_json: str
@@ -59,8 +55,7 @@ class Judging:
 
 
 class Scan:
-    """A recording of an undamaged part, its surface, and what a detector judges of it. Raises UserError for a recording
-    without a lens or without anything to judge."""
+    """A recording of an undamaged part, its surface, what is judged of it. Raises UserError without either."""
 
     def __init__(self, recording: Recording, judging: Judging) -> None:
         if recording.lens is None or recording.slopes is None or recording.projection != "central":
@@ -138,19 +133,16 @@ class Scan:
         return family.damage.widest_mm * MM / 2 / self.pitch_m + BEYOND_PX + self.reach_px
 
     def left_out(self, family: DrawnTargetConfig) -> str:
-        """Return a sentence on the rim that no damage is placed on, empty where it is as steep as the rest, and so
-        tells nothing of its own."""
+        """Return a sentence on the rim that no damage is placed on; empty where it is as steep as the rest."""
         inner, known = self.depth_px >= self.rim_px(family), np.isfinite(self.angle_deg)
         if not (inner & known).any():
             return ""
         steep = [float(np.quantile(self.angle_deg[part & known], 0.99)) for part in (inner, self.judged)]
         if steep[1] - steep[0] < TELLING_DEG:
             return ""
-        percent, name = 100 * (inner & known).sum() / known.sum(), self.recording.name
-        return (
-            f"{name}: damage is placed on the inner {percent:.0f} % of what is judged, seen at up to {steep[0]:.0f} "
-            f"degrees; the limit says nothing of the rim, seen at up to {steep[1]:.0f} degrees, where more is missed"
-        )
+        inside = f"the inner {100 * (inner & known).sum() / known.sum():.0f} % of what is judged"
+        rim = f"the limit says nothing of the rim, seen at up to {steep[1]:.0f} degrees, where more is missed"
+        return f"{self.recording.name}: damage is placed on {inside}, seen at up to {steep[0]:.0f} degrees; {rim}"
 
     def averaged(self, frames: Sequence[Frame]) -> Cloud:
         """Return the average of some frames, as `harness.detect` takes it."""
@@ -169,9 +161,8 @@ class Scan:
         h, w = self.judged.shape
         if not (0 <= row < h and 0 <= column < w) or self.depth_px[row, column] < rim_px:
             return None
-        around = np.s_[
-            max(row - NORMAL_PX, 0) : row + NORMAL_PX + 1, max(column - NORMAL_PX, 0) : column + NORMAL_PX + 1
-        ]
+        rows, columns = (slice(max(at - NORMAL_PX, 0), at + NORMAL_PX + 1) for at in (row, column))
+        around = rows, columns
         points = (self.rays[around] * self.surface_z_m[around][..., None]).reshape(-1, 3)
         points = points[np.isfinite(points[:, 2])]
         middle = points.mean(axis=0)
@@ -211,8 +202,7 @@ class Implanted:
 def placements(
     scans: Sequence[Scan], family: DrawnTargetConfig, camera: str, targets: int, seed: int, cache: Path
 ) -> Iterator[Implanted]:
-    """Yield placements with ``targets`` damages in all, or a few more, scan by scan in turn; renders are kept in
-    ``cache``. Raises UserError where no damage finds a place."""
+    """Yield placements with ``targets`` damages or a few more, scan by scan. Raises UserError where none fits."""
     units = [unit_config(camera, scan.lens) for scan in scans]
     found = number = empty = 0
     while found < targets:
@@ -239,25 +229,16 @@ def damages_placed(scan: Scan, family: DrawnTargetConfig, camera: str, purpose: 
     """Return a board of the family with those of its damages that have enough judged surface around them."""
     drawn, rim_px = family.drawn(purpose, number), scan.rim_px(family)
     kept = {each.id for each in drawn.damages if scan.place(*each.centre_m, rim_px) is not None}
-    return drawn.model_copy(
-        update={name: tuple(each for each in getattr(drawn, name) if each.id in kept) for name in KINDS}
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class JudgedScans:
-    """The study's tables and records, one set-up for each number of frames; ``warnings``: full sentences."""
-
-    tables: ResultTables
-    set_ups: tuple[SetUpRecord, ...]
-    warnings: tuple[str, ...]
+    left = {name: tuple(each for each in getattr(drawn, name) if each.id in kept) for name in KINDS}
+    return drawn.model_copy(update=left)
 
 
 def judge_scans(
     scans: Sequence[Scan], made: Sequence[Implanted], family: DrawnTargetConfig, camera: str, judging: Judging,
     frames: Sequence[int],
-) -> JudgedScans:  # fmt: skip
-    """Set a threshold for each number of frames, count false calls on the undamaged frames, and judge all placements.
+) -> tuple[ResultTables, tuple[SetUpRecord, ...], tuple[str, ...]]:  # fmt: skip
+    """Set a threshold for each number of frames, count false calls on the undamaged frames, and judge all placements;
+    return tables, a set-up for each number of frames, and warnings.
     Where a recording has two groups of so many frames or more, every second sets the threshold and the others are
     judged; else the same frames do both, and a warning says so."""
     rows: Rows = {name: [] for name in ("runs", "holes", *STUDY_TABLES)}
@@ -281,10 +262,9 @@ def judge_scans(
             known = scan.known(scan.averaged(scan.frames[group]), sites)
             _add(rows, judging, known, threshold, {"frames": count, "board": number, "role": "hole_free"})
         for at, placement in enumerate(made):
-            own_groups = [group for scan, group in judged if scan is placement.scan] or [
-                group for scan, group in groups if scan is placement.scan
-            ]
-            cloud = placement.cloud(own_groups[at % len(own_groups)])
+            slices = [group for scan, group in judged if scan is placement.scan]
+            slices = slices or [group for scan, group in groups if scan is placement.scan]
+            cloud = placement.cloud(slices[at % len(slices)])
             known = placement.scan.known(cloud, placement.target)
             _add(rows, judging, known, threshold, {"frames": count, "board": placement.number, "role": "damaged"})
             print(f"{count} frames: placement {at + 1} of {len(made)}", file=sys.stderr)
@@ -294,7 +274,7 @@ def judge_scans(
     )  # fmt: skip
     detector = detector_of(judging.detector, judging.settings_json)
     camera_data = camera_of(unit_config(camera, scans[0].lens)[0]).to_data()
-    set_ups = []
+    set_ups, files = [], [str(path) for one in scans for path in one.recording.files]
     for count in frames:
         holes, runs = (of[of["frames"] == count] for of in (tables.holes, tables.runs))
         set_ups.append(
@@ -307,13 +287,11 @@ def judge_scans(
                 calibration_runs=calibrated[count],
                 failed=0,
                 targets_digest=digest([placement.target.to_data() for placement in made]),
-                frames_digest=digest(
-                    [camera_data, count, *(str(path) for one in scans for path in one.recording.files)]
-                ),
+                frames_digest=digest([camera_data, count, *files]),
                 **judged_facts(holes, runs),
             )
         )
-    return JudgedScans(tables, tuple(set_ups), tuple(warnings))
+    return tables, tuple(set_ups), tuple(warnings)
 
 
 def _add(rows: Rows, judging: Judging, known: KnownCloud, threshold: float, named: dict[str, str | int]) -> None:

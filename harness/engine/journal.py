@@ -1,9 +1,7 @@
 """The journal of a sweep: how each trial ended, appended to segment files, so that the same command resumes.
 
-Each process that writes has a segment of its own, so shards may share a folder, and journals merge by appending. A
-segment begins with its version; every further line is the entry of one trial with a checksum over the whole line. A
-line that a crash has torn, or that was altered since, counts as not there.
-"""
+Each process that writes has a segment of its own: shards may share a folder, and journals merge by appending. A segment
+begins with its version; every further line is an entry with a checksum. A torn or altered line counts as not there."""
 
 from __future__ import annotations
 

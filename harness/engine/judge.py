@@ -1,5 +1,4 @@
-"""One detector on one cloud, measured against the truth: the rows of a run and of each damage; and the further rows of
-a study's board: signals at every place, findings, and counts at other thresholds than the one in use."""
+"""One detector on one cloud against the truth: rows of a run and each damage; further rows of a study's board."""
 
 from __future__ import annotations
 
@@ -25,8 +24,7 @@ from scenes.target.truth import Damage
 
 Rows = dict[str, list[dict[str, Any]]]  # rows by table
 STUDY_TABLES = ("sites", "findings", "operating", "pixels")
-SMEARED_PX = 2
-"""Pixels by which an outline is grown before findings are laid over it: half of a camera's window."""
+SMEARED_PX = 2  # Pixels by which an outline is grown before findings are laid over it: half of a camera's window
 STEPS_PER_OCTAVE = 4
 FINDING_OCTAVES = (-2, 3)
 """Other thresholds for findings, about the one in use: under a quarter of it most of a noisy face is one finding."""
@@ -61,8 +59,7 @@ def judge(
     hole_free: bool,
     learned: str | None = None,
 ) -> JudgedCloud:
-    """Judge one detector on one cloud. Without a threshold only the quiet one is found. ``radius_m``, ``overlap``: what
-    counts as a hit (`matched`). ``learned``: file of what the detector has learned."""
+    """Judge a detector on a cloud; without threshold only the quiet one is found. ``learned``: a file."""
     cloud = known.cloud
     detector = detector_for(known, detector_name, settings_json, hole_free=hole_free, learned=learned)
     evidence = detector.analyse(cloud)
@@ -82,7 +79,7 @@ def judge(
     if threshold is None:
         return JudgedCloud(run, [], detector, evidence)
     detections = detector.find(cloud, evidence, threshold)
-    places_m = _places_of(known, detections)
+    places_m = known.on_board(np.array([one.centre_m for one in detections]).reshape(-1, 3))
     pairs, parts = matched(known, detections, radius_m, overlap)
     of_damage = 0 if hole_free else len(pairs) + parts
     run |= {"detections": len(detections), "false_calls": len(detections) - of_damage}
@@ -102,10 +99,9 @@ def matched(
     known: KnownCloud, detections: Sequence[Detection], radius_m: float, overlap: float | None
 ) -> tuple[dict[int, int], int]:
     """Return the findings that count for damages, {index of damage: index of finding}, one for each, nearest first; and
-    how many others are parts of a damage and so no false calls. A finding may count for a damage where its centre lies
-    within the radius of the damage's centre, of long damage of its centre line; with an ``overlap`` also where at least
-    this share of its pixels lie on the damage, its outline grown by `SMEARED_PX`. Findings that overlap so beside the
-    one that counts are its parts."""
+    how many others are parts of a damage and so no false calls. A finding may count where its centre lies within the
+    radius of the damage's centre (of long damage its centre line), with an ``overlap`` also where this share of its
+    pixels lies on the damage, its outline grown by `SMEARED_PX`. Findings that overlap so beside it are parts."""
     (found,) = _matched(known, [Findings.of(detections)], radius_m, overlap)
     return found
 
@@ -122,8 +118,7 @@ def _matched(
 
 
 def smeared(outlines: Sequence[np.ndarray], shape: tuple[int, ...], *, grid: bool = True) -> list[np.ndarray]:
-    """Return a mask (n,) of a cloud's pixels for each of the ``outlines``, flat indices, grown by `SMEARED_PX` where
-    the cloud has a pixel ``grid``."""
+    """Return masks (n,) of pixels for outlines of flat indices, grown by `SMEARED_PX` on a ``grid``."""
     masks = []
     for outline in outlines:
         on = np.zeros(shape, bool)
@@ -183,11 +178,6 @@ def detector_for(
     return detector.told(() if hole_free else tuple(truth))
 
 
-def _places_of(known: KnownCloud, detections: Sequence[Detection]) -> np.ndarray:
-    """(m, 2) places of findings on the face."""
-    return known.on_board(np.array([one.centre_m for one in detections]).reshape(-1, 3))
-
-
 def _place(damage: Damage) -> dict[str, Any]:
     x_m, y_m = damage.centre_board_m[:2]
     return {
@@ -202,8 +192,7 @@ def _place(damage: Damage) -> dict[str, Any]:
 def _hole_row(
     known: KnownCloud, evidence: Evidence, damage: Damage, found: Measurement | None, largest: Measurement | None
 ) -> dict[str, Any]:
-    """The row of one damage, mm; positions as the thesis takes them, from the largest cluster. ``state``: found,
-    invalid (most pixels have no range), wrong depth (off the surface, below threshold), or invisible."""
+    """The row of one damage, mm; positions as the thesis takes them, from the largest cluster."""
     inside = known.outlines[damage.id]
     # a cloud without a grid has no pixels that could lack a range
     seen_z = known.cloud.points_m.reshape(-1, 3)[inside, 2]
@@ -244,9 +233,6 @@ def _hole_row(
     return row | {"score": float(found.score), "points": int(found.points), "model_note": found.model_note}
 
 
-# ---------------------------------------------------------------- a study's board
-
-
 def study_rows(known: KnownCloud, judged: JudgedCloud, radius_m: float, *, hole_free: bool) -> Rows:
     """Return the rows of one board by table (`STUDY_TABLES`, "runs", "holes"); of one that only sets a threshold, the
     area and what stood out most. Findings without return stand in ``no_return`` and ``no_return_calls``."""
@@ -267,33 +253,17 @@ def study_rows(known: KnownCloud, judged: JudgedCloud, radius_m: float, *, hole_
     lines = [damage.line_m for damage in known.truth]
     signals = highest_within(known.places_m, score, lines, radius_m).tolist()
     counts_for = {} if hole_free else {finding: str(known.truth[i].id) for i, finding in judged.pairs.items()}
-    findings = [
-        {
-            "x_mm": float(place[0]) / MM,
-            "y_mm": float(place[1]) / MM,
-            "score": float(detection.score),
-            "hole": counts_for.get(number, ""),
-        }
-        for number, (detection, place) in enumerate(zip(judged.detections, judged.places_m, strict=True))
-    ]
-    tables: Rows = {
-        "runs": [run],
-        "holes": [],
-        "sites": [],
-        "findings": findings,
-        "operating": [_operating(known, judged, threshold, radius_m, hole_free=hole_free)],
-        "pixels": [],
-    }
+    operating = _operating(known, judged, threshold, radius_m, hole_free=hole_free)
+    tables: Rows = {"runs": [run], "holes": [], "sites": [], "findings": [], "operating": [operating], "pixels": []}
+    for number, (detection, place) in enumerate(zip(judged.detections, judged.places_m, strict=True)):
+        row = {"x_mm": float(place[0]) / MM, "y_mm": float(place[1]) / MM, "score": float(detection.score)}
+        tables["findings"].append({**row, "hole": counts_for.get(number, "")})
     if hole_free:  # places of left-out damage
-        tables["sites"] = [
-            _place(damage) | {"detected": i in judged.pairs, "signal": signal}
-            for i, (damage, signal) in enumerate(zip(known.truth, signals, strict=True))
-        ]
+        for i, (damage, signal) in enumerate(zip(known.truth, signals, strict=True)):
+            tables["sites"].append(_place(damage) | {"detected": i in judged.pairs, "signal": signal})
         return tables
-    tables["holes"] = [
-        {**row, "signal": signal, "no_return": i in without_return}
-        for i, (row, signal) in enumerate(zip(judged.holes, signals, strict=True))
-    ]
+    for i, (row, signal) in enumerate(zip(judged.holes, signals, strict=True)):
+        tables["holes"].append({**row, "signal": signal, "no_return": i in without_return})
     # judged pixels of each damage and of the undamaged face, and how many of them lie above each threshold
     thresholds, flat = grid(threshold, PIXEL_OCTAVES), score.ravel()
     parts = [(str(damage.id), known.outlines[damage.id]) for damage in known.truth]
@@ -316,9 +286,8 @@ def grid(threshold: float, octaves: tuple[int, int]) -> np.ndarray:
 def _without_return(
     known: KnownCloud, judged: JudgedCloud, radius_m: float, *, hole_free: bool
 ) -> tuple[frozenset[int], int]:
-    """Damages (indices into the truth) that a finding without return hits, and how many of these findings are false
-    calls: those that hit none and are no part of a finding by depth. None for detectors that test the harness, whose
-    findings are not what a cloud shows."""
+    """Damages (indices) that a finding without return hits, and how many such findings are false calls: they hit none
+    and are no part of a finding by depth. None for detectors that test the harness."""
     tests = getattr(judged.detector, "tests_the_harness", False)
     missing = None if tests else missing_returns(known.cloud, judged.evidence)
     if missing is None or not missing.detections:

@@ -1,45 +1,33 @@
-"""Hole-free boards on which a detector learns before its threshold is calibrated.
+"""Hole-free boards on which a detector (`detectors.interface.Calibratable`) learns before its threshold is set.
 
-Detectors that can do so implement `detectors.interface.Calibratable`. What one has learned is stored in the journal, as
-thresholds are, so that it is resumed, merged and shared by shards; and in a file of the same name, from which trials
-read it.
-"""
+What it has learned is stored in the journal, for resuming and for shards, and in a file of the same name, from which
+trials read it."""
 
 from __future__ import annotations
 
 import base64
 import io
-import json
 from dataclasses import replace
-from functools import lru_cache
 from typing import cast
 
 import numpy as np
 
-from detectors import load_detector
 from detectors.interface import Calibratable
 from harness.engine.judge import Rows, detector_of
 from harness.engine.trial import TrialTask, cloud_of
 from harness.vocabulary.seeds import canonical_json
 
 LEARNING_BOARDS = 8
-"""Boards, outside of a study repeats of the one target, on which a detector learns, and on which nothing else is done:
-some 200,000 pixels of a board at 0.7 m, so that a spectrum is known to a few per cent."""
+"""Boards to learn on, and for nothing else: 200,000 pixels each at 0.7 m make a spectrum good to a few per cent."""
 
 
 def learns(detector: str, settings: dict[str, object]) -> bool:
     """Return whether a detector can learn."""
-    return _learns(detector, canonical_json(settings))
-
-
-@lru_cache(maxsize=1000)
-def _learns(detector: str, settings_json: str) -> bool:
-    return isinstance(load_detector(detector, json.loads(settings_json)), Calibratable)
+    return isinstance(detector_of(detector, canonical_json(settings)), Calibratable)
 
 
 def learn(task: TrialTask) -> Rows:
-    """Return the record of what the one detector of a task learns: its arrays as an ``.npz`` in base 64. The task's
-    set-ups are those of `LEARNING_BOARDS` boards in a row."""
+    """Return the record of what a task's detector learns on its `LEARNING_BOARDS` boards: an ``.npz`` in base 64."""
     (point,), views = task.points, len(task.set_ups) // LEARNING_BOARDS
     boards = (
         replace(task, set_ups=task.set_ups[number * views : (number + 1) * views], repeat=number)

@@ -10,16 +10,16 @@ import numpy as np
 
 from detectors.mapping.merge import SEVERAL, Mapped
 from detectors.mapping.settings import MappingConfig
-from harness.engine.judge import detector_for, judge
+from harness.engine.judge import JudgedCloud, judge
 from harness.engine.plan import Batch, Group, SweepPlan
 from harness.engine.setup import SetUp, known_view, load_set_up
-from harness.engine.trial import MapMaker, averages_of, capture_of
+from harness.engine.trial import MapMaker, PointTask, TrialTask, averages_of, capture_of
 from harness.evaluation.profile import HoleInView
 from harness.evaluation.study.limit import SetUpLimit
 from harness.experiment.schema import Point
 from harness.report.clouds import ExampleCloud, MappedExample, StudyExample, Where
 from harness.report.view3d import Circle3d, Kind, Scene3d
-from harness.vocabulary.geometry import MM, Cloud, transform_points
+from harness.vocabulary.geometry import MM, transform_points
 from harness.vocabulary.seeds import canonical_json
 from scenes.target.truth import Damage, face_of
 
@@ -36,29 +36,31 @@ def pictures_of(group: Group, thresholds: Mapping[str, float]) -> list[Any]:
     return _cloud_examples(group, thresholds) if group.poses is None else _map_examples(group, thresholds)
 
 
-def _detected(cloud: Cloud, detections: Sequence[Any]) -> np.ndarray:
+def _judged(task: TrialTask, point: PointTask, most: int) -> JudgedCloud:
+    """Judge one view's cloud as a trial did that drew so many frames at ``most``."""
+    set_up = load_set_up(task.set_ups[0])
+    capture = capture_of(set_up, 0, task, most)
+    clouds = averages_of(capture, [point.frames], point.average, point.exact, point.flat_field)
+    known = known_view(set_up, clouds[point.frames], hole_free=False)
+    given = (point.detector, point.settings_json, point.threshold, point.radius_m)
+    return judge(known, *given, overlap=point.overlap, hole_free=False, learned=point.learned)
+
+
+def _detected(judged: JudgedCloud) -> np.ndarray:
     """(h, w) bool: pixels that belong to a detection."""
-    detected = np.zeros(cloud.valid.shape, bool)
-    for detection in detections:
+    detected = np.zeros(judged.evidence.score.shape, bool)
+    for detection in judged.detections:
         detected.ravel()[detection.pixels] = True
     return detected
 
 
-# ---------------------------------------------------------------- clouds of one view
-
-
 def _cloud_examples(group: Group, thresholds: Mapping[str, float]) -> list[ExampleCloud]:
     """The clouds of repeat 0 at the least and the greatest number of frames of each variant of a group."""
-    by_variant: dict[str, list[Point]] = {}
-    for point in sorted(group.points, key=lambda point: point.config.capture.frames):
-        if point.digest in thresholds:
-            by_variant.setdefault(point.variant, []).append(point)
-    chosen = [point for found in by_variant.values() for point in (found[0], *found[1:][-1:])]
-    if not chosen:
-        return []
-    set_up = load_set_up(group.damaged.set_ups[0])
-    counts = sorted({point.config.capture.frames for point in chosen})
-    capture = set_up.unit.capture(counts[-1], group.seed, "damaged", 0)
+    batch, by_variant = group.damaged, dict[str, list[PointTask]]()
+    _, task = next(group.trials(batch, thresholds))
+    for point in sorted(task.points, key=lambda point: point.frames):
+        by_variant.setdefault(point.variant, []).append(point)
+    set_up = load_set_up(batch.set_ups[0])
     region, lens = set_up.unit.region, set_up.unit.camera.nominal_lens
     marks = []
     for damage in set_up.truth:
@@ -66,25 +68,15 @@ def _cloud_examples(group: Group, thresholds: Mapping[str, float]) -> list[Examp
         radius_px = float(lens.fx * damage.diameter_m / 2 / damage.centre_camera_m[2])
         sizes_mm = damage.diameter_m / MM, damage.depth_m / MM
         marks.append(HoleInView(str(damage.id), float(u - region.col0), float(v - region.row0), radius_px, *sizes_mm))
-    averages: dict[str, dict[int, Cloud]] = {}
     examples = []
-    for point in chosen:
-        asked, settings = point.config.capture, point.config.detector
-        name = canonical_json([asked.average.to_data(), asked.flat_field and asked.flat_field.to_data()])
-        if name not in averages:
-            averages[name] = averages_of(capture, counts, asked.average, asked.exact, asked.flat_field)
-        cloud = averages[name][asked.frames]
-        known = known_view(set_up, cloud, hole_free=False)
-        named, learned = (settings.name, canonical_json(settings.settings)), group.learned.get(point.digest)
-        detector = detector_for(known, *named, hole_free=False, learned=learned)
-        evidence = detector.analyse(cloud)
-        detections = detector.find(cloud, evidence, thresholds[point.digest])
+    for point in (point for found in by_variant.values() for point in (found[0], *found[1:][-1:])):
+        judged = _judged(task, point, max(one.frames for one in task.points))
         example = ExampleCloud(
-            frames=asked.frames,
+            frames=point.frames,
             variant=point.variant,
-            residual_mm=evidence.residual_m / MM,
-            detected=_detected(cloud, detections),
-            inside=np.isfinite(evidence.score),
+            residual_mm=judged.evidence.residual_m / MM,
+            detected=_detected(judged),
+            inside=np.isfinite(judged.evidence.score),
             truth=tuple(marks),
             z_truth_mm=set_up.seen_z_m / MM,
             outlines_px=tuple(_outline_px(set_up, damage) for damage in set_up.truth),
@@ -94,8 +86,7 @@ def _cloud_examples(group: Group, thresholds: Mapping[str, float]) -> list[Examp
 
 
 def _outline_px(set_up: SetUp, damage: Damage) -> np.ndarray:
-    """(n, 2) columns and rows of a damage's rim on the cloud's grid: its outline on the face, of a hole or dent a
-    circle in the face's tangent plane."""
+    """(n, 2) columns and rows of a damage's rim on the cloud's grid; of a hole or dent a circle."""
     region, lens = set_up.unit.region, set_up.unit.camera.nominal_lens
     across = np.cross(damage.axis_camera, [0.0, 1.0, 0.0])
     across /= np.linalg.norm(across)
@@ -106,9 +97,6 @@ def _outline_px(set_up: SetUp, damage: Damage) -> np.ndarray:
         on_face = face_of(set_up.target.board).point(*outline.T)
         rim = transform_points(set_up.T_camera_board, np.vstack([on_face, on_face[:1]]))
     return np.asarray(lens.project(rim) - [region.col0, region.row0])
-
-
-# ---------------------------------------------------------------- maps of several views
 
 
 def _map_examples(group: Group, thresholds: Mapping[str, float]) -> list[MappedExample]:
@@ -172,7 +160,7 @@ def _map_example(maps: MapMaker, point: Point, threshold: float, learned: str | 
         frame="board",
         rgb=np.full((len(shown), 3), GREY, np.uint8) if cloud.rgb is None else cloud.rgb.reshape(-1, 3)[shown],
         residual_mm=judged.evidence.residual_m.ravel()[shown] / MM,
-        detected=_detected(cloud, judged.detections).ravel()[shown],
+        detected=_detected(judged).ravel()[shown],
         view_of=number_of[mapped.view_of_points()[shown]],
         view_names=names,
         circles=tuple(circles),
@@ -183,9 +171,6 @@ def _map_example(maps: MapMaker, point: Point, threshold: float, learned: str | 
         ),
     )
     return MappedExample(point.variant, frames, count, *way, scene, point.is_variation)
-
-
-# ---------------------------------------------------------------- damages of a study
 
 
 class ShownDamage(NamedTuple):
@@ -201,8 +186,7 @@ class ShownDamage(NamedTuple):
 
 
 def shown_in(plan: SweepPlan, limits: Sequence[SetUpLimit]) -> Iterator[ShownDamage]:
-    """Yield the damages of each of the first few set-ups whose sizes lie nearest to 0.75, 1 and 1.25 of its limit:
-    a90/95 where demonstrated, else the estimate of a90, a50 or the middle size. One view's clouds only."""
+    """Yield the damages of the first few set-ups (single views) nearest to 0.75, 1 and 1.25 of the limit."""
     places = [(group, point) for group in plan.groups for point in group.points]
     by_place = {(point.variant, point.config.capture.frames): (group, point) for group, point in places}
     for limit in limits[:MOST_SET_UPS]:
@@ -229,13 +213,8 @@ def study_example(shown: ShownDamage, thresholds: Mapping[str, float]) -> StudyE
     seen = limit.record.inspected
     (task,) = (task for _, task in group.trials(batch, thresholds) if task.repeat == int(seen.repeat[row]))
     asked = next(found for found in task.points if found.digest == point.digest)
-    set_up = load_set_up(task.set_ups[0])
-    capture = capture_of(set_up, 0, task, asked.frames)
-    cloud = averages_of(capture, [asked.frames], asked.average, asked.exact, asked.flat_field)[asked.frames]
-    known = known_view(set_up, cloud, hole_free=False)
-    given = (asked.detector, asked.settings_json, asked.threshold, asked.radius_m)
-    judged = judge(known, *given, overlap=asked.overlap, hole_free=False, learned=asked.learned)
-    damage = next(found for found in known.truth if str(found.id) == str(seen.hole[row]))
+    set_up, judged = load_set_up(task.set_ups[0]), _judged(task, asked, asked.frames)
+    damage = next(found for found in set_up.truth if str(found.id) == str(seen.hole[row]))
     rim = _outline_px(set_up, damage)
     pitch_mm = float(np.mean(set_up.pitch_mm))
     half = int(np.ceil(max(half_m, damage.reach_m + ROOM_MM * MM) / MM / pitch_mm))
@@ -260,7 +239,7 @@ def study_example(shown: ShownDamage, thresholds: Mapping[str, float]) -> StudyE
         depth_mm=damage.depth_m / MM,
         threshold=float(judged.run["threshold"]),
         residual_mm=window(judged.evidence.residual_m / MM, np.nan),
-        detected=window(_detected(cloud, judged.detections), False),
+        detected=window(_detected(judged), False),
         outline_px=rim - (middle - half),
         pitch_mm=pitch_mm,
     )

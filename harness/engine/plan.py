@@ -31,9 +31,8 @@ CODE = "harness.engine.learning"
 PACKAGES = (
     "numpy", "scipy", "numba", "opencv-python-headless", "open3d-cpu" if sys.platform == "linux" else "open3d",
 )  # fmt: skip
-"""A trial's numbers are decided, beside its task, by all sources that this module and the detector's reach, and by the
-versions of these packages: a change of any makes stored trials count as not done. Mitsuba's version is part of the
-names of the rendered views."""
+"""The task, all sources that this module and the detector's reach, and the versions of these packages decide a trial: a
+change of any makes it count as not done. Mitsuba's version is in the names of the rendered views."""
 MOST_REPEATS = 256  # repeats of a part of a plan, which is looked up and queued as one
 
 
@@ -124,9 +123,8 @@ class Group:
         return next(batch for batch in self.then if batch.role == "damaged")
 
     def repeats(self, batch: Batch, point: Point) -> int:
-        """Return the number of trials of a batch that a point wants: with a given threshold, as many hole-free as
-        damaged ones; one of each board that sets a study's threshold; of damaged boards one, times ``repeats``, for
-        each unit."""
+        """Return the number of trials of a batch that a point wants: with a given threshold as many hole-free as
+        damaged ones, one of each calibration board, of damaged boards ``repeats`` for each unit."""
         calibrate = point.config.threshold.calibrate
         if batch.role == "calibration":
             return 0 if calibrate is None else 1
@@ -180,19 +178,14 @@ class Group:
             task.board,
             task.repeat,
             [ref.camera.unit_seed for ref in task.set_ups],
-            [[point.digest, point.variant, point.threshold, _name(point.learned)] for point in task.points],
+            [[one.digest, one.variant, one.threshold, one.learned and Path(one.learned).name] for one in task.points],
         ]
         number = task.repeat if task.board is None else task.board
         return f"{task.role}-{number:05d}-{digest(content)}"
 
 
-def _name(path: str | None) -> str | None:
-    return None if path is None else Path(path).name
-
-
 def point_task(point: Point, threshold: float | None, learned: str | None) -> PointTask:
-    """Return the demands of a point on trials. ``threshold`` None: it is being calibrated; ``learned`` as of
-    `PointTask`."""
+    """Return what a point asks of trials. ``threshold`` None: it is being calibrated; ``learned`` as of `PointTask`."""
     capture, detector, matching = point.config.capture, point.config.detector, point.config.matching
     asked = (detector.name, canonical_json(detector.settings), capture.average, matching.radius_mm * MM, threshold)
     further = (point.config.mapping, capture.exact, learned, capture.flat_field, matching.overlap)
@@ -258,8 +251,7 @@ def _group(points: tuple[Point, ...], cache: Path, folder: Path) -> Group:
     return replace(group, learning=(Batch("learning", tuple(renders.values()), set_ups),))
 
 
-_drawn = lru_cache(maxsize=4096)(DrawnTargetConfig.drawn)
-"""Cameras, frames and detectors look at the same boards."""
+_drawn = lru_cache(maxsize=4096)(DrawnTargetConfig.drawn)  # Cameras, frames and detectors look at the same boards
 
 
 def unit_of(camera: CameraConfig, seed: int, role: Role, number: int) -> CameraConfig:
@@ -289,8 +281,7 @@ def batch_of(
 
 
 class PlanPart(NamedTuple):
-    """Some repeats of one batch. ``group``: its number in the plan; ``sets_threshold``: whether the trials set the
-    points' thresholds."""
+    """Some repeats of one batch of the group with this number; ``sets_threshold``: whether they set its thresholds."""
 
     group: int
     batch: Batch
@@ -299,8 +290,7 @@ class PlanPart(NamedTuple):
 
 
 def parts_of(plan: SweepPlan, shard: Shard) -> tuple[list[list[PlanPart]], list[list[PlanPart]]]:
-    """Cut a plan, by group, into parts that set its thresholds, those of learning first, and judged parts that are the
-    shard's. A group of which the shard judges nothing has neither."""
+    """Cut a plan, by group, into parts that set its thresholds, learning first, and the shard's judged parts."""
 
     def cut(number: int, batch: Batch, repeats: range, sets_threshold: bool) -> list[PlanPart]:
         starts = range(repeats.start, repeats.stop, MOST_REPEATS)

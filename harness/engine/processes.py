@@ -1,8 +1,7 @@
 """Jobs in processes of this machine: a process that dies, hangs or needs too much memory fails its own job only.
 
-The executors of the standard library give up all their jobs when one of their processes dies. Here a thread serves each
-process through a pipe of its own, so that it is known which job a process held. A cluster's nodes use the same class.
-"""
+The standard library's executors give up all jobs when a process dies. Here a thread serves each process through a pipe,
+so that its job is known. A cluster's nodes use the same class."""
 
 from __future__ import annotations
 
@@ -54,8 +53,7 @@ class Answers:
 class LocalEngine:
     """``jobs`` processes for trials, and up to two for renders, which alone load Mitsuba. ``limits`` are a trial's;
     renders have no memory limit, as Dr.Jit reserves more than it uses. ``code``: modules that decide the numbers of
-    a stage; a process that starts after one of their sources was edited is refused, because its results would be stored
-    as those of the code that this process runs."""
+    a stage; a process that starts after one of their sources was edited is refused: it would compute other results."""
 
     def __init__(self, jobs: int, limits: Limits, code: Mapping[Stage, Code] | None = None) -> None:
         self.code = dict(code or {})
@@ -157,16 +155,14 @@ class _Worker(threading.Thread):
     def run(self) -> None:
         while (taken := self._engine.next_job(self)) is not None:
             job, limits, answers = taken
-            said: tuple[Job, Ended] | UserError
             try:
-                said = job, self._carried_out(job, limits, answers)
+                answers.ended.put((job, self._carried_out(job, limits, answers)))
             except UserError as mistake:
-                said = mistake
                 self.end()
+                answers.ended.put(mistake)
             except Exception as error:  # a bug here must not leave the driver waiting
                 why = "".join(traceback.format_exception(error))[-TRACEBACK_CHARACTERS:]
-                said = job, Ended("failed", why=why, is_bug=True)
-            answers.ended.put(said)
+                answers.ended.put((job, Ended("failed", why=why, is_bug=True)))
         self.end()
 
     def _carried_out(self, job: Job, limits: Limits, answers: Answers) -> Ended:
@@ -189,8 +185,8 @@ class _Worker(threading.Thread):
         engine = self._engine
         self._pipe, theirs = multiprocessing.get_context("spawn").Pipe()
         arguments = (theirs, self._label, self.stage, str(self._said), engine.code.get(self.stage))
+        process = multiprocessing.get_context("spawn").Process(target=serve, args=arguments, daemon=True)
         with _spawning():
-            process = multiprocessing.get_context("spawn").Process(target=serve, args=arguments, daemon=True)
             process.start()
         self._process = process
         theirs.close()
@@ -246,8 +242,7 @@ class _Worker(threading.Thread):
 
     def strike(self) -> None:
         """Begin to end the process, without waiting for it; from any thread."""
-        process = self._process
-        if process is not None:
+        if (process := self._process) is not None:
             process.kill()
 
     def end(self) -> None:
@@ -262,13 +257,14 @@ class _Worker(threading.Thread):
 @contextlib.contextmanager
 def _one_thread() -> Iterator[None]:
     """Hold the environment in which a process starts that computes in one thread; libraries read it as they load."""
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    before = os.environ.copy()
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     try:
         yield
     finally:
-        for name, value in before.items():
-            os.environ.pop(name, None) if value is None else os.environ.update({name: value})
+        for name in ONE_THREAD:
+            os.environ.pop(name, None)
+            os.environ.update({name: before[name]} if name in before else {})
 
 
 @contextlib.contextmanager
@@ -316,8 +312,7 @@ def serve(pipe: Connection[Any, Any], name: str, stage: Stage, said: str, code: 
             try:
                 pipe.send(ended)
             except (TypeError, AttributeError, pickle.PicklingError) as error:
-                why = f"its result cannot be sent: {error}"
-                pipe.send(Ended("failed", why=why, is_bug=True, seconds=ended.seconds, worker=name))
+                pipe.send(Ended("failed", why=f"its result cannot be sent: {error}", is_bug=True, worker=name))
 
 
 def _prepare(said: str) -> IO[str]:
@@ -348,8 +343,7 @@ def _limit_memory(memory_mb: int | None) -> None:
 def render_into_cache(
     target_data: dict[str, Any], camera_data: dict[str, Any], render_data: dict[str, Any], folder: str
 ) -> tuple[bool, float]:
-    """Render a view unless the cache holds it whole; this alone loads Mitsuba. Returns whether the view was there, and
-    the seconds that it took. Arguments are plain data."""
+    """Render a view unless it is cached; only this loads Mitsuba. Returns whether it was there, and seconds."""
     from scenes.optics import RenderConfig
     from scenes.render.cache import cached_view
     from scenes.sensor.camera import CameraConfig, camera_of
@@ -361,8 +355,7 @@ def render_into_cache(
 
 
 class SerialEngine:
-    """One job at a time in this process, for debuggers and tests. No limits hold, and a job that hangs or kills the
-    process is not survived."""
+    """One job at a time in this process, for debuggers and tests: no limits hold, no hang is survived."""
 
     def __init__(self) -> None:
         self._jobs: deque[Job] = deque()

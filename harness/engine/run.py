@@ -1,11 +1,8 @@
-"""The run of a plan: renders feed trials; detectors that can do so learn on hole-free boards, then hole-free trials set
-thresholds, then judged trials use both. All ends are in the journal; trials that the journal holds are not run again,
-and views that only they need are not rendered.
+"""The run of a plan: renders feed trials; detectors learn on hole-free boards, then hole-free trials set thresholds,
+then judged trials use both. What the journal holds is not run again, and views that only that needs are not rendered.
 
 Every shard calibrates for itself, and unlike processors give unlike last digits. So the journal stores the thresholds
-that were used beside the trials, and a merge keeps all work: trials that were judged at a threshold which agrees with
-the one in use to within `AGREES` count, filed under the one in use; others are judged anew.
-"""
+in use, and after a merge trials that were judged within `AGREES` of the one in use count, filed under it."""
 
 from __future__ import annotations
 
@@ -62,12 +59,11 @@ class Calibration:
         found: dict[str, float] = {}
         failures: list[Failure] = []
         for point in self._group.points:
-            quiet = self._quiet.get(point.digest, {})
-            threshold, why = None, "no hole-free run ended"
-            if point.digest in self.unlearned:
-                failures.append(Failure(f"threshold of {point.label}", "its detector has learned nothing"))
-                continue
+            quiet, threshold = self._quiet.get(point.digest, {}), None
+            why = "no hole-free run ended"
             try:
+                if point.digest in self.unlearned:
+                    raise UserError("its detector has learned nothing")
                 threshold = threshold_of(point, [quiet[key] for key in sorted(quiet)])
             except UserError as error:
                 why = str(error)
@@ -78,8 +74,7 @@ class Calibration:
         return found, failures
 
     def sets(self, own: Mapping[str, float], journal: Journal) -> list[dict[str, float]]:
-        """Return the thresholds to use (``own``, unless the journal has only others that agree), then others that agree
-        with them, at which shards have judged."""
+        """Return the thresholds to use (``own``, unless the journal has only others that agree), then others."""
         prefix, stored = self._prefix(), []
         for key in journal.thresholds():
             entry = journal.read(key) if prefix and key.startswith(prefix) else None
@@ -146,14 +141,10 @@ def threshold_of(point: Point, quiet: Iterable[tuple[float, float]]) -> float | 
         raise UserError(f"{message}, too little for a threshold") from error
 
 
-# ---------------------------------------------------------------- the run
-
-
+Report = Callable[[Outcome], None]
 AHEAD = 4096
 """Trials that may wait to be run: enough for a thousand workers, and a few megabytes whatever the plan's size."""
-TRIES = 2
-"""A render whose process died is begun once more: two of them may have been too much for the memory. So is a trial that
-sets a threshold, since with another threshold all that was judged by it would be run again."""
+TRIES = 2  # Tries of a render (two may have been too much for the memory), and of trials that set a threshold
 PARTS_AT_ONCE = 200  # parts that are looked up in the journal before the engine is asked again: some 0.1 s
 TOLD_WHOLE = 200  # failures whose traceback is kept in memory; of the others the journal has it
 
@@ -162,15 +153,14 @@ def run_plan(
     plan: SweepPlan,
     journal: Journal,
     engine: JobEngine,
-    report: Callable[[Outcome], None],
+    report: Report,
     *,
     shard: Shard = WHOLE,
     retry_failed: bool = False,
 ) -> Outcome:
     """Run the trials that the journal lacks, with ``retry_failed`` also those that are not done, and draw the pictures
-    of a whole sweep. A job that ends badly becomes a `Failure` and costs the trials that need it. Raises UserError
-    where nothing can be written or the engine is gone; KeyboardInterrupt passes through, with all ends in the
-    journal."""
+    of a whole sweep. A job that ends badly is a `Failure` and costs the trials that need it. Raises UserError where
+    nothing can be written or the engine is gone; KeyboardInterrupt passes through, with all ends in the journal."""
     first, then = parts_of(plan, shard)
     run = _Run(plan, journal, engine, report, shard, retry_failed)
     outcome = run.outcome
@@ -199,9 +189,8 @@ def _draw(plan: SweepPlan, outcome: Outcome, engine: JobEngine, there: set[Path]
     """Add the pictures of all groups that were judged, but for studies, whose limits decide what is shown."""
     groups = [group for group in plan.groups if not group.is_study]
     groups = [group for group in groups if any(point.digest in outcome.thresholds for point in group.points)]
-    failures = render_missing(
-        (job for group in groups for job in group.damaged.renders if job.path not in there), engine
-    )
+    missing = (job for group in groups for job in group.damaged.renders if job.path not in there)
+    failures = render_missing(missing, engine)
     outcome.failures += failures
     lost = {failure.what for failure in failures}
     jobs = [
@@ -257,38 +246,28 @@ class _Trial(NamedTuple):
 
 
 class _Run:
-    """The state of a run. ``under_way``: jobs by name; ``there``: views that are in the cache; ``judged_paths``: views,
-    by group, that will be wanted once its thresholds are set."""
+    """The state of a run: jobs under way by name, views in the cache, views wanted after calibration by group."""
 
     def __init__(
-        self,
-        plan: SweepPlan,
-        journal: Journal,
-        engine: JobEngine,
-        report: Callable[[Outcome], None],
-        shard: Shard,
-        retry_failed: bool,
+        self, plan: SweepPlan, journal: Journal, engine: JobEngine, report: Report, shard: Shard, retry: bool
     ) -> None:
         self.outcome = Outcome()
         self.under_way: dict[str, _Trial | RenderJob] = {}
         self.there: set[Path] = set()
         self.judged_paths: dict[int, list[Path]] = {}
         self._groups, self._journal, self._engine, self._report = plan.groups, journal, engine, report
-        self._shard, self._retry_failed = shard, retry_failed
+        self._shard, self._retry_failed = shard, retry
         self._renders = {job.path: job for job in plan.renders}
         self._calibrations = [Calibration(group) for group in plan.groups]
+        # by group, thresholds that agree with those in use, at which other shards have judged
         self._others: list[list[dict[str, float]]] = [[] for _ in plan.groups]
-        """Thresholds, by group, that agree with those in use, at which other shards have judged."""
-        self._died: Counter[str] = Counter()
-        """Number of times that the process of a render or of a calibrating trial died."""
+        self._died: Counter[str] = Counter()  # deaths of the process of a render or of a calibrating trial
         self._queue: deque[_Trial] = deque()
-        self._waiting: dict[Path, list[tuple[PlanPart, list[_Trial]]]] = {}
-        """Parts with their trials, by the views that they wait for."""
+        self._waiting: dict[Path, list[tuple[PlanPart, list[_Trial]]]] = {}  # parts by the views that they wait for
         self._ahead = self._begun = 0  # trials that are open and not begun, and those under way
         self._lost: dict[Path, str] = {}
-        self._asked: set[Path] = set()
-        """Views that were wanted so far; those still to be rendered are ``_wanted``, those wanted later ``_later``."""
-        self._wanted: deque[Path] = deque()
+        self._asked: set[Path] = set()  # views that were wanted so far
+        self._wanted: deque[Path] = deque()  # views still to be rendered, and those that are wanted later
         self._later: deque[Path] = deque()
 
     def carry_out(self, parts: Iterable[PlanPart]) -> None:
@@ -299,9 +278,14 @@ class _Run:
                 if not to_open or self._ahead >= AHEAD:
                     break
                 self._open(to_open.popleft())
-            while self._engine.room("renders") > 0 and (path := self._next_render(prefetch=not to_open)) is not None:
-                self.under_way[path.name] = self._renders[path]
-                self._engine.submit(_render_job(self._renders[path]))
+            while self._engine.room("renders") > 0:
+                while self._later and not to_open and not self._wanted:  # what is wanted later is rendered meanwhile
+                    self._want(self._later.popleft())
+                if not self._wanted:
+                    break
+                render = self._renders[self._wanted.popleft()]
+                self.under_way[render.path.name] = render
+                self._engine.submit(_render_job(render))
             while self._engine.room("trials") > 0 and self._queue:
                 self._begin(self._queue.popleft())
             self.step()
@@ -328,7 +312,6 @@ class _Run:
                 continue
             self._journal.write(work.key, ended)
             self.outcome.peak_mb = max(self.outcome.peak_mb, ended.peak_mb)
-            self.outcome.trials.seconds += ended.seconds
             self.outcome.trials.done += ended.state == "done"
             self._count(work, ended)
         self._report(self.outcome)
@@ -336,8 +319,7 @@ class _Run:
     def take_learned(self) -> None:
         """Write what detectors have learned into files, from which trials read it."""
         for group, calibration in zip(self._groups, self._calibrations, strict=True):
-            for point, file in group.learned.items():
-                path = Path(file)
+            for point, path in ((point, Path(file)) for point, file in group.learned.items()):
                 entry = self._journal.read(path.stem)
                 if entry is None or entry.record is None:
                     calibration.unlearned.add(point)
@@ -358,11 +340,6 @@ class _Run:
             made = self._groups[number].trials(part.batch, None, part.repeats)
             self._skip([_Trial(part, *keyed) for keyed in made], f"no threshold: {failures[0].in_short}")
         return judged if thresholds else []
-
-    def _next_render(self, *, prefetch: bool) -> Path | None:
-        while self._later and prefetch and not self._wanted:
-            self._want(self._later.popleft())
-        return self._wanted.popleft() if self._wanted else None
 
     def _want(self, path: Path) -> None:
         if path not in self._asked:
@@ -413,10 +390,9 @@ class _Run:
         for thresholds in self._others[part.group]:
             elsewhere = group.trials(part.batch, thresholds, part.repeats)
             for trial, (key, judged) in zip(found, elsewhere, strict=True):
-                if self._journal.state(trial.key) != "done" and self._journal.state(key) == "done":
-                    entry = self._journal.read(key)
-                    if entry is not None:
-                        self._journal.write(trial.key, refiled(entry, judged, trial.task))
+                is_new = self._journal.state(trial.key) != "done" and self._journal.state(key) == "done"
+                if is_new and (entry := self._journal.read(key)) is not None:
+                    self._journal.write(trial.key, refiled(entry, judged, trial.task))
         return found
 
     def _found(self, trial: _Trial) -> bool:

@@ -1,7 +1,4 @@
-"""A simulated set-up as a trial needs it, and a cloud with the truth on its own grid: one view's average, or a map.
-
-The truth stays on this side: a detector is handed clouds only.
-"""
+"""A simulated set-up as a trial needs it, and a cloud with the truth on its grid; detectors are handed clouds only."""
 
 from __future__ import annotations
 
@@ -71,14 +68,18 @@ class SetUp:
         return np.where((over & np.isfinite(z))[..., None], met, np.nan)
 
     @property
+    def light_bytes(self) -> int:
+        """Bytes of its view's light."""
+        return self.unit.view.phasor.nbytes
+
+    @property
     def board_xy_m(self) -> np.ndarray:
         """(h, w, 2): the same, along the face in plan."""
         return self.on_face_m[..., :2]
 
     @cached_property
     def seen_z_m(self) -> np.ndarray:
-        """(h, w): z of what each pixel's central ray meets in the rendered view; where that is damaged, floors and
-        backing of holes too."""
+        """(h, w): z of what each pixel's central ray meets in the rendered view, floors of holes included."""
         view, cut = self.unit.view, self.unit.cut
         return np.asarray(view.range_m[cut] / np.sqrt(1 + (view.slopes[cut] ** 2).sum(axis=-1)))
 
@@ -134,8 +135,7 @@ class SetUp:
 
     @cached_property
     def probes(self) -> np.ndarray:
-        """(p,) flat indices of evenly spread undamaged pixels; over damage too where else there are too few (probes are
-        read on the hole-free board only)."""
+        """(p,) flat indices of evenly spread undamaged pixels; over damage too where those are too few."""
         intact = np.flatnonzero(self.intact)
         intact = intact if len(intact) >= FEWEST_PROBES else np.flatnonzero(self.bare)
         return intact[:: max(1, len(intact) // PROBES)][:PROBES]
@@ -167,33 +167,25 @@ def met_on_face(points_m: np.ndarray, directions: np.ndarray, face: Face) -> np.
 
 
 KEPT, KEPT_BYTES = 32, 200_000_000
-"""Most set-ups that a worker keeps, and most light of their views: three views from near of a lidar, whose light has 31
-frequencies."""
+"""Most set-ups that a worker keeps, and bytes of their views: three near views of a lidar with 31 frequencies."""
 _kept: OrderedDict[SetUpRef, SetUp] = OrderedDict()
 
 
 def load_set_up(ref: SetUpRef) -> SetUp:
     """Return the set-up behind a reference, kept for the worker's next trials within ``KEPT`` and ``KEPT_BYTES``."""
     if ref not in _kept:
-        _kept[ref] = _read_set_up(ref)
+        T_camera_board, view = ref.target.pose.T_camera_board, read_view(Path(ref.view_path))
+        if view is None:
+            said = f"{ref.view_path}: the stored render is missing or damaged"
+            raise UserError(said, fix="run the same command again")
+        unit, truth = SimulatedUnit(camera_of(ref.camera), ref.camera, view), truth_of(ref.target, T_camera_board)
+        in_view = unit.camera.images(np.array([damage.centre_camera_m for damage in truth]).reshape(-1, 3))
+        seen = tuple(damage for damage, there in zip(truth, in_view, strict=True) if there)
+        _kept[ref] = SetUp(unit, ref.damaged, seen, ref.target, T_camera_board)
     _kept.move_to_end(ref)
-    while len(_kept) > KEPT or (
-        len(_kept) > 1 and sum(kept.unit.view.phasor.nbytes for kept in _kept.values()) > KEPT_BYTES
-    ):
+    while len(_kept) > 1 and (len(_kept) > KEPT or sum(kept.light_bytes for kept in _kept.values()) > KEPT_BYTES):
         _kept.popitem(last=False)
     return _kept[ref]
-
-
-def _read_set_up(ref: SetUpRef) -> SetUp:
-    place, T_camera_board = Path(ref.view_path), ref.target.pose.T_camera_board
-    view = read_view(place)
-    if view is None:
-        raise UserError(f"{place}: the stored render is missing or damaged", fix="run the same command again")
-    unit = SimulatedUnit(camera_of(ref.camera), ref.camera, view)
-    truth = truth_of(ref.target, T_camera_board)
-    in_view = unit.camera.images(np.array([damage.centre_camera_m for damage in truth]).reshape(-1, 3))
-    seen = tuple(damage for damage, there in zip(truth, in_view, strict=True) if there)
-    return SetUp(unit, ref.damaged, seen, ref.target, T_camera_board)
 
 
 @dataclass(frozen=True)
@@ -216,8 +208,7 @@ class KnownCloud:
     seen_depth_m: Mapping[int, float]
 
     def on_board(self, centres_m: np.ndarray) -> np.ndarray:
-        """Return (m, 2) places on the face of findings whose centres (m, 3) are given in the cloud's frame: where the
-        line of sight through a centre, on a map its z axis, meets the face."""
+        """Return (m, 2) places on the face along lines of sight through centres (m, 3) in the cloud's frame."""
         board = transform_points(self.T_board_cloud, np.asarray(centres_m).reshape(-1, 3))
         if self.cloud.projection == "parallel":
             direction = np.broadcast_to(self.T_board_cloud[:3, 2], board.shape)
@@ -230,8 +221,7 @@ class KnownCloud:
         return transform_points(invert(self.T_board_cloud), damage.centre_board_m)
 
     def area_m2(self, pixels: np.ndarray) -> float:
-        """Return the face's area in plan that the pixels (h, w) bool cover, tilt and perspective included; of a cloud
-        without a grid the whole face's, in the share of its points."""
+        """Return the face's area in plan under pixels (h, w) bool; without a grid by their share of the whole."""
         there = pixels & np.isfinite(self.places_m[..., 0])
         if not self.cloud.organised:
             board = self.target.board
@@ -252,8 +242,7 @@ def known_view(set_up: SetUp, cloud: Cloud, *, hole_free: bool) -> KnownCloud:
 
 
 def known_map(first: SetUp, cloud: Cloud, T_reference_cloud: np.ndarray, *, hole_free: bool) -> KnownCloud:
-    """Return a map of several views, ``first`` being the reference view's set-up: the truth by each point's own place
-    (deep in a hole that was seen at an angle it is aside, within the margin round the damage)."""
+    """Return a map, ``first`` being the reference view's set-up, with the truth by each point's own place."""
     T_board_cloud = invert(first.T_camera_board) @ T_reference_cloud
     place = board_places_m(cloud, T_board_cloud)
     margin_m = INTACT_MARGIN_PX * max(first.pitch_mm) * MM
@@ -280,8 +269,7 @@ def outlined(
 
 
 def board_places_m(cloud: Cloud, T_board_cloud: np.ndarray) -> np.ndarray:
-    """Return the (h, w, 2) place on the board of each point; of a map's empty cells too, whose x and y its grid
-    knows."""
+    """Return the (h, w, 2) place on the board of each point; of a map's empty cells too, by its grid."""
     points = cloud.points_m
     if cloud.projection == "parallel":
         x, y = _ticks(points[..., 0]), _ticks(points[..., 1].T)
@@ -346,9 +334,8 @@ def _about(  # type: ignore[no-untyped-def]
 
 @numba.njit(**PLAIN)
 def pixel_areas(places_m: np.ndarray) -> np.ndarray:
-    """Return (h, w) area that each pixel covers of the plane on which the pixels lie at ``places_m`` (h, w, 2): of the
-    parallelogram of the central differences, at the grid's edge of the one-sided ones. NaN beside a pixel that lies
-    nowhere; h and w are 2 at least."""
+    """Return (h, w) area that pixels at ``places_m`` (h, w, 2) cover of a plane: the parallelogram of central
+    differences, at the edge one-sided ones. NaN beside a pixel that lies nowhere; h and w are 2 at least."""
     h, w, _ = places_m.shape
     areas = np.empty((h, w))
     for v in range(h):

@@ -11,7 +11,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from harness.engine.estimate import progress_display
@@ -29,20 +28,17 @@ from harness.tables.text import Grid, show
 from harness.tables.trials import ResultTables
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import RECORD_BYTES, bounded_bytes, strict_json, write_text
-from harness.vocabulary.geometry import MM
 from harness.vocabulary.path_names import in_words, names_of
 from harness.vocabulary.provenance import RESULTS_VERSION, check_version, record, source_digest
 from harness.vocabulary.seeds import digest
 from scenes.render.cache import in_use, read_view, trim_cache
 from scenes.sensor.camera import camera_of, guessed_precision
 
-MOST_FAILURES = 200  # failures that are listed; the journal has all
-MOST_VIEWS = 64  # views whose render noise is measured: evenly taken from all, 4 MB each
+MOST_FAILURES, FAILURE = 200, ("what", "state", "why")  # failures that are listed; the journal has all
 
 
 def run_study(experiment: Experiment, out: Path, options: EngineOptions, command: str) -> int:
-    """Run, write tables and report, print the summary; a shard's trials only go into the journal. Returns 0, 1 where
-    trials did not end well, 130 after Ctrl-C."""
+    """Run, write tables and report, print the summary; of a shard only the journal. Returns 0, 1, or 130."""
     began = time.monotonic()
     origin = record(command)  # now: a commit that is made while the sweep runs is not what it ran
     origin["started"] = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
@@ -60,8 +56,8 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
                 retry = options.retry_failed
                 outcome = run_plan(plan, journal, engine, report, shard=options.shard, retry_failed=retry)
             if not options.shard.is_whole:
-                trials = outcome.trials
-                counts = f"{trials.done} trials done, {trials.found} found, {trials.failed} not ended well"
+                done = outcome.trials
+                counts = f"{done.done} trials done, {done.found} found, {done.failed} not ended well"
                 print(f"shard {options.shard}: {counts}")
                 _tell_failures(outcome)
                 print(f"journal: {folder / 'journal'}")
@@ -109,9 +105,6 @@ def _records(journal: Journal, outcome: Outcome) -> Iterator[dict[str, Any]]:
             fix = "run the same command again: what is missing is run again"
             raise UserError(f"{journal.folder}: the record {key} is gone or damaged since it was written", fix=fix)
         yield entry.record
-
-
-# ---------------------------------------------------------------- pages
 
 
 def _write_study(
@@ -170,14 +163,10 @@ def _write_report(
     return final_tables(tables, found)
 
 
-# ---------------------------------------------------------------- failures, provenance
-
-
 def _nothing_to_report(experiment: Experiment, outcome: Outcome) -> int:
     """Conclude a run without any result: the user's mistake is raised; a bug keeps its traceback (once) and gives 1."""
     name, detector = experiment.config.name, experiment.config.detector.name
-    bug = next((failure for failure in outcome.failures if failure.is_bug), None)
-    if bug is not None:
+    if bug := next((failure for failure in outcome.failures if failure.is_bug), None):
         count = outcome.trials.failed
         told = f"no trial of {name} succeeded; {count} failed, the first as above (detector {detector!r})"
         print(f"{bug.why}\n{told}", file=sys.stderr)
@@ -203,31 +192,19 @@ def _counts(outcome: Outcome) -> dict[str, int]:
 
 
 def _tell_failures(outcome: Outcome) -> None:
-    counts = _counts(outcome)
-    if counts:
+    if counts := _counts(outcome):
         said = ", ".join(f"{count} {state}" for state, count in counts.items())
+        again = "the same command, with --retry-failed, runs them again" if set(counts) - {"skipped"} else ""
         print(f"{said}: {_reasons(outcome)}", file=sys.stderr)
-    if set(counts) - {"skipped"}:
-        print("the same command with --retry-failed runs again what failed, crashed or timed out", file=sys.stderr)
-    if "skipped" in counts:
-        print("the same command runs again what was skipped", file=sys.stderr)
+        print(again or "the same command runs again what was skipped", file=sys.stderr)
 
 
 def _provenance(
     experiment: Experiment, plan: SweepPlan, outcome: Outcome, tables: ResultTables, origin: dict[str, Any]
 ) -> dict[str, Any]:
-    """Everything that a reader needs to repeat the numbers or to doubt them. ``indirect_noise_mm``: of the renders."""
-    set_ups = [group for group in plan.groups if any(not point.is_variation for point in group.points)]
-    paths = [path for group in set_ups or plan.groups[:1] for path in group.damaged.paths]
-    found = (read_view(path) for path in paths[:: -(-len(paths) // MOST_VIEWS)])
-    views = [view for view in found if view is not None]
-    noise: dict[str, float] = {}
-    for view in views:
-        for index, name in enumerate(view.surface_names):
-            here = view.surface == index
-            if here.any():
-                noise_mm = round(float(np.median(view.indirect_noise_m[here])) / MM, 4)
-                noise[name] = max(noise.get(name, 0.0), noise_mm)
+    """Everything that a reader needs to repeat the numbers or to doubt them."""
+    views = (read_view(job.path) for job in plan.renders)
+    variant = next((view.variant for view in views if view is not None), None)
     runs, renders, trials = tables.runs, outcome.renders, outcome.trials
     sources = [point.config.simulated.camera for point in experiment.points]
     cameras = {source.name: camera_of(source) for source in sources}
@@ -238,7 +215,7 @@ def _provenance(
         "experiment": experiment.config.name,
         "digest": experiment.digest,
         "seed": experiment.config.seed,
-        "mitsuba_variant": views[0].variant if views else None,
+        "mitsuba_variant": variant,
         "seconds": {
             "renders (not cached)": round(renders.seconds, 1),
             "frames (all workers, resumed trials too)": round(float(runs["seconds_frames"].sum()), 1),
@@ -247,16 +224,10 @@ def _provenance(
         "renders": {"done": renders.done, "cached": renders.found, "failed": renders.failed},
         "trials": {"done": trials.done, "resumed": trials.found, "failed": trials.failed},
         "peak_mb": outcome.peak_mb,
-        "indirect_noise_mm": noise,
         "warnings": [text for text in guesses if text],
-        "failures": [
-            {"what": one.what, "state": one.state, "why": one.why} for one in outcome.failures[:MOST_FAILURES]
-        ],
+        "failures": [{name: getattr(one, name) for name in FAILURE} for one in outcome.failures[:MOST_FAILURES]],
         "failures_in_all": _counts(outcome),
     }
-
-
-# ---------------------------------------------------------------- a study's record
 
 
 SIMULATION = ("scenes.sensor.source",)
@@ -275,8 +246,7 @@ def record_of(
     failed: Mapping[str, Sequence[Failure]],
     provenance: Mapping[str, Any],
 ) -> StudyRecord:
-    """Return the record of a study. ``failed``: trials that failed, by point digest. Set-ups of which no damaged
-    board was judged are left out; `without_limit` tells of them."""
+    """Return a study's record, without set-ups of which no damaged board was judged. ``failed``: by point digest."""
     calibrate = experiment.config.threshold.calibrate
     found = {point.digest: group for group in plan.groups for point in group.points}
     counts = {digest: len(failures) for digest, failures in failed.items()}
@@ -318,7 +288,6 @@ def _set_up(point: Point, group: Group, tables: ResultTables, failed: int) -> Se
         detector_version=detector_version(config),
         calibration_runs=len(calibrating),
         failed=failed,
-        # the damage and the size of every damaged board, wherever and before whichever camera it stands
         targets_digest=digest(targets),
         frames_digest=digest([*decided_by, config.repeats, None if study is None else study.units]),
         units=1 if study is None else study.units or 1,
@@ -328,10 +297,7 @@ def _set_up(point: Point, group: Group, tables: ResultTables, failed: int) -> Se
             board=loudest["board"].to_numpy(int),
             repeat=loudest["repeat"].to_numpy(int),
             score=loudest["quiet_threshold"].to_numpy(float),
-            x_mm=loudest["loudest_x_mm"].to_numpy(float),
-            y_mm=loudest["loudest_y_mm"].to_numpy(float),
-            u_px=loudest["loudest_u_px"].to_numpy(float),
-            v_px=loudest["loudest_v_px"].to_numpy(float),
+            **{name: loudest[f"loudest_{name}"].to_numpy(float) for name in ("x_mm", "y_mm", "u_px", "v_px")},
         ),
         **judged_facts(holes, runs),
     )
@@ -373,13 +339,12 @@ def failures_by_point(
     plan: SweepPlan, failures: Iterable[Failure], thresholds: Mapping[str, float]
 ) -> dict[str, list[Failure]]:
     """Return the failed trials of each point, by its digest."""
-    by_key = {failure.what: failure for failure in failures}
-    found: dict[str, list[Failure]] = {}
-    for group in plan.groups if by_key else ():
-        for batch in group.batches:
-            for key, task in group.trials(batch, thresholds if batch in group.then else {}):
-                for asked in task.points if key in by_key else ():
-                    found.setdefault(asked.digest, []).append(by_key[key])
+    by_key, found = {failure.what: failure for failure in failures}, dict[str, list[Failure]]()
+    every = [(group, batch) for group in plan.groups for batch in group.batches] if by_key else []
+    for group, batch in every:
+        for key, task in group.trials(batch, thresholds if batch in group.then else {}):
+            for asked in task.points if key in by_key else ():
+                found.setdefault(asked.digest, []).append(by_key[key])
     return found
 
 
@@ -388,14 +353,12 @@ def without_limit(
 ) -> list[str]:
     """Return sentences on the points that are not among the ``judged`` set-ups, with their commonest failure."""
     known, said = {(one.variant, one.frames) for one in judged}, dict[str, list[str]]()
-    by_name = {failure.what: failure for failure in outcome.failures}
-    for point in points:
-        if (point.variant, point.config.capture.frames) not in known:
-            own = [one for one in failed.get(point.digest, ()) if one.state != "skipped"]
-            causes = Counter(one.in_short for one in own).most_common(1)
-            threshold = by_name.get(f"threshold of {point.label}")
-            why = causes[0][0] if causes else threshold.in_short if threshold else "its trials did not end"
-            if own and all(one.state == "failed" and not one.is_bug for one in own):
-                why = f"the camera sees nothing of the board here that could be judged ({why})"
-            said.setdefault(why, []).append(point.label)
+    for point in (one for one in points if (one.variant, one.config.capture.frames) not in known):
+        own = [one for one in failed.get(point.digest, ()) if one.state != "skipped"]
+        causes = [one.in_short for one in own]
+        causes = causes or [one.in_short for one in outcome.failures if one.what == f"threshold of {point.label}"]
+        why = Counter([*causes, "its trials did not end"]).most_common(1)[0][0]
+        if own and all(one.state == "failed" and not one.is_bug for one in own):
+            why = f"the camera sees nothing of the board here that could be judged ({why})"
+        said.setdefault(why, []).append(point.label)
     return [f"no limit for {'; '.join(labels)}: {why}" for why, labels in said.items()]

@@ -27,8 +27,7 @@ UNKNOWN = np.iinfo(np.int32).min  # stands among whole numbers for a value that 
 
 
 def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> trials.ResultTables:
-    """Collect records into tables in a fixed order; equal for equal records in equal order. The number of frames apart,
-    every axis is a column of all tables but those of a study alone."""
+    """Collect records into tables in a fixed order; every axis but frames is a column, but of a study's own."""
     parts: dict[str, list[dict[str, Any]]] = {name: [] for name in (*RECORDED, *OF_STUDY)}
     grids: dict[tuple[float, ...], np.ndarray] = {}
     probes: list[dict[str, Any]] = []
@@ -65,11 +64,8 @@ def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> t
             return pd.DataFrame()
         order = {column: joined(column)[column].array for column in declared.order if column in names}
         places = pd.DataFrame(order).sort_values(list(order), kind="stable").index.to_numpy()
-        table = {
-            column: (order[column] if column in order else joined(column)[column].array).take(places)
-            for column in names
-        }
-        return pd.DataFrame(table, copy=False)
+        held = ((one, order[one] if one in order else joined(one)[one].array) for one in names)
+        return pd.DataFrame({name: values.take(places) for name, values in held}, copy=False)
 
     return trials.ResultTables(
         **{name: with_axes(ordered(name, table)) for name, table in RECORDED.items()},
@@ -153,12 +149,9 @@ def _variants(experiment: Experiment) -> pd.DataFrame:
     for path in paths:
         numbers = table[path].map(lambda v: isinstance(v, int | float) and not isinstance(v, bool))
         # a column of Parquet has one type
-        table[path] = table[path].astype(float) if numbers.all() else table[path].map(_text)
+        texts = table[path].map(lambda value: value if isinstance(value, str) else json.dumps(value, sort_keys=True))
+        table[path] = table[path].astype(float) if numbers.all() else texts
     return table
-
-
-def _text(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value, sort_keys=True)
 
 
 def _reason(experiment: Experiment, point: Point) -> str:
@@ -173,9 +166,6 @@ def _reason(experiment: Experiment, point: Point) -> str:
         if named:
             return variation.reason
     return ""
-
-
-# ---------------------------------------------------------------- files
 
 
 def write_tables(folder: Path, tables: Mapping[Table, pd.DataFrame], provenance: Mapping[str, Any]) -> None:

@@ -1,19 +1,17 @@
 """One trial: frames of one set-up, their averages, the maps made of them, every detector that asked for them, measured
 against the truth.
 
-Averages are drawn at once where that is equal in distribution (plain means of at least `FEWEST_FRAMES` frames, where
-the camera's model can), from single frames otherwise. Frames that jump as a whole are left out by how far each is
-displaced, which is known exactly here.
-"""
+Averages are drawn at once where that is equal in distribution (plain means of `FEWEST_FRAMES` frames and more, where
+the camera's model can). Frames that jump are left out by their displacement, which is known exactly here."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice, pairwise
-from typing import Any, Literal, TypeVar, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 from scipy import special
@@ -56,8 +54,7 @@ def averages_of(
 ) -> dict[int, Cloud]:
     """Return averages of the first n frames of a capture for each n in ``counts``, equal in distribution to
     `detectors.average.prefix_averages`, which is used (and raises) where ``exact`` or nothing else will do. Averages
-    drawn at once nest, and so do those drawn frame by frame; the two kinds have noise of their own. With a
-    ``flat_field`` they are corrected by it."""
+    drawn at once nest, and so do those drawn frame by frame. A ``flat_field`` is taken off."""
     many = sorted({n for n in counts if n >= FEWEST_FRAMES})
     clouds = _at_once(capture, many, config) if many and not exact and config.method == "mean" else {}
     rest = [n for n in counts if n not in clouds]
@@ -70,9 +67,7 @@ def averages_of(
 
 @lru_cache(maxsize=4)
 def flat_field_of(camera: CameraConfig, config: FlatFieldConfig, seed: int) -> FlatField:
-    """Return what a unit's whole sensor makes of a plane across its axis, with noise of its own, kept for the worker's
-    next trials. The plane is known to be flat, so one capture is enough. Raises UserError where no pixel has a
-    range."""
+    """Return what a unit makes of a flat plane across its axis, kept. Raises UserError where no pixel has a range."""
     facts = camera_of(camera)
     view = plane_view(facts, facts.nominal_lens.whole, config.distance_m, FLAT_ALBEDO)
     capture = SimulatedUnit(facts, camera, view).capture(config.frames, seed, "flat field")
@@ -156,10 +151,7 @@ def _cloud(capture: SimulatedCapture, totals: FrameTotals, left_out: tuple[LeftO
     )
 
 
-# ---------------------------------------------------------------- maps
-
-
-Made = TypeVar("Made")
+Clouds = Mapping[int, Cloud]  # one view's averages by number of frames
 BOARD_STEPS = 9  # places along each side of the board at which a registration's error is taken
 
 
@@ -168,11 +160,7 @@ class MapMaker:
     this trial's random errors of the poses. ``truth`` and ``guesses``: T_reference_view."""
 
     def __init__(
-        self,
-        set_ups: Sequence[SetUp],
-        clouds: Sequence[Mapping[int, Cloud]],
-        poses: AnyViews,
-        labels: Sequence[str | int],
+        self, set_ups: Sequence[SetUp], clouds: Sequence[Clouds], poses: AnyViews, labels: Sequence[str | int]
     ) -> None:
         self._set_ups, self._clouds = set_ups, clouds
         self._made: dict[str, Any] = {}
@@ -196,22 +184,20 @@ class MapMaker:
 
     def merged(self, mapping: MappingConfig, frames: int) -> Merged:
         """Return the map."""
-
-        def make() -> Merged:
-            return merge(self.prepared(mapping, frames), self.registrations(mapping, frames), mapping.merge)
-
-        return self._once(make, "merged", self.key(mapping, frames))
+        if (key := f"merged {self.key(mapping, frames)}") not in self._made:
+            registrations = self.registrations(mapping, frames)
+            self._made[key] = merge(self.prepared(mapping, frames), registrations, mapping.merge)
+        return cast("Merged", self._made[key])
 
     def prepared(self, mapping: MappingConfig, frames: int, count: int | None = None) -> tuple[PreparedView, ...]:
         """Return the views with their targets cut out and their marks found."""
-
-        def make() -> PreparedView:
-            return prepare(View(f"view {number}", self._clouds[number][frames], self.guesses[number]), mapping)
-
-        key, found = (frames, mapping.crop.to_data(), mapping.marks.to_data()), []
+        keys = []
         for number in range(self.count(mapping) if count is None else count):
-            found.append(self._once(make, "prepared", number, *key))
-        return tuple(found)
+            keys.append(canonical_json([number, frames, mapping.crop.to_data(), mapping.marks.to_data()]))
+            if keys[-1] not in self._made:
+                view = View(f"view {number}", self._clouds[number][frames], self.guesses[number])
+                self._made[keys[-1]] = prepare(view, mapping)
+        return tuple(self._made[key] for key in keys)
 
     def registrations(self, mapping: MappingConfig, frames: int) -> tuple[Registration, ...]:
         """Return a registration for each view."""
@@ -220,8 +206,9 @@ class MapMaker:
             most = sum(frames in clouds for clouds in self._clouds)
             parts = [frames, mapping.crop.to_data(), mapping.marks.to_data(), mapping.registration.to_data()]
             key, count = canonical_json(parts), max(most, count)
-        views = self.prepared(mapping, frames, count)
-        return self._once(lambda: register(views, mapping.registration), "registered", key)[: self.count(mapping)]
+        if key not in self._made:
+            self._made[key] = register(self.prepared(mapping, frames, count), mapping.registration)
+        return tuple(self._made[key][: self.count(mapping)])
 
     def registration_rows(self, mapping: MappingConfig, frames: int) -> list[dict[str, Any]]:
         """Return a row for each view but the first, once for each registration (columns: `REGISTRATIONS`)."""
@@ -242,22 +229,14 @@ class MapMaker:
         registration = mapping.registration.to_data() if count > 1 else None
         return canonical_json([count, frames, mapping.crop.to_data(), mapping.marks.to_data(), registration])
 
-    def _once(self, make: Callable[[], Made], *key: Any) -> Made:
-        name = canonical_json(key)
-        if name not in self._made:
-            self._made[name] = make()
-        return cast("Made", self._made[name])
-
     def _row(self, number: int, view: PreparedView, registration: Registration) -> dict[str, Any]:
         first = self._set_ups[0]
         board, T_camera_board = first.target.board, first.T_camera_board
         x, y = (np.linspace(-0.5, 0.5, BOARD_STEPS) * side * MM for side in (board.width_mm, board.height_mm))
         grid = np.stack([*np.meshgrid(x, y), np.zeros((BOARD_STEPS, BOARD_STEPS))], axis=-1).reshape(-1, 3)
         places_m, normal = transform_points(T_camera_board, grid), T_camera_board[:3, 2]
-        (in_plane, across), guessed = (
-            registration_error_m(T, self.truth[number], places_m, normal)
-            for T in (registration.T_reference_view, self.guesses[number])
-        )
+        both = (registration.T_reference_view, self.guesses[number])
+        (in_plane, across), guessed = (registration_error_m(T, self.truth[number], places_m, normal) for T in both)
         predicted = predicted_error_m(registration, places_m, normal)
         return {
             "view": number,
@@ -291,12 +270,8 @@ def registration_error_m(
     return float(np.sqrt((in_plane**2).mean())), float(np.sqrt((across**2).mean()))
 
 
-# ---------------------------------------------------------------- trials
-
-
 Role = Literal["learning", "calibration", "hole_free", "damaged"]
-"""The purpose of a trial's target. Detectors learn on those of "learning" (`harness.engine.learning`). Only in a study
-do boards that set a threshold ("calibration") differ from those on which false calls are counted ("hole_free")."""
+"""Purpose of a trial's target: to learn on, to set a threshold (in a study only), to count false calls, to be found."""
 TABLES = ("runs", "holes", "probes", "noise", "registrations", *STUDY_TABLES)
 LAGS = (1, 2, 3)  # distances in pixels at which the noise's correlation is taken
 FEWEST_PAIRS = 50  # pairs of pixels below which a correlation is not told: its standard error would exceed 0.14
@@ -304,8 +279,7 @@ FEWEST_PAIRS = 50  # pairs of pixels below which a correlation is not told: its 
 
 @dataclass(frozen=True)
 class PointTask:
-    """The demands of a point on a trial. ``threshold`` is None while it is being calibrated. ``learned``: file of what
-    its detector has learned; None for one that learns nothing, or is learning."""
+    """A point's demands. ``threshold`` None: being calibrated. ``learned``: file of what its detector learned."""
 
     digest: str
     variant: str
@@ -324,8 +298,7 @@ class PointTask:
 
 @dataclass(frozen=True)
 class TrialTask:
-    """Frames of one set-up, drawn once, judged by all points that share them. ``poses`` declares the views, if there
-    are several. ``board``: its number among a study's boards of this role; None where the target is the only one."""
+    """Frames of one set-up, drawn once, judged by points that share them. ``board``: its number in a study."""
 
     set_ups: tuple[SetUpRef, ...]
     seed: int
@@ -444,12 +417,8 @@ def _point_rows(
     return rows | {"registrations": [{**common, **role, **row} for row in registrations]}
 
 
-# ---------------------------------------------------------------- what one camera makes of an undamaged board
-
-
 def _board_rows(task: TrialTask, set_up: SetUp, clouds: dict[int, Cloud], points: Sequence[PointTask]) -> Rows:
-    """Rows for each variant and number of frames: "probes", a list of errors of z; "noise", as in
-    `harness.tables.trials.NOISE`."""
+    """Rows by variant and number of frames: "probes", errors of z; "noise", as in `tables.trials.NOISE`."""
     pair = [frame.z_m for frame in islice(capture_of(set_up, 0, task, 2).frames(), 2)]
     noise = pair_noise(pair[0], pair[-1], set_up.bare)
     rows: Rows = {"probes": [], "noise": []}

@@ -1,17 +1,11 @@
-"""The seam between what is to be done and what does it: jobs go in, each comes back once with how it ended; one part of
-a sweep (`--shard 3/10`), with no other process to talk to; and the options of every program that runs an experiment.
-
-An engine runs jobs somewhere: in this process, in processes of this machine, on a cluster. It never decides what is
-to be done, and it loses nothing: a job that raises, kills its process, hangs or eats the memory comes back as such, and
-takes no other with it.
-"""
+"""The seam between what is to be done and what does it: jobs go in, each comes back once with how it ended, whatever it
+did; one part of a sweep (`--shard 3/10`); and the options of every program that runs an experiment."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
 import json
-import os
 import re
 import sys
 import time
@@ -30,8 +24,7 @@ if TYPE_CHECKING:
     from harness.report.clouds import ExampleCloud, MappedExample
 
 State = Literal["done", "failed", "crashed", "timed out", "skipped"]
-"""The ways in which a job can end. Done; failed: it raised; crashed: its process died; timed out: it was ended by
-the time limit; skipped: it was never begun, because what it needs is not there."""
+"""The ends of a job. Failed: it raised; crashed: its process died; skipped: what it needs is not there."""
 STATES: tuple[State, ...] = get_args(State)
 Stage = Literal["renders", "trials"]  # renders load Mitsuba and some 2 GB; everything else runs where trials run
 Code = tuple[tuple[str, ...], tuple[str, ...]]
@@ -41,8 +34,7 @@ TRACEBACK_CHARACTERS = 4000
 
 @dataclass(frozen=True)
 class Job:
-    """``function(*arguments)``, somewhere. The function is importable by its name; arguments and result are plain data
-    or frozen dataclasses."""
+    """``function(*arguments)``, importable by its name; arguments and result are plain data or frozen dataclasses."""
 
     name: str
     stage: Stage
@@ -80,7 +72,6 @@ class JobEngine(Protocol):
     """An engine that runs jobs. Used as a context: left by an exception it drops its jobs within two seconds."""
 
     def __enter__(self) -> JobEngine: ...
-
     def __exit__(self, *error: object) -> None: ...
 
     def room(self, stage: Stage) -> int:
@@ -233,35 +224,24 @@ def _held(path: Path, *, shared: bool) -> Iterator[None]:
     with opened_lock(path) as file:
         answer = lock(file, shared=shared, wait=False)
         if answer == "busy":
-            file.seek(0)
-            said = file.read(20).strip()
-            who = f" (process {said})" if said.isdigit() else ""
-            fix = "wait for it, or name another folder with --out"
-            raise UserError(f"{path.parent}: another sweep is at work in this folder{who}", fix=fix)
+            said = f"{path.parent}: another sweep is at work in this folder"
+            raise UserError(said, fix="wait for it, or name another folder with --out")
         if answer == "no locks":
             print(f"{path.parent}: cannot be locked on this system: start no second sweep in it", file=sys.stderr)
-        file.truncate(0)
-        if not shared:
-            file.write(f"{os.getpid()}\n")
-            file.flush()
         yield
-        file.truncate(0)
 
 
 # ---------------------------------------------------------------- options
 
 
-DEFAULT_TIME_LIMIT_S = 900.0  # a trial takes seconds at most; a hang should not take a night
-DEFAULT_MEMORY_GB = 4.0  # a trial takes some 300 MB, maps of many views up to 2 GB
-DEFAULT_CACHE_GB = 20.0
-DEFAULT_LIMITS = Limits(DEFAULT_TIME_LIMIT_S, round(1000 * DEFAULT_MEMORY_GB))
+DEFAULT_LIMITS = Limits(seconds=900.0, memory_mb=4000)
+"""A trial takes seconds at most, and a hang should not take a night; 300 MB, maps of many views up to 2 GB."""
 LEAST_MEMORY_GB = 0.5  # a process that has loaded what trials need holds 0.2 GB
 
 
 @dataclass(frozen=True)
 class EngineOptions:
-    """``jobs``: processes, or workers that a cluster is asked for. ``scheduler``: address of one, or jobqueue:slurm and
-    the like; None: this machine. ``serial``: in this process."""
+    """``jobs``: processes, or workers of a cluster. ``scheduler`` None: this machine; ``serial``: this process."""
 
     jobs: int = 2
     limits: Limits = DEFAULT_LIMITS
@@ -273,8 +253,7 @@ class EngineOptions:
 
 
 def engine_of(options: EngineOptions, detectors: Iterable[str] = (), folder: Path = Path()) -> JobEngine:
-    """Return the engine, not yet begun, for trials of these ``detectors``; ``folder``: of renders. Raises UserError
-    where it is not installed or does not answer."""
+    """Return the engine, not yet begun, for trials of ``detectors``; ``folder``: of renders. Raises UserError."""
     from harness.engine.processes import LocalEngine, SerialEngine
 
     if options.serial:
@@ -298,22 +277,17 @@ def code_of(detectors: Iterable[str]) -> dict[Stage, Code]:
 def add_engine_options(parser: argparse.ArgumentParser) -> None:
     """Add them, in a group of their own."""
     add = parser.add_argument_group("how it is run").add_argument
-    add(
-        "--jobs",
-        type=whole_number(4096),
-        default=2,
-        metavar="N",
-        help="processes, or workers of a cluster (default: 2)",
-    )
+    processes = "processes, or workers of a cluster (default: 2)"
+    add("--jobs", type=whole_number(4096), default=2, metavar="N", help=processes)
     add("--serial", action="store_true", help="run everything in this process, for a debugger; without limits")
     help = "run on a Dask cluster: tcp://host:8786, or jobqueue:slurm and the like as your Dask configuration has it"
     add("--scheduler", metavar="ADDRESS", help=help)
     add("--shard", metavar="K/N", help="run the k-th of n parts only, such as 3/10; python -m harness.merge joins them")
     add("--retry-failed", action="store_true", help="run again what failed, crashed or timed out before")
     for name, unit, default, meaning in (
-        ("--time-limit", "SECONDS", DEFAULT_TIME_LIMIT_S, "that one trial or render may take"),
-        ("--memory-limit", "GB", DEFAULT_MEMORY_GB, "that a trial's process may take, on a cluster too"),
-        ("--cache-limit", "GB", DEFAULT_CACHE_GB, "of stored renders; the longest unused go first"),
+        ("--time-limit", "SECONDS", 900.0, "that one trial or render may take"),
+        ("--memory-limit", "GB", 4.0, "that a trial's process may take, on a cluster too"),
+        ("--cache-limit", "GB", 20.0, "of stored renders; the longest unused go first"),
     ):
         add(name, type=_positive, default=default, metavar=unit, help=f"{meaning} (default: {default:g})")
 
@@ -323,19 +297,13 @@ def engine_options(options: argparse.Namespace) -> EngineOptions:
     if options.serial and options.scheduler is not None:
         raise UserError("--serial and --scheduler: ask for different engines", fix="leave one of them out")
     if options.memory_limit < LEAST_MEMORY_GB:
-        raise UserError(
-            f"--memory-limit {options.memory_limit:g}: a process needs more than that to begin with",
-            legal=f"{LEAST_MEMORY_GB:g} GB or more; 1 GB is enough for most trials",
-        )
-    return EngineOptions(
-        jobs=options.jobs,
-        limits=Limits(options.time_limit, round(1000 * options.memory_limit)),
-        scheduler=options.scheduler,
-        serial=options.serial,
-        shard=WHOLE if options.shard is None else Shard.of(options.shard),
-        retry_failed=options.retry_failed,
-        cache_limit_gb=options.cache_limit,
-    )
+        legal = f"{LEAST_MEMORY_GB:g} GB or more; 1 GB is enough for most trials"
+        said = f"--memory-limit {options.memory_limit:g}: a process needs more than that to begin with"
+        raise UserError(said, legal=legal)
+    limits = Limits(options.time_limit, round(1000 * options.memory_limit))
+    shard = WHOLE if options.shard is None else Shard.of(options.shard)
+    where = (options.scheduler, options.serial, shard, options.retry_failed, options.cache_limit)
+    return EngineOptions(options.jobs, limits, *where)
 
 
 def _positive(text: str) -> float:

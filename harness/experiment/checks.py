@@ -11,14 +11,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from detectors import detector_names
-from harness.experiment.schema import (
-    DETECTOR_NAME,
-    CaptureSource,
-    ExperimentConfig,
-    SimulatedSource,
-    recording_of,
-    splices_of,
-)
+from harness.experiment.schema import CaptureSource, ExperimentConfig, SimulatedSource, recording_of, splices_of
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.diagnose import nearest, validated, wrong_choice
 from harness.vocabulary.declaration.yaml_source import KeyPath, Problem, Source
@@ -32,7 +25,7 @@ from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.thesis import AnyTargetConfig
 
-CAMERA_NAME = ("source", "camera", "name")
+CAMERA_NAME, DETECTOR_NAME = ("source", "camera", "name"), ("detector", "name")
 CAMERA_NUMBERS = ("source", "camera", "numbers")
 TARGET = ("source", "target")
 VIEWS = ("source", "views")
@@ -50,19 +43,17 @@ def resolved(source: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
                 problems.append(Problem(str(error), source.place_of(path)))
         elif isinstance(name, str) and name not in legal:
             problems.append(wrong_choice(path, name, legal, source.place_of(path)))
-    if config is not None and not problems:
-        if config.capture.average.frames is not None:
-            place = source.key_place_of(("capture", "average", "frames"))
-            message = "an experiment counts its frames by `capture.frames`"
-            problems.append(Problem(message, place, fix="remove this key"))
-        if isinstance(config.source, SimulatedSource):
-            problems += _target_problems(config, config.source, source)
-            problems += _mapping_problems(config, config.source, source)
-            problems += _flat_field_problems(config, config.source, source)
-        else:
-            problems += _capture_problems(config, config.source, source)
-        problems += _study_problems(config, source)
-    return config, problems
+    if config is None or problems:
+        return config, problems
+    if config.capture.average.frames is not None:
+        place, message = source.key_place_of(("capture", "average", "frames")), "an experiment counts its frames by"
+        problems.append(Problem(f"{message} `capture.frames`", place, fix="remove this key"))
+    if isinstance(config.source, SimulatedSource):
+        for check in (_target_problems, _mapping_problems, _flat_field_problems):
+            problems += check(config, config.source, source)
+    else:
+        problems += _capture_problems(config, config.source, source)
+    return config, [*problems, *_study_problems(config, source)]
 
 
 def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Problem]:
@@ -118,12 +109,9 @@ def _target_problems(config: ExperimentConfig, simulated: SimulatedSource, sourc
     apart_mm = [dist(a.centre_mm, b.centre_mm) for a, b in combinations(target.damages, 2)]
     pitch_mm = drawn.apart_mm if drawn is not None else min(apart_mm, default=None)
     if pitch_mm is not None and config.matching.radius_mm > pitch_mm / 2:
-        yield Problem(
-            f"a matching radius of {config.matching.radius_mm:g} mm reaches beyond half the way to the next damage, so "
-            "that a detection could count for either",
-            source.place_of(("matching", "radius_mm")),
-            legal=f"at most {pitch_mm / 2:g} mm for damages whose centres are {pitch_mm:g} mm apart",
-        )
+        said = f"a matching radius of {config.matching.radius_mm:g} mm lets a detection count for either of two damages"
+        legal = f"at most {pitch_mm / 2:g} mm for damages whose centres are {pitch_mm:g} mm apart"
+        yield Problem(said, source.place_of(("matching", "radius_mm")), legal=legal)
 
 
 @lru_cache(maxsize=10_000)
@@ -138,9 +126,8 @@ def _declared(config: AnyTargetConfig) -> TargetConfig:
 def _unseen(
     camera: CameraConfig, views: AnyViews | None, declared: AnyTargetConfig
 ) -> tuple[KeyPath, UserError] | None:
-    """Return why the camera does not see the target, and the key that this concerns: the camera cannot be made, finds
-    no albedo at its wavelength, or `_unseen_pose`; of a family of boards in the extreme poses that can be drawn, first
-    in a single view."""
+    """Return why the camera does not see the target, and the key that this concerns: no such camera, no albedo at its
+    wavelength, or `_unseen_pose`; of a family in the extreme poses that can be drawn, first in a single view."""
     target = _declared(declared)
     path: KeyPath = CAMERA_NUMBERS if camera.numbers else CAMERA_NAME
     try:
@@ -156,17 +143,15 @@ def _unseen(
         found = _unseen_pose(optics, None, posed) or (views and _unseen_pose(optics, views, posed))
         if found:
             path, first = found
-            where = (
-                f"a board drawn at {pose.distance_m:.3g} m, {pose.offset_x_mm:.3g} and {pose.offset_y_mm:.3g} mm off "
-                f"the axis, tilted by {pose.tilt_x_deg:.3g}° and {pose.tilt_y_deg:.3g}°, rolled by {pose.roll_deg:.3g}°"
-            )
+            aside = f"{pose.offset_x_mm:.3g} and {pose.offset_y_mm:.3g} mm off the axis"
+            turned = f"tilted by {pose.tilt_x_deg:.3g}° and {pose.tilt_y_deg:.3g}°, rolled by {pose.roll_deg:.3g}°"
+            where = f"a board drawn at {pose.distance_m:.3g} m, {aside}, {turned}"
             return path, UserError(f"{where}: {first.message}", legal=first.legal, fix=first.fix)
     return None
 
 
 def _unseen_pose(optics: Optics, views: AnyViews | None, target: TargetConfig) -> tuple[KeyPath, UserError] | None:
-    """Return the mistake of the first pose (of several views the first view) from which the camera sees nothing of the
-    face, or none of it within its range; and the key that it concerns."""
+    """Return the mistake of the first pose that sees nothing of the face within range, and the key that it concerns."""
     try:
         poses = (target.pose,) if views is None else poses_of(views, target.pose)
     except ValidationError as error:
@@ -189,17 +174,16 @@ def _unseen_pose(optics: Optics, views: AnyViews | None, target: TargetConfig) -
 
 def _mapping_problems(config: ExperimentConfig, simulated: SimulatedSource, source: Source) -> Iterator[Problem]:
     """Find what does not fit between several views and their mapping into one cloud."""
-    if simulated.views is None and config.mapping is not None:
+    views, mapping = simulated.views, config.mapping
+    if views is None and mapping is not None:
         fix = "declare source.views, for instance {kind: arc, count: 3, spread_deg: 40.0}"
         yield Problem("a mapping needs several views", source.place_of(("mapping",)), fix=fix)
-    elif simulated.views is not None and config.mapping is None:
+    elif views is not None and mapping is None:
         fix = "declare mapping, for instance {registration: {method: marks}, merge: {kind: fusion}}"
-        yield Problem("several views need a mapping into one cloud", source.place_of(("source", "views")), fix=fix)
-    elif simulated.views is not None and config.mapping is not None and config.mapping.views is not None:
-        there = view_count(simulated.views)
-        if config.mapping.views > there:
-            place = source.place_of(("mapping", "views"))
-            yield Problem(f"{config.mapping.views} views, but source.views has {there}", place, legal=f"1 to {there}")
+        yield Problem("several views need a mapping into one cloud", source.place_of(VIEWS), fix=fix)
+    elif views is not None and mapping is not None and (mapping.views or 0) > (there := view_count(views)):
+        place = source.place_of(("mapping", "views"))
+        yield Problem(f"{mapping.views} views, but source.views has {there}", place, legal=f"1 to {there}")
 
 
 def _flat_field_problems(config: ExperimentConfig, simulated: SimulatedSource, source: Source) -> Iterator[Problem]:
@@ -217,8 +201,7 @@ def _flat_field_problems(config: ExperimentConfig, simulated: SimulatedSource, s
 def _capture_problems(config: ExperimentConfig, capture: CaptureSource, source: Source) -> Iterator[Problem]:
     """Find files that are not there or cannot be read, and what only a simulated source can have."""
     missing = [number for number, name in enumerate(capture.paths) if not Path(name).exists()]
-    for number in missing:
-        path = Path(capture.paths[number])
+    for number, path in ((number, Path(capture.paths[number])) for number in missing):
         near = nearest(path.name, [file.name for file in path.parent.glob("*")])
         place = source.place_of(("source", "paths", number))
         yield Problem(f"{path}: there is no such file or folder", place, nearest=near)

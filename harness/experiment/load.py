@@ -12,17 +12,14 @@ from harness.experiment.schema import DETECTOR_SETTINGS, Experiment, ValuesVaria
 from harness.experiment.unfold import OPTION, overridden, set_path, unfolded
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.diagnose import dotted
-from harness.vocabulary.declaration.yaml_source import DeclarationError, KeyPath, Problem, Source, read_yaml, to_yaml
+from harness.vocabulary.declaration.yaml_source import DeclarationError, KeyPath, Source, read_yaml, to_yaml
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import shipped
 from harness.vocabulary.provenance import check_version, stamp_of, stamped
 from scenes.sensor.camera import CameraConfig, camera_names, is_camera_path, load_camera, numbers_of_lens
 
-EXPERIMENT_VERSION = 1
-"""Version of the resolved experiment in a result folder; raised when a key changes its meaning."""
+EXPERIMENT_VERSION = 1  # Version of the resolved experiment in a result folder; raised when a key changes its meaning
 STAMP_KIND = "experiment"
-RESERVED = {"con", "prn", "aux", "nul", *(f"{port}{number}" for port in ("com", "lpt") for number in range(10))}
-"""Devices on Windows: no folder of results can be called so there."""
 
 
 def load_experiment(path: Path, overrides: Sequence[str] = (), calibration: Path | None = None) -> Experiment:
@@ -40,18 +37,13 @@ def load_experiment(path: Path, overrides: Sequence[str] = (), calibration: Path
     source = _with_absolute_paths(source, path.resolve().parent)
     if calibration is not None:
         source = _with_calibration(source, calibration)
-    name = source.data.get("name")
-    if isinstance(name, str) and name.lower() in RESERVED:
-        message = f"`name` is {name}, which is a device's name on Windows"
-        problems.append(Problem(message, source.place_of(("name",)), fix="choose another name"))
     config, invalid = checks.resolved(source)
     problems += invalid
     points, unfolding = unfolded(source, None if problems else config)
     if problems or unfolding or config is None:
         raise DeclarationError(str(path), [*problems, *unfolding])
-    data, study = config.to_data(), config.sensitivity
-    varied = [*config.sweep]
-    for variation in study.vary if study else ():
+    data, varied = config.to_data(), [*config.sweep]
+    for variation in config.sensitivity.vary if config.sensitivity else ():
         varied += [variation.path] if isinstance(variation, ValuesVariation) else [*variation.set]
     if any(each.startswith("detector") for each in varied):
         # a detector may fill some settings from others (a preset): written out they would count beside a varied preset
@@ -60,8 +52,7 @@ def load_experiment(path: Path, overrides: Sequence[str] = (), calibration: Path
 
 
 def _experiment_file(path: Path) -> Path:
-    """Return the file that a path or name means: ``averaging`` is the one that comes with tofpod where there is no file
-    of that name. Raises UserError for a name that is neither."""
+    """Return the file that a path means, or a name such as ``averaging`` that comes with tofpod. Raises UserError."""
     if path.exists() or path.name != str(path):
         return path
     own = shipped("experiments") / f"{path.name.removesuffix('.yaml')}.yaml"

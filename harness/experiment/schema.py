@@ -36,8 +36,7 @@ if TYPE_CHECKING:
 MAX_FRAMES = 10_000
 MAX_REPEATS = 100_000
 MAX_BOARDS = 10_000
-DEFAULT_RATE_PER_M2 = 1.0
-"""False calls per square metre that a study's threshold is calibrated to."""
+DEFAULT_RATE_PER_M2 = 1.0  # False calls per square metre that a study's threshold is calibrated to
 
 Repeats = Annotated[int, Field(ge=1, le=MAX_REPEATS)]
 Frames = Annotated[int, Field(ge=1, le=MAX_FRAMES)]
@@ -79,12 +78,10 @@ class CaptureConfig(Config):
     frames: Frames
     average: AverageConfig = AverageConfig()
     flat_field: FlatFieldConfig | None = Field(
-        None,
-        description="a plane that the unit is shown first: the pattern found there is taken off",
+        None, description="a plane that the unit is shown first: the pattern found there is taken off"
     )
     exact: bool = Field(
-        False,
-        description="draw each simulated frame; false: a mean is drawn at once where that is equal in distribution",
+        False, description="draw each simulated frame; false: a mean at once where that is equal in distribution"
     )
 
 
@@ -174,12 +171,11 @@ class SensitivityConfig(Config):
 
 
 class StudyConfig(Config):
-    """A study of the probability of detection: the target is a family of boards, each one drawn at random. ``boards``
-    with damage, and ``hole_free_boards`` of their own on which false calls are counted. Every point of the experiment
-    is judged on the same boards; ``repeats`` of the experiment draw the noise anew on each.
+    """A study of the probability of detection on random boards: ``boards`` with damage, and ``hole_free_boards`` on
+    which false calls are counted; every point is judged on the same, and ``repeats`` draw the noise anew on each.
 
-    ``units`` draws units of the camera, each with a fixed pattern of its own: every damaged board is inspected by all
-    of them, every other board, those that set the threshold too, by a unit of its own."""
+    ``units`` draws cameras with patterns of their own: every damaged board is inspected by all, every other by its own.
+    """
 
     boards: Boards
     hole_free_boards: Boards
@@ -219,7 +215,6 @@ class ExperimentConfig(Config):
         return self.source
 
 
-DETECTOR_NAME = ("detector", "name")
 DETECTOR_SETTINGS = ("detector", "settings")
 
 
@@ -236,8 +231,7 @@ def declared_of(data: Any) -> shape.Declared:
     return shape.Declared(ExperimentConfig, data, splices_of(data))
 
 
-MAIN = "main"
-"""The only set-up of an experiment whose only axis, if any, is the number of frames."""
+MAIN = "main"  # The only set-up of an experiment whose only axis, if any, is the number of frames
 NO_NUMBERS = ("name", "title", "repeats", "study", "sweep", "draws", "switches", "sensitivity")
 """Keys that decide which trials are run, not what a trial gives."""
 
@@ -245,18 +239,15 @@ NO_NUMBERS = ("name", "title", "repeats", "study", "sweep", "draws", "switches",
 @dataclass(frozen=True)
 class Point:
     """A resolved experiment without axes. ``values``: dotted path -> value, for the paths that make the point.
-    ``variant`` is the label of its set-up ("main" where there is one only) or of a variation; ``label`` tells points
-    apart in tables. ``axes``: resolved value of every axis but the number of frames, which is what tells set-ups apart.
-    ``is_variation``: whether it belongs to the sensitivity study; ``reference`` is then the set-up to compare it with,
-    the one with the same ``axes`` (empty where none has them), else the point's own set-up. ``digest`` names the
-    point's numbers, ``frames_key`` those of its frames (source and seed), ``render_key`` those of its render."""
+    ``variant``: label of its set-up or variation; ``label`` tells points apart. ``axes``: resolved values of all axes
+    but the number of frames, which tell set-ups apart. ``reference``: of a variation the set-up with the same ``axes``
+    ("" for none), else the point's own. ``digest`` names the point's numbers, ``frames_key`` those of its frames."""
 
     label: str
     variant: str
     values: Mapping[str, Any]
     config: ExperimentConfig
     digest: str
-    render_key: str
     frames_key: str
     axes: Mapping[str, Any] = field(default_factory=dict)
     is_variation: bool = False
@@ -290,13 +281,12 @@ def point_of(label: str, variant: str, values: Mapping[str, Any], config: Experi
         files = [[file.name, file_digest(file)] for file in recording_of(source).files]
         camera_name = lens_names().get(source.intrinsics or "")
         named = load_camera(camera_name).lens.to_data() if camera_name else None
-        render = frames = {"kind": source.kind, "files": files, "unit": source.unit, "lens": named}
+        frames = {"kind": source.kind, "files": files, "unit": source.unit, "lens": named}
     else:
         # the full target (of a family of boards what they are drawn from) and the camera's numbers
         drawn = isinstance(source.target, DrawnTargetConfig)
         target = source.target.to_data() if drawn else source.target.declare().to_data()
         camera, work = camera_of(source.camera), source.render.to_data()
-        render = {"target": target, "optics": camera.optics.content(), "render": work}
         frames = {"kind": source.kind, "target": target, "render": work}
         frames["camera"] = {**source.camera.to_data(), "name": camera.name, "facts": camera_digest(camera)}
         frames |= {} if source.views is None else {"views": source.views.to_data()}
@@ -305,7 +295,7 @@ def point_of(label: str, variant: str, values: Mapping[str, Any], config: Experi
     offer = DETECTORS.offer(config.detector.name)
     numbers |= {} if offer.built_in else {"detector_from": offer.origin}
     frames_key = digest({"source": frames, "seed": config.seed})
-    return Point(label, variant, values, config, digest(numbers), digest(render), frames_key)
+    return Point(label, variant, values, config, digest(numbers), frames_key)
 
 
 def detector_version(config: ExperimentConfig) -> int:
@@ -316,8 +306,7 @@ def detector_version(config: ExperimentConfig) -> int:
 
 @lru_cache(maxsize=1000)
 def recording_of(source: CaptureSource) -> Recording:
-    """Open the recording behind a source, its first frame read and checked. Raises UserError for faults of its files.
-    ``intrinsics`` may name a camera, whose nominal lens then counts."""
+    """Open the recording behind a source, its first frame read and checked. Raises UserError for its files."""
     from detectors.recordings import open_capture  # brings the readers of every format
 
     name = source.intrinsics

@@ -1,7 +1,5 @@
-"""Dotted paths and ``--set path=value``; axes, switches and variations unfolded into points.
-
-Each point is validated, and problems stand at the value that causes them. Set-ups of an experiment differ in the axes
-other than the number of frames."""
+"""Dotted paths and ``--set path=value``; axes, switches and variations unfolded into points, each validated, with
+problems at the value that causes them. Set-ups differ in the axes other than the number of frames."""
 
 from __future__ import annotations
 
@@ -22,8 +20,7 @@ from harness.vocabulary.path_names import differing, names_of, on_one_line, valu
 from harness.vocabulary.seeds import canonical_json, random_stream
 
 OPTION = "--set"
-NOT_VARIED = ("sweep", "sensitivity")
-"""Keys that hold dotted paths themselves."""
+NOT_VARIED = ("sweep", "sensitivity")  # Keys that hold dotted paths themselves
 
 
 class PathError(UserError):
@@ -39,10 +36,9 @@ def key_path(text: str) -> KeyPath:
 
 
 def set_path(data: Any, path: KeyPath, value: Any, declared: shape.Declared | None = None, above: KeyPath = ()) -> Any:
-    """Return ``data`` with the value at ``path`` replaced or added; the argument itself stays unchanged. A mapping that
-    is missing on the way is filled with its declared defaults where ``declared`` is given, so that setting one key of
-    it leaves the others at what they would have been. Likewise a key that says which of several kinds a mapping is
-    (``merge.kind``) leaves out what only the former kind has. ``above`` is where ``data`` stands in the declared data.
+    """Return ``data`` with the value at ``path`` replaced or added; the argument stays unchanged. With ``declared``, a
+    mapping missing on the way is filled with its defaults, so that one key leaves the others as they would have been,
+    and a new kind of a mapping (``merge.kind``) leaves out what only the former has. ``above``: where ``data`` stands.
     Raises PathError where the way is barred."""
     if not path:
         return value
@@ -114,13 +110,10 @@ def overridden(source: Source, overrides: Sequence[str], declared_of: shape.Decl
     return source, problems
 
 
-MAX_POINTS = 10_000
-"""More than a machine works through in a week; beyond it an axis was mistyped."""
-MAX_SHOWN = 20
-"""Problems of combinations are found one point at a time and look alike."""
+MAX_POINTS = 10_000  # More than a machine works through in a week; beyond it an axis was mistyped
+MAX_SHOWN = 20  # Problems of combinations are found one point at a time and look alike
 FRAMES = "capture.frames"
-SWITCHES = "switches"
-"""Key of the file that names a mapping of switches."""
+SWITCHES = "switches"  # Key of the file that names a mapping of switches
 FIXED = ("name", "title", "repeats", "study", "sweep", "draws", SWITCHES, "sensitivity")
 """Keys that are the same for all points."""
 
@@ -137,8 +130,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Draft:
-    """A point before its declaration is resolved. ``named_at``: its label in the file where it has one, else its last
-    value; ``frames``: a variation's own numbers of frames."""
+    """An unresolved point. ``named_at``: its label in the file, else its last value; ``frames``: a variation's."""
 
     label: str
     variant: str
@@ -149,8 +141,7 @@ class Draft:
 
 
 def unfolded(source: Source, config: ExperimentConfig | None) -> tuple[tuple[Point, ...], list[Problem]]:
-    """Return all points of an experiment in order, or all problems of its axes and variations. ``config`` is None where
-    the rest of the file is not valid: then axes are checked as far as they can be."""
+    """Return all points in order, or all problems of axes and variations. ``config`` None: the rest is wrong."""
     sweep = shape.child(source.data, "sweep")
     axes = [
         [Setting(path, value, ("sweep", path, index)) for index, value in enumerate(values)]
@@ -242,12 +233,10 @@ def _variation_problems(variations: list[Draft], axes: list[list[Setting]], sour
     # variations at a number of frames that the main experiment does not have could be compared with nothing
     main = [setting.value for axis in axes for setting in axis if setting.path == FRAMES]
     main = main or [shape.get(source.data, ("capture", "frames"))]
-    written = _frame_settings(shape.get(source.data, ("sensitivity", "frames")), ("sensitivity", "frames"))
-    for setting in written:
+    at = ("sensitivity", "frames")
+    for setting in _frame_settings(shape.get(source.data, at), at):
         if setting.value not in main:
-            message = (
-                f"{setting.value} frames are not run in the main experiment, so that there is nothing to compare with"
-            )
+            message = f"{setting.value} frames are not run in the main experiment: there is nothing to compare with"
             yield Problem(message, source.place_of(setting.written_at), "of " + ", ".join(map(str, main)))
 
 
@@ -287,14 +276,11 @@ def _drafts(
     axes: list[list[Setting]], telling: list[str], variations: list[Draft], config: ExperimentConfig
 ) -> Iterator[Draft]:
     """Yield the product of the axes, the last one fastest; then every variation at every number of frames."""
-    names = names_of(telling)
-    told = {
-        id(one): one.name
-        or f"{names[one.path]}={value_text(one.path, differing(one.value, (other.value for other in axis)))}"
-        for axis in axes
-        for one in axis
-        if one.path in telling
-    }
+    names, told = names_of(telling), dict[int, str]()
+    for axis in axes:
+        for one in axis if axis[0].path in telling else ():
+            value = value_text(one.path, differing(one.value, (other.value for other in axis)))
+            told[id(one)] = one.name or f"{names[one.path]}={value}"
     chosen = list(product(*axes))
     if config.draws is not None:
         groups: dict[str, list[tuple[Setting, ...]]] = {}

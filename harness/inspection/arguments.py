@@ -34,8 +34,7 @@ LEGAL_CROP = "auto, none, box:x0,x1,y0,y1,z0,z1 (mm, camera frame), polygon:u,v,
 
 
 def refuse_misfits(arguments: argparse.Namespace, paths: list[Path]) -> None:
-    """Raise UserError for arguments that contradict each other: those of several views for one capture, and those of
-    one capture for several views."""
+    """Raise UserError for arguments of several views with one capture, and the other way round."""
     several = f"--register {'|'.join(METHODS)}"
     if arguments.register is None:
         given = [name for name in ("merge", "marks", "poses") if getattr(arguments, name) is not None]
@@ -107,8 +106,7 @@ def mapping_of(arguments: argparse.Namespace) -> MappingConfig:
 
 
 def crop_from_text(text: str, target: int | None = None) -> dict[str, Any]:
-    """Return the crop's declaration from ``auto``, ``none``, ``box:..`` or ``polygon:..``, with the number of the
-    automatic crop's candidate where one is chosen. Raises UserError on anything else."""
+    """Return the crop's declaration from text, with the automatic crop's candidate. Raises UserError."""
     kind, _, values = text.partition(":")
     if target is not None and text != "auto":
         what = f"--target {target}: chooses among what --crop auto finds, and --crop {text} is another crop"
@@ -121,10 +119,9 @@ def crop_from_text(text: str, target: int | None = None) -> dict[str, Any]:
     if kind in ("auto", "none") and not numbers:
         return {"kind": kind} if target is None else {"kind": kind, "target": target}
     if kind == "box" and len(numbers) == 6:
-        for axis, (low, high) in zip("xyz", pairs, strict=True):
-            if not low < high:
-                what = f"--crop {text}: {axis}0 = {low:g} is not below {axis}1 = {high:g}"
-                raise UserError(what, legal=LEGAL_CROP, fix="state the smaller bound of each axis first")
+        if not all(low < high for low, high in pairs):
+            what = f"--crop {text}: a lower bound is not below the upper one"
+            raise UserError(what, legal=LEGAL_CROP, fix="state the smaller bound of each axis first")
         return {"kind": "box", "x_mm": pairs[0], "y_mm": pairs[1], "z_mm": pairs[2], "range_max_m": None}
     if kind == "polygon" and len(numbers) >= 6 and len(numbers) % 2 == 0:
         return {"kind": "polygon", "vertices_px": pairs}
@@ -149,8 +146,7 @@ def assign(settings: dict[str, Any], assignment: str) -> None:
 
 
 def opened(paths: Sequence[Path], intrinsics: str | None, lens: Lens | None = None, **reading: Any) -> Recording:
-    """Open a capture; ``intrinsics`` names a file, or a camera, whose nominal lens then counts. ``reading``: the other
-    options of `detectors.recordings.open_capture`."""
+    """Open a capture. ``intrinsics``: a file or a camera; ``reading``: options of `open_capture`."""
     from detectors.recordings import open_capture
 
     file = None if intrinsics is None else Path(intrinsics)
@@ -165,9 +161,6 @@ def opened(paths: Sequence[Path], intrinsics: str | None, lens: Lens | None = No
     return open_capture(list(paths), intrinsics=file, lens=lens, **reading)
 
 
-# ---------------------------------------------------------------- poses
-
-
 POSES_KEY = "T_reference_view"  # key of the list in a file of `harness.export`, beside the file's version
 LEGAL_POSES = (
     "JSON: a list with a 4x4 matrix (metres, last row 0 0 0 1) for each view, all to one common frame, bare or"
@@ -175,17 +168,13 @@ LEGAL_POSES = (
     " `timestamp tx ty tz qx qy qz qw`, one for each view"
 )
 RIGID_WITHIN = 1e-4  # tolerance of R R' = 1 and of the quaternion's length: poses are written with four digits and more
-FARTHEST_M = 100.0
-"""Largest distance of two views of one target: several times any such camera's range. Poses in millimetres lie beyond.
-"""
+FARTHEST_M = 100.0  # Largest distance of two views of one target: poses in millimetres lie beyond
 
 
 def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
-    """Return ``T_first_view`` (4, 4) of each view, the first the identity, from poses to any common frame.
-
-    Raises UserError where the file cannot be read, is larger than `limits.TEXT_BYTES` or of a newer version, holds
-    another number of poses, one that is not rigid, or one farther than `FARTHEST_M` from the first.
-    """
+    """Return ``T_first_view`` (4, 4) of each view, the first the identity, from poses to any common frame. Raises
+    UserError where the file cannot be read or is a newer version's, has another number of poses, or one not rigid or
+    too far."""
     import numpy as np
 
     from harness.vocabulary.geometry import invert

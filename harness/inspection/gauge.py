@@ -25,9 +25,7 @@ if TYPE_CHECKING:
 
 GAUGE_VERSION = 1
 FEWEST_MARKS = 3
-SIDES = 8
-"""Directions in which judged points must lie within the hit radius of a hole's rim: else the crop took the hole for the
-edge, or an object covers it, and a miss would say nothing of its size."""
+SIDES = 8  # Directions around a hole in which judged points must lie: else a miss says nothing of its size
 WORST_FIT_MM = 2.0
 """Root mean square distance of marks from where the board has them, beyond which the board's place is doubtful."""
 Length = Annotated[float, Field(gt=0, le=5e3)]
@@ -86,8 +84,7 @@ def read_gauge(path: Path) -> Gauge:
 
 @dataclass(frozen=True)
 class GaugeRow:
-    """One hole of a board in a capture. ``found``: "hit", "miss", or "NA" where not all around it was judged;
-    ``offset_mm`` and ``score`` of the finding that hit it, None of others."""
+    """A hole in a capture. ``found`` "NA": not all around it was judged; ``offset_mm`` and ``score`` of the hit."""
 
     board: str
     hole: GaugeHole
@@ -129,15 +126,12 @@ class GaugeSeen:
     def answer(self) -> str:
         """The counts in a sentence."""
         count = {state: sum(row.found == state for row in self.rows) for state in ("hit", "miss", "NA")}
-        return (
-            f"gauge: {count['hit']} hits, {count['miss']} misses, {count['NA']} holes not judged, "
-            f"{self.false_calls} false calls"
-        )
+        hits = f"{count['hit']} hits, {count['miss']} misses, {count['NA']} holes not judged"
+        return f"gauge: {hits}, {self.false_calls} false calls"
 
 
 def seen_on(gauge: Gauge, judged: Judged) -> GaugeSeen:
-    """Find the boards in a judged capture by their marks, and match findings to their holes. Raises UserError where no
-    board shows three marks."""
+    """Find the boards in a judged capture by their marks, match findings to holes. Raises UserError without one."""
     from dataclasses import replace
 
     from detectors.marks.find import find_marks
@@ -164,9 +158,8 @@ def seen_on(gauge: Gauge, judged: Judged) -> GaugeSeen:
         fit_mm = float(np.sqrt((apart_m**2).mean())) / MM
         notes.append(f"{board.name}: {len(marks)} marks, {fit_mm:.2f} mm from where the board has them")
         if fit_mm > WORST_FIT_MM:
-            warnings.append(
-                f"{board.name}: its marks are {fit_mm:.1f} mm off: was it printed at 100 %, and is it flat?"
-            )
+            doubt = f"its marks are {fit_mm:.1f} mm off: was it printed at 100 %, and is it flat?"
+            warnings.append(f"{board.name}: {doubt}")
         own, beside = _matched(board, gauge.hit_radius_mm * MM, judged, invert(T_camera_board))
         if unjudged := [str(row.hole.id) for row in own if row.found == "NA"]:
             told = "is not judged all around, as near the edge of what is judged: it counts neither as hit nor as miss"

@@ -16,16 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from harness.inspection import arguments as asked
 from harness.inspection import told
-from harness.inspection.arguments import (
-    DEFAULT_FALSE_CALLS,
-    PREFIX,
-    detector_of,
-    mapping_of,
-    opened,
-    read_poses,
-    refuse_misfits,
-)
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM
 from harness.vocabulary.provenance import RESULTS_VERSION
@@ -44,8 +36,7 @@ if TYPE_CHECKING:
     from harness.vocabulary.geometry import Cloud
 
 DEFAULT_K = 5.0
-"""Robust standard deviations, where the capture cannot tell better: of a million normal pixels 0.6 lie beyond by
-chance. Real surfaces are not that kind."""
+"""Robust standard deviations, where the capture cannot tell better; of a million normal pixels 0.6 lie beyond."""
 FAINT_CALLS = 0.05
 """Expected false calls as strong as a finding, in the capture, from which on noise explains the finding."""
 FAINT_PEAKS = 20  # peaks below which their number does not tell how fast it falls with the score
@@ -85,9 +76,7 @@ def refuse_thresholds(arguments: argparse.Namespace) -> None:
     """Raise UserError where several arguments set the threshold, or where its value is none."""
     given = [f"--{name.replace('_', '-')}" for name in THRESHOLDS if getattr(arguments, name) is not None]
     if len(given) > 1:
-        raise UserError(
-            f"{' and '.join(given)} {'both' * (len(given) == 2) or 'all'} set the threshold", fix="give one of them"
-        )
+        raise UserError(f"{' and '.join(given)} set the threshold", fix="give one of them")
     for name, value in (("threshold", arguments.threshold), ("false-calls", arguments.false_calls)):
         if value is not None and not 0 < value < float("inf"):
             raise UserError(f"--{name} {value:g}", legal="a number above 0")
@@ -113,7 +102,7 @@ def threshold_of(
     if default is not None and arguments.false_calls is None:
         return float(default), "the detector's own", evidence
 
-    own = own_threshold(detector, cloud, evidence, arguments.false_calls or DEFAULT_FALSE_CALLS)
+    own = own_threshold(detector, cloud, evidence, arguments.false_calls or asked.DEFAULT_FALSE_CALLS)
     names = ("threshold", "expected", "low", "high", "peaks", "floor", "objects", "rim_pixels")
     notes = {**evidence.notes, "own_null": {name: getattr(own, name) for name in names}}
     told = f"{own.peaks} peaks towards the camera"
@@ -145,10 +134,9 @@ def with_faint_told(judged: Judged, threshold: float) -> Judged:
     faint = [str(each.id) for each in judged.findings if each.kind != "no return" and each.score < sure]
     if len(faint) <= max(null["expected"], 1.0) + 1e-6:
         return judged
-    warning = (
-        f"{len(faint)} of {len(judged.findings)} findings ({', '.join(faint)}) are so faint that noise explains them:"
-        f" {_calls(null['expected'])} false calls are expected, with scores up to about {sure:.2g}"
-    )
+    which = f"{len(faint)} of {len(judged.findings)} findings ({', '.join(faint)})"
+    calls = f"{_calls(null['expected'])} false calls are expected, with scores up to about {sure:.2g}"
+    warning = f"{which} are so faint that noise explains them: {calls}"
     evidence = replace(judged.evidence, warnings=(*judged.evidence.warnings, warning))
     return replace(judged, evidence=evidence)
 
@@ -157,20 +145,15 @@ def _calls(expected: float) -> str:
     return f"{expected:.1f}" if expected >= 0.1 else f"{expected:.1g}" if expected >= 1e-4 else "0"
 
 
-# ---------------------------------------------------------------- the program
-
-
 START_FROM_MARKS = ("icp", "cpd")
-"""Methods that need a place to start from. `joint` finds its own by marks, `odometry` uses none and goes from view to
-view, `nominal` has nothing but the poses."""
+"""Methods that need a place to start from; `joint` finds its own, `odometry` goes from view to view."""
 LOOPING = ("marks", "icp", "cpd")
 """Methods that register any two views to each other by themselves, so that going round a loop can be wrong."""
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """Everything that a run knows when it is time to tell it. ``mapped`` is None for one capture; ``registrations``:
-    data of registrations.json."""
+    """What a run knows when it is told. ``mapped`` None: one capture; ``registrations``: data of registrations.json."""
 
     arguments: argparse.Namespace
     recordings: list[Recording]
@@ -193,23 +176,20 @@ class Inspection:
 
 
 def inspect(arguments: argparse.Namespace) -> int:
-    """Open, average, register and merge where there are several views, judge; print, and write with --out. Returns 0.
-
-    Raises UserError for faults of the files, where a view cannot be registered, and where nothing can be judged.
-    """
+    """Open, average, register and merge views, judge, print, and write with --out. Returns 0. Raises UserError."""
     from detectors.flat_field import doubts, load_flat_field
     from detectors.views import View
     from harness.inspection.gauge import read_gauge, seen_on
 
-    config = mapping_of(arguments) if arguments.register is not None else None
+    config = asked.mapping_of(arguments) if arguments.register is not None else None
     paths = arguments.paths[: config.views] if config else arguments.paths
-    refuse_misfits(arguments, paths)
+    asked.refuse_misfits(arguments, paths)
     refuse_thresholds(arguments)
-    own_settings = [each for each in arguments.set if config is None or not each.startswith(PREFIX)]
-    detector, settings = detector_of(arguments, "none" if config else arguments.crop, own_settings)
+    own_settings = [each for each in arguments.set if config is None or not each.startswith(asked.PREFIX)]
+    detector, settings = asked.detector_of(arguments, "none" if config else arguments.crop, own_settings)
     gauge = read_gauge(arguments.gauge) if arguments.gauge else None
     field = load_flat_field(arguments.flat_field) if arguments.flat_field else None
-    guesses = read_poses(arguments.poses, len(paths)) if arguments.poses else (None,) * len(paths)
+    guesses = asked.read_poses(arguments.poses, len(paths)) if arguments.poses else (None,) * len(paths)
     recordings = [_opened(arguments, group) for group in ([[path] for path in paths] if config else [paths])]
     quiet = [] if arguments.quiet_capture is None else [_opened(arguments, [arguments.quiet_capture])]
 
@@ -236,18 +216,14 @@ def inspect(arguments: argparse.Namespace) -> int:
 
     evidence = analysed(detector, cloud)
     if field is not None:
-        told_of_field = dict.fromkeys(
-            each for view in views for each in doubts(view.cloud, field, arguments.flat_field)
-        )
-        evidence = replace(evidence, warnings=(*told_of_field, *evidence.warnings))
+        doubted = dict.fromkeys(each for view in views for each in doubts(view.cloud, field, arguments.flat_field))
+        evidence = replace(evidence, warnings=(*doubted, *evidence.warnings))
     threshold, origin, evidence = threshold_of(arguments, detector, cloud, evidence, silent_threshold)
     result = judged(detector, cloud, evidence, threshold)
     result = result if mapped else with_faint_told(result, threshold)
     seen = seen_on(gauge, result) if gauge else None
-    run = Inspection(
-        arguments, recordings, choices, config, mapped, registrations, detector, settings, result, threshold, origin,
-        seen,
-    )  # fmt: skip
+    found = (mapped, registrations, detector, settings, result, threshold, origin, seen)
+    run = Inspection(arguments, recordings, choices, config, *found)
     _print(run)
     if arguments.out is not None:
         _write(run, _facts(run, [*recordings, *quiet]))
@@ -257,7 +233,9 @@ def inspect(arguments: argparse.Namespace) -> int:
 def _opened(arguments: argparse.Namespace, paths: Sequence[Path]) -> Recording:
     names = ("unit", "topic", "array", "pitch", "raw")
     frames = slice(arguments.max_frames) if arguments.max_frames else None
-    return opened(paths, arguments.intrinsics, frames=frames, **{name: getattr(arguments, name) for name in names})
+    return asked.opened(
+        paths, arguments.intrinsics, frames=frames, **{name: getattr(arguments, name) for name in names}
+    )
 
 
 def _averaged(arguments: argparse.Namespace, recording: Recording, field: FlatField | None) -> Cloud:
@@ -282,9 +260,6 @@ def _mistakes_named(view: View | None) -> Iterator[None]:
         raise UserError(f"view {view.name}: {mistake.message}", legal=mistake.legal, fix=mistake.fix) from mistake
 
 
-# ---- several views as one cloud --------------------------------------------------------------------------------------
-
-
 def _merged(
     arguments: argparse.Namespace,
     config: MappingConfig,
@@ -292,11 +267,8 @@ def _merged(
     views: Sequence[View],
     choices: Sequence[Choice | None],
 ) -> tuple[Mapped, dict[str, Any]]:
-    """Find targets and marks, which are told at once as they explain later failures, then register and merge. Returns
-    the data of registrations.json, too.
-
-    Raises UserError where a view has no target, or names each view that cannot be placed, and why.
-    """
+    """Find targets and marks, told at once as they explain later failures, then register and merge; return also the
+    data of registrations.json. Raises UserError where a view has no target, or for each view that cannot be placed."""
     from detectors.mapping.merge import Mapped, merge, prepare
     from detectors.registration.by_marks import register_by_marks
     from detectors.registration.register import register
@@ -326,12 +298,10 @@ def _merged(
     failed = [each for each in registrations if each.failure]
     if failed:
         reasons = "\n  ".join(f"{each.view}: {each.failure.removeprefix(f'{each.view}: ')}" for each in failed)
-        pose = "correct --poses where it is wrong" if has_poses else "state where they stand (--poses)"
         several = f"{len(failed)} of {len(registrations)} views" if len(failed) > 1 else "one view"
-        raise UserError(
-            f"{several} cannot be registered to {registrations[0].view} by {failed[0].method}:\n  {reasons}",
-            fix=f"leave such views out, {pose}, or choose another --register or --marks",
-        )
+        said = f"{several} cannot be registered to {registrations[0].view} by {failed[0].method}:\n  {reasons}"
+        pose = "correct --poses where it is wrong" if has_poses else "state where they stand (--poses)"
+        raise UserError(said, fix=f"leave such views out, {pose}, or choose another --register or --marks")
     mapped = Mapped(tuple(prepared), registrations, merge(tuple(prepared), registrations, config.merge))
     return mapped, _registration_data(config, mapped)
 
@@ -364,9 +334,6 @@ def _registration_data(config: MappingConfig, mapped: Mapped) -> dict[str, Any]:
             "marks": len(view.marks.trusted),
             "marks_doubtful": len(view.marks.marks) - len(view.marks.trusted),
             "pairs": each.pairs,
-            "iterations": each.iterations,
-            "converged": each.converged,
-            "seconds": round(each.seconds, 4),
             "notes": each.notes,
         }
 
@@ -381,7 +348,6 @@ def _registration_data(config: MappingConfig, mapped: Mapped) -> dict[str, Any]:
             " both in the first view's frame",
         },
         "T_reference_cloud": np.asarray(mapped.merged.T_reference_cloud).tolist(),
-        "merge_seconds": round(mapped.merged.seconds, 4),
         "views": list(map(row, mapped.views, mapped.registrations)),
         "loops": [
             {
@@ -393,9 +359,6 @@ def _registration_data(config: MappingConfig, mapped: Mapped) -> dict[str, Any]:
             for loop in (loop_errors(mapped.views, config.registration) if is_looping else ())
         ],
     }
-
-
-# ---- what is told ----------------------------------------------------------------------------------------------------
 
 
 def _print(run: Inspection) -> None:
@@ -434,8 +397,7 @@ def _print(run: Inspection) -> None:
 
 
 def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
-    """Return the facts that the JSON holds beside the findings, with command, code, versions, and the content of every
-    file that can change a number (those of ``recordings``, and the poses)."""
+    """Return the facts that the JSON holds beside the findings, with the origin and digests of all files read."""
     from harness.vocabulary.provenance import record
 
     evidence, arguments = run.result.evidence, run.arguments
@@ -460,13 +422,10 @@ def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
         with path.open("rb") as stream:
             files.append({"path": str(path), "sha256": hashlib.file_digest(stream, "sha256").hexdigest()})
     scale_mm = evidence.scale_m / MM
+    threshold_mm = None if evidence.unit else run.threshold * scale_mm
     return {
         **facts,
-        "threshold": {
-            "k": run.threshold,
-            "mm": None if evidence.unit else run.threshold * scale_mm,
-            "from": run.origin,
-        },
+        "threshold": {"k": run.threshold, "mm": threshold_mm, "from": run.origin},
         "warnings": evidence.warnings,
         "missing_returns": None if run.result.missing is None else run.result.missing.facts,
         "surface": {"one_unit_of_score_mm": scale_mm, **evidence.notes},

@@ -48,9 +48,6 @@ def print_notes(notes: Iterable[str]) -> None:
         print(f"note: {note}")
 
 
-# ---- captures --------------------------------------------------------------------------------------------------------
-
-
 def print_capture(recording: Recording, cloud: Cloud, name: str, kept: np.ndarray, crop: str) -> None:
     """Print the frames, those left out, and the points that the crop keeps (``kept``, of the cloud), a line each."""
     height, width = cloud.valid.shape
@@ -59,10 +56,8 @@ def print_capture(recording: Recording, cloud: Cloud, name: str, kept: np.ndarra
     print(recording.unit_text)
     print_notes(recording.notes)
     if cloud.noise_reach_px > WIDEST_NATIVE_PX:
-        print(
-            f"note: {cloud.noise_reach_px:.0f} pixels share their noise: the depth was upsampled, aligned to"
-            " another camera or smoothed; sizes are taken with a blur of that many pixels"
-        )
+        why = "the depth was upsampled, aligned to another camera or smoothed; sizes are taken with that blur"
+        print(f"note: {cloud.noise_reach_px:.0f} pixels share their noise: {why}")
     for left in cloud.left_out:
         print(f"left out: {left.name}: {left.why}")
     print(f"crop: {crop} keeps {kept.sum()} of {cloud.valid.sum()} valid points")
@@ -92,12 +87,8 @@ def capture_facts(recording: Recording, cloud: Cloud) -> dict[str, Any]:
     }
 
 
-# ---- the target that the automatic crop took -------------------------------------------------------------------------
-
-
 def choice_by(settings: object, cloud: Cloud) -> Choice | None:
-    """Return the choice of the automatic crop among a detector's or a mapping's settings; None where they have another
-    crop, or none. Raises UserError as the crop does."""
+    """Return the automatic crop's choice by settings; None with another crop. Raises UserError as the crop does."""
     from detectors.crop import AutoCrop, choice_of
 
     config = getattr(settings, "crop", None)
@@ -147,31 +138,24 @@ def pictures(choice: Choice | None, name: str = "targets.png") -> dict[str, Call
     return {name: lambda path: save_targets(path, choice.grid, outlines, texts, choice.taken)}
 
 
-# ---- registrations, surface, threshold and findings ------------------------------------------------------------------
-
-
 def print_registrations(data: Mapping[str, Any]) -> None:
     """Print ``data`` of registrations.json: a table with a view a line, then notes and loops."""
-    digits = {
-        "residual_mm": 3, "overlap": 2, "predicted_in_plane_mm": 3, "predicted_across_mm": 3, "held_out_mark_mm": 3,
-        "pairs": 0, "iterations": 0, "seconds": 3,
+    columns = {
+        "residual mm": ("residual_mm", 3), "overlap": ("overlap", 2), "in plane mm": ("predicted_in_plane_mm", 3),
+        "across mm": ("predicted_across_mm", 3), "held out mm": ("held_out_mark_mm", 3), "pairs": ("pairs", 0),
     }  # fmt: skip
-    heads = ("view", "method", "residual mm", "overlap", "in plane mm", "across mm", "held out mm", "pairs", "steps")
     rows = [
-        (row["view"], row["method"], *(number(row[key], places) for key, places in digits.items()))
+        (row["view"], row["method"], *(number(row[key], digits) for key, digits in columns.values()))
         for row in data["views"]
     ]
     print("registration to the first view (in plane, across: predicted root mean square error over the target)")
-    show([Grid.of((*heads, "s"), rows, left=0)])
+    show([Grid.of(("view", "method", *columns), rows, left=0)])
     for row in data["views"]:
         print_notes(f"{row['view']}: {note}" for note in row["notes"])
-    closed = [loop for loop in data["loops"] if not loop["failure"]]
-    if closed:
+    if closed := [loop for loop in data["loops"] if not loop["failure"]]:
         worst = max(closed, key=lambda loop: loop["translation_mm"])
-        print(
-            f"loops: {len(closed)} of three views; the worst, {' - '.join(worst['views'])}, ends"
-            f" {worst['translation_mm']:.3g} mm and {worst['rotation_deg']:.3f} degrees from where it began"
-        )
+        off = f"{worst['translation_mm']:.3g} mm and {worst['rotation_deg']:.3f} degrees from where it began"
+        print(f"loops: {len(closed)} of three views; the worst, {' - '.join(worst['views'])}, ends {off}")
     broken = [loop for loop in data["loops"] if loop["failure"]]
     print_notes(f"the loop {' - '.join(loop['views'])} is open: {loop['failure']}" for loop in broken)
 
@@ -201,12 +185,8 @@ def print_findings(findings: Sequence[Finding], grid: str = "px") -> None:
     show([Grid.of(heads, rows, left=0)])
 
 
-# ---------------------------------------------------------------- the scene
-
-
 def scene_of(mapped: Mapped, judged: Judged) -> Scene3d:
-    """Return the valid points of the merged cloud in its own frame (x right, y down, z away), millimetres, with a ring
-    around each finding of known size."""
+    """Return the merged cloud's valid points (x right, y down, z away, mm), with a ring around each finding."""
     cloud, merged = judged.cloud, mapped.merged
     valid = cloud.valid.reshape(-1)
     detected = np.zeros(valid.size, bool)

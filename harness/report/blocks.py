@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 HERE = Path(__file__).parent
 SHOWN_FIRST = (
     *("commit", "dirty", "seed", "started", "machine", "mitsuba_variant"),
-    *("indirect_noise_mm", "renders", "versions"),
+    *("renders", "versions"),
 )
 """Keys of the provenance that a page names in any case, as not recorded where they are missing."""
 MOST_VALUES = 81

@@ -8,8 +8,7 @@ from pydantic import BaseModel, ConfigDict, model_validator
 
 
 class Config(BaseModel):
-    """A declaration. Unknown keys, NaN, infinity, and text or booleans in place of numbers are refused. Fields carry
-    their unit in their name (``width_mm``)."""
+    """A declaration: no unknown keys, NaN, infinity, text or booleans as numbers; units in the fields' names."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -21,8 +20,7 @@ class Config(BaseModel):
 
     @classmethod
     def from_data(cls, data: Any) -> Self:
-        """Validate plain data (dicts, lists, numbers, text: what YAML and JSON hold). Raises pydantic.ValidationError,
-        whose ``loc`` paths match the data's."""
+        """Validate plain data. Raises pydantic.ValidationError, whose ``loc`` are the data's paths."""
         return cls.model_validate(data)
 
     def to_data(self) -> dict[str, Any]:

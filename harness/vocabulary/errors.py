@@ -11,8 +11,7 @@ import threading
 from collections.abc import Callable
 from functools import partial
 
-CLOSED_PIPE = 141
-"""Exit code that a shell reports of a program that SIGPIPE ended: 128 + 13."""
+CLOSED_PIPE = 141  # Exit code that a shell reports of a program that SIGPIPE ended: 128 + 13
 
 
 class UserError(Exception):

@@ -1,8 +1,7 @@
-"""Files: read within limits, as strict JSON; written so that a reader never sees half of one; locked.
+"""Files: read within limits, as strict JSON; written whole or not at all; locked by the system's own locks.
 
 A file may be made to fill the memory: most are refused by what they state, unread; libraries that believe what a file
-states run within `limited_memory`. All limits stand here. Locks are the system's own, so a process that dies gives them
-back, and no clock is asked."""
+states run within `limited_memory`. All limits stand here."""
 
 from __future__ import annotations
 
@@ -29,23 +28,19 @@ ARRAYS_BYTES = 4 << 30
 """All arrays that are unpacked from one ``.npz`` or ``.mat``: 5,800 frames of an Azure Kinect in 16 bits."""
 READING_BYTES = 5 << 30
 """Memory that a library may take while it reads one file: `ARRAYS_BYTES`, and what unpacking them needs beside."""
-PICTURE_BYTES = 512 << 20
-"""A picture's file: what `FRAME_PIXELS` of 48 bits need without compression, and more."""
+PICTURE_BYTES = 512 << 20  # A picture's file: what `FRAME_PIXELS` of 48 bits need without compression, and more
 RECORD_BYTES = 256 << 20
 """A study's record: three million inspections. As Python's values it is some 10 times as large."""
 TEXT_BYTES = 16 << 20
 """A file of settings, poses, a calibration, or a bag's description: those written by programs have some kB."""
-TABLE_BYTES = 256 << 20
-"""A table of inspections: five million rows."""
+TABLE_BYTES = 256 << 20  # A table of inspections: five million rows
 RAISE = "if the file is to be so large, raise the limit in harness/vocabulary/files.py"
 
 
 def size_text(count: int) -> str:
     """Return bytes as text in the unit that is easiest to read."""
-    for unit, factor in (("GiB", 1 << 30), ("MiB", 1 << 20), ("kiB", 1 << 10)):
-        if count >= factor:
-            return f"{count / factor:.4g} {unit}"
-    return f"{count} bytes"
+    units = (("GiB", 1 << 30), ("MiB", 1 << 20), ("kiB", 1 << 10))
+    return next((f"{count / factor:.4g} {unit}" for unit, factor in units if count >= factor), f"{count} bytes")
 
 
 def refuse_bytes(name: str, count: int, at_most: int, what: str = "has", fix: str = RAISE) -> None:
@@ -62,18 +57,15 @@ def refuse_pixels(name: str, width: int, height: int) -> None:
 
 
 def bounded_bytes(path: Path, at_most: int) -> bytes:
-    """Return a file's content. Raises UserError where it is larger than ``at_most``, whatever it says it is (a sparse
-    file, a device, a pipe); OSError as files do."""
+    """Return a file's content. Raises UserError where it is larger, also of a device or pipe; OSError as files do."""
     with Path(path).open("rb") as stream:
         content = stream.read(at_most + 1)
-    if len(content) > at_most:
-        raise UserError(f"{path}: has more than {size_text(at_most)}", legal=f"at most {size_text(at_most)}", fix=RAISE)
+    refuse_bytes(str(path), len(content), at_most, "has at least")
     return content
 
 
 def shipped(kind: str) -> Path:
-    """Return the folder of ``experiments`` or ``baselines`` that come with tofpod: of its checkout, else of the
-    environment that it is installed in."""
+    """Return the folder of ``experiments`` or ``baselines`` of tofpod's checkout, else of the environment."""
     checkout = Path(__file__).resolve().parents[2]
     folder = checkout / ("results/baselines" if kind == "baselines" else kind)
     return folder if folder.is_dir() else Path(sysconfig.get_path("data")) / "share" / "tofpod" / kind
@@ -86,8 +78,7 @@ _LOCK, _WANTED, _BEFORE = threading.Lock(), list[int](), list[tuple[int, int]]()
 @contextmanager
 def limited_memory() -> Iterator[None]:
     """Limit the memory that the process may take inside to `READING_BYTES` more; beyond, MemoryError is raised. The
-    limit (RLIMIT_AS) holds for all threads; where several are inside, or a generator waits inside, the least limit
-    counts. Systems without it or without /proc (macOS, Windows) set none."""
+    limit (RLIMIT_AS) holds for all threads; of several the least counts. Systems without it or /proc set none."""
     try:
         import resource
 
@@ -144,10 +135,9 @@ NOT_WRITABLE |= {errno.ENAMETOOLONG, errno.EINVAL}
 
 @contextmanager
 def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
-    """Yield a temporary path beside ``path`` (same suffix); rename it to ``path`` on success, delete it on failure.
-    ``durable``: the content is on the disk before it has its name, so that a power failure leaves the old file or the
-    new file; what can be made again at no cost may do without. Raises UserError where the folder cannot be written or
-    the disk is full."""
+    """Yield a temporary path beside ``path`` (same suffix); rename it on success, delete it on failure. ``durable``:
+    the content is on the disk before the rename, against power failures. Raises UserError where the folder cannot be
+    written or the disk is full."""
     path = Path(path)
 
     def make() -> str:
@@ -164,8 +154,7 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """Yield an empty temporary folder beside ``path``; rename it to ``path`` on success, delete it on failure. Raises
-    UserError where ``path`` exists and is no empty folder, cannot be written, or the disk is full."""
+    """Yield a new folder beside ``path``, which gets its name on success. Raises UserError where it cannot be."""
     path = Path(path)
     if path.is_dir() and any(path.iterdir()):
         raise UserError(f"{path}: is not empty, and nothing is written over", fix="name a new folder with --out")
@@ -181,8 +170,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _renamed(path: Path, make: Callable[[], str], mode: int) -> Iterator[Path]:
-    """Make something temporary and rename it, with the permissions that the user's umask leaves: tempfile makes
-    everything private."""
+    """Make something temporary and rename it, with the user's umask: tempfile makes everything private."""
     temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -201,17 +189,14 @@ def _renamed(path: Path, make: Callable[[], str], mode: int) -> Iterator[Path]:
 
 def inside(folder: Path, *parts: str) -> Path:
     """``folder`` with ``parts`` below it, for names that somebody else may have chosen. Raises UserError where a part
-    is no plain name (empty, "..", with a separator or a zero byte), or where a link that lies in ``folder`` leads out
-    of it: what is written would land elsewhere. ``folder`` itself may be a link."""
+    is no plain name, or where a link in ``folder`` leads out of it. ``folder`` itself may be a link."""
     for part in parts:
         if part in ("", ".", "..") or any(letter in part for letter in "/\\\0"):
             raise UserError(f"{part!r} is no name of a file or folder", legal="letters, digits, - and _")
     path = Path(folder).joinpath(*parts)
     if not path.resolve().is_relative_to(Path(folder).resolve()):
-        raise UserError(
-            f"{path}: is a link that leads out of {folder}, to {path.resolve()}",
-            fix=f"remove the link, or name its goal with --out; {folder} itself may be a link",
-        )
+        fix = f"remove the link, or name its goal with --out; {folder} itself may be a link"
+        raise UserError(f"{path}: is a link that leads out of {folder}, to {path.resolve()}", fix=fix)
     return path
 
 
@@ -227,9 +212,8 @@ def write_text(path: Path, content: str, *, durable: bool = True) -> None:
 
 
 def open_plain(path: Path, flags: int) -> IO[bytes]:
-    """Open a regular file, unbuffered where it is written: never through a link, and without waiting for a pipe.
-    ``flags`` as of `os.open`. Raises UserError where the path is a link, a pipe or a folder; OSError as `os.open`
-    does."""
+    """Open a regular file, unbuffered where it is written, never through a link. ``flags`` as of `os.open`. Raises
+    UserError where the path is a link, a pipe or a folder; OSError as `os.open` does."""
     odd = UserError(f"{path}: is not a regular file, so nothing is read from it or written to it", fix="remove it")
     if path.is_symlink() or path.is_dir():
         raise odd
@@ -257,13 +241,12 @@ Answer = Literal["held", "busy", "no locks"]
 """``busy``: another process holds it. ``no locks``: the system (Windows) or the file system knows none."""
 
 
-def opened_lock(path: Path) -> IO[str]:
+def opened_lock(path: Path) -> IO[bytes]:
     """Open a lock file, made where there is none. Raises OSError, or UserError where it is no regular file."""
-    with open_plain(path, os.O_RDWR | os.O_CREAT | os.O_APPEND) as file:
-        return os.fdopen(os.dup(file.fileno()), "a+", encoding="utf-8")
+    return open_plain(path, os.O_RDWR | os.O_CREAT | os.O_APPEND)
 
 
-def lock(file: IO[str], *, shared: bool, wait: bool) -> Answer:
+def lock(file: IO[bytes], *, shared: bool, wait: bool) -> Answer:
     """Lock an open file until it is closed."""
     try:
         import fcntl
@@ -280,8 +263,7 @@ def lock(file: IO[str], *, shared: bool, wait: bool) -> Answer:
 
 @contextmanager
 def one_at_a_time(path: Path, number: int) -> Iterator[None]:
-    """Wait for other processes that hold the same ``number`` of a lock file, and hold it: one byte of the file, so that
-    any number of things needs one file. Processes, not threads. Holds nothing where the system knows no locks."""
+    """Hold byte ``number`` of a lock file against other processes, where the system knows locks."""
     try:
         import fcntl
 

@@ -16,18 +16,13 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-MM = 1e-3
-"""Metres in a millimetre."""
-INCH = 25.4e-3
-"""Metres in an inch (exact by definition)."""
-UW_CM2 = 1e-2
-"""Watts per square metre in a microwatt per square centimetre."""
-SPEED_OF_LIGHT_VACUUM = 299_792_458.0
-"""m/s, exact by definition."""
+MM = 1e-3  # Metres in a millimetre
+INCH = 25.4e-3  # Metres in an inch (exact by definition)
+UW_CM2 = 1e-2  # Watts per square metre in a microwatt per square centimetre
+SPEED_OF_LIGHT_VACUUM = 299_792_458.0  # m/s, exact by definition
 REFRACTIVE_INDEX_AIR = 1.00027
 """Air at 850 nm, 20 C, 101 kPa (Ciddor 1996, rounded): +-1e-5 over indoor weather, 10 um at 1 m."""
-SPEED_OF_LIGHT_AIR = SPEED_OF_LIGHT_VACUUM / REFRACTIVE_INDEX_AIR
-"""m/s in indoor air."""
+SPEED_OF_LIGHT_AIR = SPEED_OF_LIGHT_VACUUM / REFRACTIVE_INDEX_AIR  # m/s in indoor air
 
 
 def transform_points(T_a_b: np.ndarray, points_b: np.ndarray) -> np.ndarray:
@@ -73,28 +68,20 @@ class Region:
 
     def grown(self, margin: int, height: int, width: int) -> Region:
         """This region with ``margin`` more pixels on each side, clipped to a sensor of ``height`` x ``width``."""
-        return Region(
-            max(self.row0 - margin, 0),
-            min(self.row1 + margin, height),
-            max(self.col0 - margin, 0),
-            min(self.col1 + margin, width),
-        )
+        rows = max(self.row0 - margin, 0), min(self.row1 + margin, height)
+        return Region(*rows, max(self.col0 - margin, 0), min(self.col1 + margin, width))
 
     def within(self, outer: Region) -> tuple[slice, slice]:
         """Slices that cut this region out of an array that covers ``outer``."""
-        return (
-            slice(self.row0 - outer.row0, self.row1 - outer.row0),
-            slice(self.col0 - outer.col0, self.col1 - outer.col0),
-        )
+        rows = slice(self.row0 - outer.row0, self.row1 - outer.row0)
+        return rows, slice(self.col0 - outer.col0, self.col1 - outer.col0)
 
 
-UNDISTORT_STEPS = 200
-"""Fixed-point steps of the inversion: the Azure Kinect's corners converge to 1e-9 px within 60."""
+UNDISTORT_STEPS = 200  # Fixed-point steps of the inversion: the Azure Kinect's corners converge to 1e-9 px within 60
 
 
 SAME_SLOPE = 1e-3
-"""Rays closer than this, in slope, are the same: beyond the angle at which a lens' distortion turns back they differ
-by more."""
+"""Rays closer than this, in slope, are the same: where a lens' distortion turns back they differ by more."""
 
 
 @dataclass(frozen=True)
@@ -147,8 +134,7 @@ class Lens:
         return pixels.reshape(*points_camera_m.shape[:-1], 2)
 
     def images(self, points_camera_m: np.ndarray) -> np.ndarray:
-        """Tell which points (..., 3) have an image on the sensor, (...) bool: they lie in front of the camera, and the
-        ray of the pixel on which the projection puts them leads back to them."""
+        """Tell which points (..., 3) have an image, (...) bool: in front, and met by the ray of their own pixel."""
         ahead = points_camera_m[..., 2] > 0
         points = np.where(ahead[..., None], points_camera_m, [0.0, 0.0, 1.0])
         u, v = np.moveaxis(self.project(points), -1, 0)
@@ -185,21 +171,15 @@ class Reason(IntEnum):
     """The reason why a pixel has no range; a recording says NO_RETURN or NOT_FINITE only, a simulated camera all."""
 
     VALID = 0
-    NO_RETURN = 1
-    """The file holds the code for 'no depth' (0), or the ray met nothing."""
+    NO_RETURN = 1  # the file holds the code for "no depth" (0), or the ray met nothing
     SATURATED = 2
     LOW_AMPLITUDE = 3
-    AMPLITUDE_RATIO = 4
-    """The amplitudes of the modulation frequencies disagree (a mixed pixel)."""
-    UNWRAP = 5
-    """The phases of the modulation frequencies fit no single distance."""
-    EDGE = 6
-    """The neighbourhood's phases differ too much."""
+    AMPLITUDE_RATIO = 4  # the amplitudes of the modulation frequencies disagree (a mixed pixel)
+    UNWRAP = 5  # the phases of the modulation frequencies fit no single distance
+    EDGE = 6  # the neighbourhood's phases differ too much
     OUT_OF_RANGE = 7
-    OUTSIDE_MASK = 8
-    """Outside the illuminated field."""
-    LOW_REFLECTIVITY = 9
-    """Amplitude times distance squared too small."""
+    OUTSIDE_MASK = 8  # outside the illuminated field
+    LOW_REFLECTIVITY = 9  # amplitude times distance squared too small
     NOT_FINITE = 10
 
 

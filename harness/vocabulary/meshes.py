@@ -30,8 +30,7 @@ FRONTS = {
 
 
 def read_mesh(file: str) -> Any:
-    """Return a file's triangles as a `trimesh.Trimesh`, equal vertices joined, flat and doubled triangles left out.
-    Raises UserError for what is no mesh."""
+    """Return a file's triangles as a `trimesh.Trimesh`, without flat and doubled ones. Raises UserError."""
     import trimesh
 
     path = Path(file)

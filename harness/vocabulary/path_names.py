@@ -13,17 +13,13 @@ from typing import Any
 
 UNITS = {"_mrad": "mrad", "_deg": "°", "_mm": "mm", "_nm": "nm", "_px": "px", "_hz": "Hz", "_m": "m"}
 """Endings of keys that name a unit, longer ones first."""
-CHOICES = ("name", "kind", "method")
-"""Keys that say which of several; what it is of stands before them."""
-NAMED = ("camera", "detector", "damage")
-"""Axes whose values say by themselves what they are."""
-LONGEST = 60
-"""Characters of a value that a table can show."""
+CHOICES = ("name", "kind", "method")  # Keys that say which of several; what it is of stands before them
+NAMED = ("camera", "detector", "damage")  # Axes whose values say by themselves what they are
+LONGEST = 60  # Characters of a value that a table can show
 
 
 def names_of(paths: Iterable[str]) -> dict[str, str]:
-    """Return a name for each path, without its unit: the last key (of ``camera.name`` and the like the key before); the
-    whole path where that would be the same for two."""
+    """Return a name for each path, without unit: its last key that says something; the path if it is not unique."""
     short = {path: _split(path)[0] for path in paths}
     return {path: name if list(short.values()).count(name) == 1 else path for path, name in short.items()}
 
@@ -34,8 +30,7 @@ def unit_of(path: str) -> str:
 
 
 def value_text(path: str, value: Any) -> str:
-    """A value on one line, short, with its unit where it is a number or a range of two; of a mapping which of several
-    it is, then each key and value; of a camera's file, its name."""
+    """A value on one short line, with its unit; of a mapping which of several it is, then its keys and values."""
     if isinstance(value, dict) and value:
         choice = next((key for key in CHOICES if key in value), "")
         rest = (f"{_split(key)[0]} {value_text(key, held)}" for key, held in value.items() if key != choice)
@@ -50,8 +45,7 @@ def value_text(path: str, value: Any) -> str:
 
 @cache
 def camera_title(name: str) -> str:
-    """Return the title in the file of a camera that comes with tofpod, without commas; of any other name its words, and
-    of a file's path those of its name."""
+    """Return the title of a camera of tofpod without commas; of any other name or path its words."""
     if re.fullmatch(r"\w+", name):
         file = resources.files("scenes") / "cameras" / f"{name}.yaml"
         told = re.search(r"^title: (.+)$", file.read_text(encoding="utf-8"), re.MULTILINE) if file.is_file() else None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import os
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -13,14 +12,12 @@ from typing import Any
 
 from harness.vocabulary.errors import UserError
 
-OWN = "tofpod"
-"""The package that the built-in ones come from, as it is told."""
+OWN = "tofpod"  # The package that the built-in ones come from, as it is told
 
 
 @dataclass(frozen=True)
 class Offer:
-    """One name and what stands behind it: ``target`` is ``module:attribute`` (of a built-in also a file), ``package``
-    and ``package_version`` where it comes from."""
+    """A name, its ``target`` (``module:attribute``, of a built-in also a file), and the package it is from."""
 
     name: str
     target: str
@@ -40,8 +37,7 @@ class Offer:
 
 @dataclass(frozen=True)
 class PlugIns:
-    """The names of one entry point group. ``noun`` is what one of them is called in messages; ``built_in`` gives
-    tofpod's own, name to target; ``fix`` is the advice on an unknown name."""
+    """The names of an entry point group: ``noun`` for messages, ``built_in`` ones by name, ``fix`` as advice."""
 
     group: str
     noun: str
@@ -50,9 +46,7 @@ class PlugIns:
 
     def offers(self) -> tuple[Offer, ...]:
         """Return every offer, by name; a name that two packages claim stands there twice."""
-        # the folders in which packages are looked for, with the times of their last changes: installing changes them
-        places = tuple((place, _changed_ns(place or os.curdir)) for place in sys.path)
-        return _offers(self.group, tuple(self.built_in().items()), places)
+        return _offers(self.group, tuple(self.built_in().items()), tuple(sys.path))
 
     def names(self) -> tuple[str, ...]:
         """Every known name, sorted; a name that is taken twice is one of them."""
@@ -75,8 +69,7 @@ class PlugIns:
         return found[0]
 
     def load(self, offer: Offer) -> Any:
-        """The attribute behind an offer. Raises UserError, with its package, where a plug-in cannot be imported; what
-        is wrong with a built-in one is a bug and keeps its traceback."""
+        """The attribute behind an offer. Raises UserError where a plug-in fails; a built-in one is a bug."""
         module, _, attribute = offer.target.partition("[")[0].strip().partition(":")
         try:
             found: Any = importlib.import_module(module)
@@ -91,24 +84,13 @@ class PlugIns:
 
     def broken(self, offer: Offer, why: str, command: str = "") -> UserError:
         """The mistake that a plug-in is not what its group asks for. ``command`` would show more."""
-        shown = f"; `{command}` shows where it fails" if command else ""
-        return UserError(
-            f"{self.noun} {offer.name!r} ({offer.target}, of the package {offer.origin}) cannot be loaded: {why}",
-            fix=f"repair or uninstall the package {offer.package}{shown}",
-        )
-
-
-def _changed_ns(folder: str) -> int:
-    try:
-        return os.stat(folder).st_mtime_ns
-    except OSError:
-        return 0
+        fix = f"repair or uninstall the package {offer.package}" + (f"; `{command}` shows more" if command else "")
+        said = f"{self.noun} {offer.name!r} ({offer.target}, of the package {offer.origin}) cannot be loaded: {why}"
+        return UserError(said, fix=fix)
 
 
 @lru_cache(maxsize=8)
-def _offers(
-    group: str, built_in: tuple[tuple[str, str], ...], _places: tuple[tuple[str, int], ...]
-) -> tuple[Offer, ...]:
+def _offers(group: str, built_in: tuple[tuple[str, str], ...], _path: tuple[str, ...]) -> tuple[Offer, ...]:
     """Return tofpod's own offers and the group's. Remembered: reading every installed package takes 7 ms."""
     from harness import __version__
 

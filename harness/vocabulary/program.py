@@ -18,8 +18,7 @@ Run = Callable[[argparse.Namespace, str], int]
 
 @dataclass(frozen=True)
 class Program:
-    """``python -m <name>``: called, it parses arguments (None: the command line's) and runs. ``options`` adds its
-    arguments to a parser; ``run`` takes what was parsed, and the command as it was given."""
+    """``python -m <name>``: called, it parses arguments (None: the command line's) and runs."""
 
     name: str
     options: Options
@@ -39,8 +38,7 @@ class Program:
         return parser
 
     def __call__(self, arguments: list[str] | None = None) -> int:
-        """Run the program; returns its exit code: what ``run`` returns, 2 on a mistake of the user, 130 after
-        Ctrl-C."""
+        """Run the program; returns what ``run`` returns, 2 on a mistake of the user, 130 after Ctrl-C."""
         given = sys.argv[1:] if arguments is None else arguments
         parsed = self.parser().parse_args(given)
         if arguments is None:

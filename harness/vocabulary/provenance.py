@@ -1,8 +1,7 @@
 """The origin of a result: code and its digest, versions of packages and of stored files, machine.
 
-Every stored file says of which version it is: a newer one is refused, an older one is read or made anew. Each kind has
-its number beside the code that writes it. It stands in JSON and Parquet by a key, in CSV by a column, which every
-reader keeps, in YAML by a comment on the first line, in HTML by ``<meta name="generator">``."""
+Every stored file says of which version it is: in JSON and Parquet by a key, in CSV by a column, in YAML by a comment on
+the first line, in HTML by ``<meta name="generator">``. A newer one is refused, an older one read or made anew."""
 
 from __future__ import annotations
 
@@ -54,8 +53,7 @@ def versions() -> dict[str, str]:
 
 
 def record(command: str) -> dict[str, Any]:
-    """Return the origin that every stored result states: command, commit, dirty flag, versions, and what a run's times
-    depend on; no host or user name."""
+    """Return the origin that every stored result states: command, commit, dirty flag, versions, machine; no names."""
     commit, dirty = commit_and_dirty()
     machine = {"system": platform.system(), "machine": platform.machine(), "processors": os.cpu_count()}
     return {"command": command, "commit": commit, "dirty": dirty, "versions": versions(), "machine": machine}
@@ -63,8 +61,7 @@ def record(command: str) -> dict[str, Any]:
 
 RESULTS_VERSION = 1
 """Stands in every file of a result folder that has no version of its own; raised when the tables' meaning changes."""
-GENERATOR = f"tofpod results {RESULTS_VERSION}"
-"""Stands in pages."""
+GENERATOR = f"tofpod results {RESULTS_VERSION}"  # Stands in pages
 STAMP = re.compile(r"#\s*tofpod (\w+)(.*)")
 
 
@@ -103,8 +100,7 @@ def stamp_of(text: str, kind: str) -> object:
 
 
 ROOT = Path(__file__).resolve().parents[2]
-OWN = ("detectors", "harness", "scenes")
-"""The project's packages."""
+OWN = ("detectors", "harness", "scenes")  # The project's packages
 IMPORT = re.compile(
     r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n#]+)|import[ \t]+([^\n#]+))", re.MULTILINE
 )
@@ -113,9 +109,8 @@ IMPORT = re.compile(
 
 @lru_cache
 def source_digest(modules: tuple[str, ...], packages: tuple[str, ...]) -> str:
-    """Digest of the project's sources that ``modules`` reach by imports, and of the versions of installed ``packages``.
-    A module of another project counts with every Python source of the package that it belongs to. Taken once a process:
-    files that change later are not what this process runs."""
+    """Digest of the project's sources that ``modules`` reach, and of the versions of ``packages``. A module of another
+    project counts with all sources of its package. Taken once a process: later changes are not what it runs."""
     state = hashlib.blake2b(digest_size=8)
     own = tuple(name for name in modules if name.partition(".")[0] in OWN)
     files = {path.relative_to(ROOT).as_posix(): path for path in reached_sources(own)}
@@ -132,9 +127,8 @@ def source_digest(modules: tuple[str, ...], packages: tuple[str, ...]) -> str:
 
 @lru_cache
 def reached_sources(modules: tuple[str, ...]) -> tuple[Path, ...]:
-    """Source files of the project that modules reach by import statements, those inside functions included, sorted.
-    Imports that exist for type checking only count too. A module that is loaded by a name in a variable is not seen:
-    name it among ``modules``."""
+    """Source files that modules reach by import statements, those inside functions and for type checking included,
+    sorted. A module that is loaded by a name in a variable is not seen: name it among ``modules``."""
     found: dict[str, Path] = {}
     waiting = list(modules)
     while waiting:

@@ -300,7 +300,7 @@ CONDITIONS = (
     ("detector.name", "detector {}"),
     ("threshold.k", "threshold {:g} deviations"),
     ("threshold.calibrate.false_calls_per_m2", "threshold for {:g} false calls per m²"),
-    ("threshold.calibrate.repeats", "threshold the highest score of {:g} hole-free runs"),
+    ("threshold.calibrate.repeats", "threshold set to the highest score of {:g} hole-free runs"),
 )
 """Settings that every set-up shares, in words, where no axis varies them."""
 

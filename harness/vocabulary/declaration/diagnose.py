@@ -14,21 +14,11 @@ from pydantic import ValidationError
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration import shape
-from harness.vocabulary.declaration.yaml_source import (
-    MAX_PROBLEMS,
-    DeclarationError,
-    KeyPath,
-    Place,
-    Problem,
-    Source,
-    in_order,
-)
+from harness.vocabulary.declaration.yaml_source import MAX_PROBLEMS, DeclarationError, KeyPath, Place, Problem, Source
 from harness.vocabulary.errors import UserError
 
-YES_AND_NO = {"yes": "true", "on": "true", "no": "false", "off": "false"}
-"""Booleans of YAML 1.1, text in YAML 1.2."""
-LEAST_HELD = 3
-"""Letters of a word that is looked for within others: fewer are in too many."""
+YES_AND_NO = {"yes": "true", "on": "true", "no": "false", "off": "false"}  # Booleans of YAML 1.1, text in YAML 1.2
+LEAST_HELD = 3  # Letters of a word that is looked for within others: fewer are in too many
 WORDS = {"Input should be": "it should be", "an object": "a mapping", "valid array": "list", "valid tuple": "list"}
 WORDS |= {"valid string": "text", "valid boolean": "true or false", " in strict mode": ""}
 WORDS |= {"be a true": "be true", "be a text": "be text"}
@@ -91,7 +81,7 @@ def settings_of(model: type[C], data: Mapping[str, Any], what: str, within: str 
         source = Source(what, "", whole, {(): Place(what, 0, 1, "")}, {})
         declared = shape.Declared(Config if base else model, whole, {base: model} if base else {})
         problems = [replace(each, place=None) for each in problems_of(error, declared, source, base)]
-        told = [str(each).replace("\n", "\n  ") for each in in_order(problems)]
+        told = dict.fromkeys(str(each).replace("\n", "\n  ") for each in problems)
         raise UserError(f"{what}:\n  " + "\n  ".join(told)) from error
 
 
@@ -194,8 +184,7 @@ def shown(value: Any) -> str:
         noun = "mapping" if isinstance(value, dict) else "list"
         return f"a {noun}" if value else f"an empty {noun}"
     text = json.dumps(value, ensure_ascii=False)
-    if isinstance(value, float):
-        text = text.replace("Infinity", ".inf").replace("NaN", ".nan")
+    text = text.replace("Infinity", ".inf").replace("NaN", ".nan") if isinstance(value, float) else text
     return text if len(text) <= 40 else text[:39] + "…"
 
 

@@ -16,8 +16,7 @@ from pydantic.fields import FieldInfo
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration.yaml_source import KeyPath
 
-LONGEST_NOTE = 100
-"""Characters of a field's description that a message repeats; longer ones are essays, not limits."""
+LONGEST_NOTE = 100  # Characters of a field's description that a message repeats; longer ones are essays, not limits
 BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 Splices = Mapping[KeyPath, type[Config]]
 
@@ -106,8 +105,7 @@ def _kinds(models: tuple[type[BaseModel], ...]) -> tuple[str, Mapping[str, type[
 
 
 def model_for(slot: Slot | None, data: Any) -> type[BaseModel] | None:
-    """Return the model that a mapping is meant to fill: by its kind, else by most keys in common, which decide too
-    where the kind is not legal, a problem of its own."""
+    """Return the model that a mapping is meant to fill: by its kind, else by most keys in common."""
     kinds, given = kinds_of(slot), data if isinstance(data, Mapping) else {}
     if kinds and str(given.get(kinds[0])) in kinds[1]:
         return kinds[1][str(given[kinds[0]])]
@@ -140,11 +138,8 @@ def default_at(slot: Slot | None) -> tuple[Any, ...]:
     default = slot.field.get_default(call_default_factory=True)
     if not isinstance(default, Config):
         return (json.loads(json.dumps(default)),)
-    constant = {
-        n: getattr(default, n)
-        for n, f in type(default).model_fields.items()
-        if len(choices_of(slot_of(f.annotation))) == 1
-    }
+    fields = type(default).model_fields
+    constant = {n: getattr(default, n) for n, f in fields.items() if len(choices_of(slot_of(f.annotation))) == 1}
     least = {**constant, **default.model_dump(mode="json", exclude_defaults=True)}
     return (least if type(default).from_data(json.loads(json.dumps(least))) == default else default.to_data(),)
 
@@ -165,9 +160,8 @@ def child(data: Any, key: str | int) -> Any:
 
 def choices_of(slot: Slot | None) -> tuple[Any, ...]:
     """Return the values of a Literal at this place, () where it is none."""
-    return tuple(
-        v for kind, _ in (slot.branches if slot else ()) if get_origin(kind) is Literal for v in get_args(kind)
-    )
+    branches = slot.branches if slot else ()
+    return tuple(v for kind, _ in branches if get_origin(kind) is Literal for v in get_args(kind))
 
 
 def legal_at(slot: Slot | None) -> str | None:
@@ -204,8 +198,7 @@ def _words(kind: Any, limits: Mapping[str, Any]) -> str:
 
 
 def every_key(model: type[BaseModel], before: str = "") -> Iterator[tuple[str, Slot]]:
-    """Yield every key below a model with its place: items of a list as ``key[]``, models of several kinds as
-    ``key[kind=name]``."""
+    """Yield every key below a model with its place: items as ``key[]``, kinds as ``key[kind=name]``."""
     for name, field in model.model_fields.items():
         path, slot = f"{before}{name}", slot_of(field.annotation, field)
         yield path, slot

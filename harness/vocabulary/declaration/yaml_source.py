@@ -1,8 +1,7 @@
 """YAML 1.2 as plain data that remembers the place of every key and value; problems are shown there, all at once.
 
-The parser is ruamel.yaml's; only its node tree is used, so that no tag can build an object, every duplicate key is
-seen, and places come from the nodes. Not supported on purpose: merge keys (``<<``, no part of YAML 1.2), tags, several
-documents, keys that are no text."""
+Only ruamel.yaml's node tree is used, so that no tag can build an object and every duplicate key is seen. Not supported
+on purpose: merge keys (``<<``, no part of YAML 1.2), tags, several documents, keys that are no text."""
 
 from __future__ import annotations
 
@@ -23,10 +22,8 @@ from ruamel.yaml.reader import ReaderError
 
 from harness.vocabulary.errors import UserError
 
-SHOWN_COLUMNS = 110
-"""Characters of a source line that a message shows; longer lines are cut around the caret."""
-MAX_PROBLEMS = 100
-"""Most problems that a message lists, and that are looked for in a single mapping."""
+SHOWN_COLUMNS = 110  # Characters of a source line that a message shows; longer lines are cut around the caret
+MAX_PROBLEMS = 100  # Most problems that a message lists, and that are looked for in a single mapping
 
 
 @dataclass(frozen=True)
@@ -52,8 +49,7 @@ class Place:
         shown = "".join(letter if letter.isprintable() else " " for letter in cut)
         offset = self.column - 1 - start
         width = max(1, min(self.width, len(shown) - offset))
-        label = f"{self.line or '':>5}"
-        return [f"{label} | {shown}".rstrip(), f"{' ' * 5} | {' ' * offset}^{'~' * (width - 1)}"]
+        return [f"{self.line or '':>5} | {shown}".rstrip(), f"{' ' * 5} | {' ' * offset}^{'~' * (width - 1)}"]
 
 
 @dataclass(frozen=True)
@@ -103,22 +99,17 @@ def in_order(problems: Iterable[Problem]) -> tuple[Problem, ...]:
     return tuple(sorted(unique, key=position))
 
 
-KeyPath = tuple[str | int, ...]
-"""Position of a value in the data: keys of mappings and indices of lists."""
-MAX_BYTES = 500_000
-"""An experiment written by hand has a few kB; the parser needs up to 20 s for a megabyte."""
-MAX_NODES = 50_000
-"""Values, aliases followed: what bounds an alias bomb."""
-MAX_DEPTH = 40
-"""Nesting; the schema needs 8."""
+KeyPath = tuple[str | int, ...]  # Position of a value in the data: keys of mappings and indices of lists
+MAX_BYTES = 500_000  # An experiment written by hand has a few kB; the parser needs up to 20 s for a megabyte
+MAX_NODES = 50_000  # Values, aliases followed: what bounds an alias bomb
+MAX_DEPTH = 40  # Nesting; the schema needs 8
 _TAG = "tag:yaml.org,2002:"
 _OTHER_VERSION = re.compile(r"^%YAML[ \t]+(?!1\.2\b).*", re.MULTILINE)
 
 
 @dataclass(frozen=True)
 class Source:
-    """Plain data (dicts, lists, text, numbers, booleans, None) and the place of everything in it. ``values`` and
-    ``keys`` map a `KeyPath` to the place of the value, respectively of its key."""
+    """Plain data with the places of all values and ``keys``, by `KeyPath`."""
 
     origin: str
     text: str
@@ -190,10 +181,9 @@ def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = Fa
         width = max(1, min(end + start, starts[line] + len(lines[line])) - index)
         return Place(origin, 0 if is_argument else line + 1, index - starts[line] + 1, lines[line], width)
 
-    version = _OTHER_VERSION.search(text)
-    if version:
-        problem = Problem("only YAML 1.2 is read", place(version.start() - start, version.end()))
-        raise DeclarationError(origin, [problem])
+    if version := _OTHER_VERSION.search(text):
+        at = place(version.start() - start, version.end())
+        raise DeclarationError(origin, [Problem("only YAML 1.2 is read", at)])
     depth = nodes = 0
     try:
         for event in YAML(typ="safe", pure=True).parse(text[start:]):
