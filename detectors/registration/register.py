@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from time import perf_counter
 
 import numpy as np
@@ -197,10 +196,6 @@ def _widened(
     return replace(registration, covariance=covariance, notes=(*registration.notes, note))
 
 
-LOOP_POINTS = 500
-"""Number of points of the first view's target over which the error of a loop is averaged."""
-
-
 def register(views: Sequence[PreparedView], config: AnyRegistration) -> tuple[registered.Registration, ...]:
     """Return one registration for each view; the first is that of the reference. Never raises for the content of the
     views: a registration that cannot be trusted has a ``failure``. Raises UserError where the method needs something
@@ -239,7 +234,7 @@ def _check_views(views: Sequence[PreparedView], config: AnyRegistration) -> None
 
 
 def _pair(reference: PreparedView, view: PreparedView, config: AnyRegistration) -> registered.Registration:
-    """Return the registration of a view to a reference that need not be the first view, not judged yet."""
+    """Return the registration of a view to the reference, not judged yet."""
     started = perf_counter()
     if isinstance(config, IcpRegistration):
         found = register_by_icp(reference, view, config)
@@ -252,45 +247,3 @@ def _pair(reference: PreparedView, view: PreparedView, config: AnyRegistration) 
         guess = registered.guess_of(reference, view)
         found = registered.Registration(view.view.name, "nominal", np.eye(4) if guess is None else guess)
     return replace(found, seconds=perf_counter() - started)
-
-
-@dataclass(frozen=True)
-class LoopError:
-    """The closure error of a loop of three separately registered steps: ``rotation_deg`` of the composed transform, and
-    ``translation_m``, the root mean square displacement of the first view's target by it. NaN where a step failed;
-    ``failure`` names the step."""
-
-    views: tuple[str, str, str]
-    rotation_deg: float
-    translation_m: float
-    failure: str = ""
-
-
-def loop_errors(views: Sequence[PreparedView], config: AnyRegistration, most: int = 40) -> tuple[LoopError, ...]:
-    """Return the closure errors of loops i -> j -> k -> i, at most ``most`` of them, evenly taken from all. Every pair
-    is registered directly, with the guess that those of both views imply. The errors of the three steps add; an error
-    that a view brings equally into both of its registrations is not seen. Empty for fewer than three views. Raises
-    UserError as `register` does, and for methods that do not register pairs."""
-    if config.method in ("nominal", "joint", "odometry"):
-        raise UserError(
-            f"loops cannot be closed with {config.method}: it does not register pairs of views separately",
-            legal="icp, cpd, marks",
-        )
-    _check_views(views, config)
-    loops = list(combinations(range(len(views)), 3))
-    loops = loops[:: max(1, -(-len(loops) // most))]
-    sides = sorted({pair for i, j, k in loops for pair in ((i, j), (j, k), (i, k))})
-    placed = {(i, j): judge(_pair(views[i], views[j], config), views[i], views[j]) for i, j in sides}
-    names = [view.view.name for view in views]
-    errors = []
-    for i, j, k in loops:
-        steps = [((a, b), placed[a, b]) for a, b in ((i, j), (j, k), (i, k))]
-        failures = [f"{names[b]} to {names[a]}: {step.failure}" for (a, b), step in steps if step.failure]
-        turn, shift = float("nan"), float("nan")
-        if not failures:
-            T_ij, T_jk, T_ik = (step.T_reference_view for _, step in steps)
-            closed = T_ij @ T_jk @ invert(T_ik)
-            turn = float(np.rad2deg(np.linalg.norm(closed[:3, :3] - np.eye(3)) / np.sqrt(2)))
-            shift = registered.moved_m(closed, registered.thinned(views[i].points_m, LOOP_POINTS))
-        errors.append(LoopError((names[i], names[j], names[k]), turn, shift, "; ".join(failures)))
-    return tuple(errors)

@@ -10,11 +10,10 @@ from harness.vocabulary.config import Config
 
 
 class IcpRegistration(Config):
-    """Iterative closest point, from the guess."""
+    """Iterative closest point, point to point, from the guess."""
 
     method: Literal["icp"] = "icp"
     points: Literal["marks", "target"] = "marks"
-    estimation: Literal["point_to_point", "point_to_plane"] = "point_to_point"
 
 
 class CpdRegistration(Config):

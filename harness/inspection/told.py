@@ -151,7 +151,7 @@ def pictures(choice: Choice | None, name: str = "targets.png") -> dict[str, Call
 
 
 def print_registrations(data: Mapping[str, Any]) -> None:
-    """Print ``data`` of registrations.json: a table with a view a line, then notes and loops."""
+    """Print ``data`` of registrations.json: a table with a view a line, then notes."""
     digits = {
         "residual_mm": 3, "overlap": 2, "predicted_in_plane_mm": 3, "predicted_across_mm": 3, "held_out_mark_mm": 3,
         "pairs": 0, "iterations": 0, "seconds": 3,
@@ -165,15 +165,6 @@ def print_registrations(data: Mapping[str, Any]) -> None:
     show([Grid.of((*heads, "s"), rows, left=0)])
     for row in data["views"]:
         print_notes(f"{row['view']}: {note}" for note in row["notes"])
-    closed = [loop for loop in data["loops"] if not loop["failure"]]
-    if closed:
-        worst = max(closed, key=lambda loop: loop["translation_mm"])
-        print(
-            f"loops: {len(closed)} of three views; the worst, {' - '.join(worst['views'])}, ends"
-            f" {worst['translation_mm']:.3g} mm and {worst['rotation_deg']:.3f} degrees from where it began"
-        )
-    broken = [loop for loop in data["loops"] if loop["failure"]]
-    print_notes(f"the loop {' - '.join(loop['views'])} is open: {loop['failure']}" for loop in broken)
 
 
 def threshold_text(threshold: float, evidence: Evidence) -> str:
