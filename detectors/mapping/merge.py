@@ -41,9 +41,9 @@ BLOCK, BLOCKS_AT_FIRST = 8, 4096
 
 def integrate(views: Sequence[ChosenView], voxel_m: float | None) -> tuple[Cloud, tuple[str, ...]]:
     """Return an unorganised cloud in the first view's frame, the field's zero crossings, sorted by x, y, z; and notes.
-    A crossing knows neither the number of its samples nor their variance: ``count`` is 1, ``variance_m2`` of all points
-    the median variance of one frame's z over the views' targets, for the floor that rounding sets. Raises UserError
-    where the field holds no surface, or the targets do not determine a smooth one."""
+    ``count`` is 1, ``variance_m2`` of all points the median variance of one frame's z over the views' targets, for the
+    floor that rounding sets. Raises UserError where the field holds no surface, or the targets determine no smooth
+    one."""
     clouds = [view.cloud for view in views]
     z = clouds[0].points_m[views[0].inside][:, 2]
     pitch = float(np.median(z)) * views[0].slope_step
@@ -74,8 +74,8 @@ def integrate(views: Sequence[ChosenView], voxel_m: float | None) -> tuple[Cloud
 
 
 def _undistorted(view: ChosenView) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-    """The view on a pinhole's grid of slopes x/z, y/z: depth (h, w, 1) float32, 0 where there is none, colour (h, w, 3)
-    0..1 if it has any, and the camera matrix."""
+    """Depth (h, w, 1) float32, 0 where there is none, on a pinhole's grid; colour (h, w, 3) 0..1 if any; camera
+    matrix."""
     cloud, inside = view.cloud, view.inside
     with np.errstate(invalid="ignore"):
         slopes = cloud.points_m[..., :2] / cloud.points_m[..., 2:]
@@ -142,9 +142,8 @@ MAX_BOXES = 1 << 21
 
 @dataclass(frozen=True)
 class Merged:
-    """One cloud of several views. ``T_reference_cloud`` (4, 4): its frame to the first view's camera frame, the
-    identity where it is that frame. ``views_used``: names of those that went in. ``seconds``: of merging.
-    ``surface_map``: what a fused map knows beside its cloud; None of the others."""
+    """One cloud of several views. ``T_reference_cloud`` (4, 4): its frame to the first view's camera frame.
+    ``views_used``: names of those that went in. ``surface_map``: what a fused map knows beside its cloud."""
 
     cloud: Cloud
     T_reference_cloud: np.ndarray
@@ -163,9 +162,8 @@ class Mapped:
     merged: Merged
 
     def view_of_points(self) -> np.ndarray:
-        """Return (n,) for each point of the merged cloud the index of its view in ``merged.views_used``, `SEVERAL` for
-        several or unknown: of a map as it knows, else by the nearest point, several where another view has one within
-        twice that."""
+        """Return (n,) for each point of the merged cloud the index of its view in ``merged.views_used``, or `SEVERAL`:
+        of a map as it knows, else by the nearest point, several where another view has one within twice that."""
         from scipy.spatial import cKDTree
 
         merged = self.merged
@@ -230,11 +228,10 @@ def _on_grid(views: Sequence[ChosenView], step_m: float) -> Cloud:
     """The thesis' merge (MATLAB's pcmerge) as an unorganised cloud in the first view's frame: boxes in the order of x,
     then y, then z; then the rest. Raises UserError where there are more boxes along an axis than can be numbered. The
     overlap of the clouds' axis-parallel bounding boxes is divided into boxes from its lowest corner; each box with
-    points becomes their plain mean, in place and in colour; points beyond the overlap stay as they are, and colour is
-    dropped where one cloud has none. Of more than two clouds all go into one grid, over the union of the pairwise
-    overlaps, where pcmerge called in turn would weight a late cloud more. ``count`` is the number of samples of all
-    points of a box and ``variance_m2`` their mean variance (of one frame's z in its own camera). ``n_frames`` is that
-    of the view with the fewest: most points are still those of one view."""
+    points becomes their plain mean, in place and in colour; points beyond the overlap stay. Of more than two clouds all
+    go into one grid, over the union of the pairwise overlaps, where pcmerge called in turn would weight a late cloud
+    more. ``count``: samples of all points of a box; ``variance_m2``: their mean variance; ``n_frames``: the least of
+    all views."""
     limits = [(view.points_reference_m.min(axis=0), view.points_reference_m.max(axis=0)) for view in views]
     # x, y, z, red, green, blue, amplitude, samples, samples times variance, number of points
     columns = np.concatenate([_columns(view) for view in views])

@@ -4,14 +4,14 @@ ICP goes coarse to fine from the guess, point to point, as MATLAB's `pcregisteri
 limited in distance, MATLAB's are not.
 
 Coherent point drift (Myronenko & Song, TPAMI 32:2262, 2010, figure 2), without scale: the moving cloud's points are
-centres of Gaussians of one width, together with a uniform component for outliers; the fixed cloud is drawn from them.
-As MATLAB's `pcregistercpd` with Transform "Rigid": both clouds are set to zero mean, the start is the width of all
-pairs, the iteration stops after so many steps or when the log likelihood changes by no more than a share. The two
-clouds share one unit of length, and the start is the guess, of which only the turn matters.
+centres of Gaussians of one width, with a uniform component for outliers, from which the fixed cloud is drawn. As in
+MATLAB's `pcregistercpd` both clouds are set to zero mean and the start is the width of all pairs; the clouds share one
+unit of length, and of the guess only the turn matters.
 
 Odometry (Open3D's hybrid term; Park, Zhou & Koltun, ICCV 2017) sets each view against the one before it, starting from
-no motion, by colour and depth together; steps are composed to the first view, so that errors add up. Only the target is
-shown to it: on a turntable the room does not move with the target. No loop is closed, no map is kept."""
+no motion, by colour and depth together, so that errors add up. Only the target is shown to it: on a turntable the room
+does not move with the target. No loop is closed, no map is kept.
+"""
 
 from __future__ import annotations
 
@@ -34,14 +34,13 @@ GUESS_ERROR_M, GUESS_ERROR_RAD = 10 * MM, np.deg2rad(3.0)
 FINEST_PITCHES = 3.0
 """Limit of the last stage: a mark's rim is known to a pixel in either view, and noise and shared errors add one."""
 STAGE_ITERATIONS, LEAST_CHANGE = 100, 1e-8
-"""A stage ends after so many iterations, or with a smaller change of the share of points that have a partner and of
-the partners' root mean square distance in metres."""
+"""A stage ends after so many steps, or a smaller change of the share of paired points and of their distance in
+metres."""
 CONVERGED_PITCHES = 0.05
 
 
 def register_by_icp(reference: PreparedView, view: PreparedView, config: IcpRegistration) -> registered.Registration:
-    """Return the registration of a view to the reference by ICP of their fiducial clouds or targets. ``covariance``:
-    see `_covariance`."""
+    """Return the registration of a view to the reference by ICP of their fiducial clouds or targets."""
     from scipy.spatial import cKDTree
 
     fixed, moving, start, notes, few = registered.clouds_of(reference, view, config.points)
@@ -138,9 +137,9 @@ PAIRS_AT_ONCE = 1 << 20  # pairs of points whose distances are held in memory
 
 @dataclass(frozen=True)
 class Drift:
-    """The result of coherent point drift. ``T_fixed_moving`` (4, 4); ``sigma_m`` the Gaussians' width; ``matched`` the
-    expected number of fixed points that are no outliers; ``step_m`` how far the last iteration moved the points, root
-    mean square; ``background`` as `posterior_moments` takes it: a share, without unit."""
+    """The result of coherent point drift. ``T_fixed_moving`` (4, 4); ``sigma_m``: the Gaussians' width; ``matched``:
+    expected number of fixed points that are no outliers; ``step_m``: how far the last iteration moved the points;
+    ``background``: a share, as `posterior_moments` takes it."""
 
     T_fixed_moving: np.ndarray
     sigma_m: float
@@ -154,8 +153,7 @@ class Drift:
 def coherent_point_drift(
     fixed_m: np.ndarray, moving_m: np.ndarray, config: CpdRegistration, T_start: np.ndarray | None = None
 ) -> Drift:
-    """Register points ``moving_m`` (m, 3) to ``fixed_m`` (n, 3), each at least three. ``T_start`` (4, 4): moving to
-    fixed; the identity where not given."""
+    """Register points ``moving_m`` (m, 3) to ``fixed_m`` (n, 3), each at least three, from ``T_start`` (4, 4)."""
     start = np.eye(4) if T_start is None else T_start
     centre = fixed_m.mean(axis=0)
     scale = max(float(np.sqrt(np.sum(np.var(fixed_m, axis=0)))), 1e-12)
@@ -197,8 +195,7 @@ def coherent_point_drift(
 
 def register_by_cpd(reference: PreparedView, view: PreparedView, config: CpdRegistration) -> registered.Registration:
     """Return the registration of a view to the reference by coherent point drift of their fiducial clouds or targets.
-    Few iterations are the rule, so one that stops by their number fails only where its last step still moved the
-    points."""
+    It fails at the limit of iterations only where its last step still moved the points."""
     fixed, moving, start, notes, few = registered.clouds_of(reference, view, config.points)
     if few:
         return registered.failed(view, "cpd", start, few, *notes)
@@ -226,12 +223,11 @@ def register_by_cpd(reference: PreparedView, view: PreparedView, config: CpdRegi
 
 
 def drift_covariance(fixed_m: np.ndarray, moved_m: np.ndarray, drift: Drift, pitch_m: float) -> np.ndarray:
-    """Return the (6, 6) covariance of the pose, as `Registration` means it, about the fixed cloud's centroid. The
-    pixels of a surface are no independent draws, so it is H^-1 S H^-1 with H the observed information (complete
-    information less that which is missing because the correspondence is not known; Louis, JRSS B 44:226, 1982) and S
-    the scatter of the scores, summed within cubes of 5 pixels whose errors are common (Liang & Zeger, Biometrika 73:13,
-    1986). The moving cloud's noise is taken to be as large. Both are taken at a Gaussian width of no less than a pitch,
-    below which the likelihood shows how two grids of pixels beat. NaN where H is not positive definite."""
+    """Return the (6, 6) covariance of the pose, as `Registration` means it, about the fixed cloud's centroid: H^-1 S
+    H^-1 with H the observed information (Louis, JRSS B 44:226, 1982) and S the scatter of the scores, summed within
+    cubes of 5 pixels whose errors are common (Liang & Zeger, Biometrika 73:13, 1986). The moving cloud's noise is taken
+    to be as large. Both are taken at a Gaussian width of no less than a pitch, below which the likelihood shows how two
+    grids of pixels beat. NaN where H is not positive definite."""
     centre = fixed_m.mean(axis=0)
     x = fixed_m - centre
     variance = max(drift.sigma_m, pitch_m) ** 2
@@ -256,10 +252,10 @@ def drift_covariance(fixed_m: np.ndarray, moved_m: np.ndarray, drift: Drift, pit
 def posterior_moments(
     fixed: np.ndarray, moving: np.ndarray, variance: float, background: float
 ) -> tuple[np.ndarray, float]:
-    """Return (n, 4, 4) posterior sums of (y, 1)(y, 1)' over the moving points y (m, 3), where they stand now, for each
-    fixed point (n, 3); and the negative sum of the log likelihood over fixed points, up to the Gaussians' factor.
-    ``background``: the uniform component as in equation 6 of Myronenko & Song: (2 pi variance)^(3/2) w / (1 - w) m / n.
-    The nearest component's weight is divided out, so that nothing underflows at w = 0."""
+    """Return (n, 4, 4) posterior sums of (y, 1)(y, 1)' over the moving points y (m, 3) for each fixed point (n, 3); and
+    the negative sum of the log likelihood over fixed points, up to the Gaussians' factor. ``background``: the uniform
+    component as in equation 6 of Myronenko & Song: (2 pi variance)^(3/2) w / (1 - w) m / n. The nearest component's
+    weight is divided out, so that nothing underflows at w = 0."""
     from scipy.spatial.distance import cdist
 
     places = np.column_stack([moving, np.ones(len(moving))])

@@ -2,7 +2,8 @@
 
 Errors that a whole view shares (an offset, wiggling, the lens) show as a distance between registered views that noise
 does not explain. They widen the covariance and are noted; a view is refused only where they would blur the merged map
-by more than `BLUR_M`, or by more than a pixel where pixels are coarser. The limits follow from the sampling."""
+by more than `BLUR_M`, or by more than a pixel where pixels are coarser.
+"""
 
 from __future__ import annotations
 
@@ -26,8 +27,8 @@ FALSE_ALARM_SIGMAS = 3.09
 MEDIAN_SCATTER = 1.65
 """Relative error of a standard deviation from the median, over that from the mean square (1 / sqrt(0.37))."""
 BLUR_M = 2.0 * MM
-"""Distance between registered views beyond which a map of them is blurred too much: with two views each lies 1 mm from
-their mean, which is a time-of-flight camera's noise in a single frame."""
+"""Distance between registered views beyond which a map of them is blurred too much: the noise of a single frame,
+twice."""
 UNDETERMINED_PITCHES = 3.0
 """A predicted error over the target beyond this, and beyond `BLUR_M`, puts every point on a wrong pixel."""
 MAX_JUMP_DEG, MAX_JUMP_M = 30.0, 0.1
@@ -42,11 +43,10 @@ TRIMMED = 0.9
 class Agreement:
     """Agreement of a registered view with the reference target. ``beside`` and ``overlap``: share of the view's target
     points beside which the reference has a point within a pitch along the surface, at any distance across it, and at no
-    more than a pitch (or three sigma of noise) across. ``apart_m``: robust root mean square distance across the
-    surfaces where they lie beside each other. ``marks_m``: root mean square distance of the fiducial points to the
-    nearest of the reference, the farthest tenth left out; NaN where either has fewer than three. ``noise_m`` and
-    ``grids_m``: what noise, and two grids of one pitch, explain of these; ``scatter`` and ``marks_scatter`` the
-    relative errors of the two distances, times `FALSE_ALARM_SIGMAS`."""
+    more than a pitch (or three sigma of noise). ``apart_m``: robust root mean square distance across the surfaces where
+    they lie beside each other. ``marks_m``: that of the fiducial points to the nearest of the reference, the farthest
+    tenth left out; NaN where either has fewer than three. ``noise_m`` and ``grids_m``: what noise, and two grids of one
+    pitch, explain of these; ``scatter`` and ``marks_scatter``: their relative errors, times `FALSE_ALARM_SIGMAS`."""
 
     beside: float
     overlap: float
@@ -93,7 +93,7 @@ def judge(
     registration: registered.Registration, reference: PreparedView, view: PreparedView
 ) -> registered.Registration:
     """Return the registration with its overlap and, where it cannot be trusted, its ``failure`` or, for baselines, a
-    note. A failure that the method itself found stays as it is."""
+    note."""
     T = registration.T_reference_view
     broken = ""
     if not (np.isfinite(T).all() and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-6)):
@@ -171,9 +171,8 @@ def _widened(
     registration: registered.Registration, normal: np.ndarray, within: float, across: float, agreement: Agreement
 ) -> registered.Registration:
     """Return the registration with a covariance that includes the errors that a whole view shares, and a note, where
-    the views show such errors. Their mean square is the part of the distances between the views that neither noise nor
-    the covariance explains. It is added to the shift, across the surface and within it. An offset of a whole view does
-    not show: the registration absorbs it."""
+    the views show such errors. Their mean square, what neither noise nor the covariance explains of the distances, is
+    added to the shift, across the surface and within it. An offset of a whole view does not show."""
 
     def beyond_m(measured_m: float, explained_m: float, scatter: float) -> float:
         beyond = measured_m > explained_m * (1 + scatter)
@@ -197,9 +196,8 @@ def _widened(
 
 
 def register(views: Sequence[PreparedView], config: AnyRegistration) -> tuple[registered.Registration, ...]:
-    """Return one registration for each view; the first is that of the reference. Never raises for the content of the
-    views: a registration that cannot be trusted has a ``failure``. Raises UserError where the method needs something
-    that these views never have (colour, a pixel grid, a guess)."""
+    """Return one registration for each view; the first is that of the reference. A registration that cannot be trusted
+    has a ``failure``. Raises UserError where the method needs what a view lacks (colour, a pixel grid, a guess)."""
     if not views:
         raise UserError("no views to register", legal="one or more views, the first being the reference")
     _check_views(views, config)
@@ -217,7 +215,6 @@ def register(views: Sequence[PreparedView], config: AnyRegistration) -> tuple[re
 
 
 def _check_views(views: Sequence[PreparedView], config: AnyRegistration) -> None:
-    """Raise UserError where the method needs something that a view does not have."""
     by_colour = config.method != "nominal" and getattr(config, "points", "marks") == "marks"
     of_odometry = config.method == "odometry"
     for view in views:

@@ -28,9 +28,8 @@ class CpdRegistration(Config):
 
 class PlainRegistration(Config):
     """Methods without settings. ``nominal``: the guesses as they are. ``marks``: centroids of marks, matched by their
-    mutual distances, weighted by their covariances. ``joint``: marks and the common surface of all views together, from
-    the marks' registration. ``odometry``: RGB-D odometry from view to view (Open3D), no marks: a SLAM system without
-    loop closure."""
+    mutual distances. ``joint``: marks and the common surface of all views together. ``odometry``: RGB-D odometry from
+    view to view (Open3D), no marks: a SLAM system without loop closure."""
 
     method: Literal["nominal", "marks", "joint", "odometry"]
 
