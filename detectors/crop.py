@@ -300,16 +300,13 @@ class NoCrop(_Crop):
 
 
 class BoxCrop(_Crop):
-    """Points inside an open box in the camera's frame; the defaults are the thesis'. ``range_max_m`` limits sqrt(x^2 +
-    z^2). ``keep_fraction`` then multiplies the remaining points' extreme x and y, as the thesis' fit script does with
-    0.75."""
+    """Points inside an open box in the camera's frame, by the thesis' defaults. ``range_max_m``: of sqrt(x^2 + z^2)."""
 
     kind: Literal["box"] = "box"
     x_mm: tuple[float, float] = (-500.0, 400.0)
     y_mm: tuple[float, float] = (-300.0, 190.0)
     z_mm: tuple[float, float] = (0.0, 1100.0)
     range_max_m: float | None = Field(default=1.0, gt=0)
-    keep_fraction: float = Field(default=1.0, gt=0, le=1)
 
     @model_validator(mode="after")
     def _ordered(self) -> BoxCrop:
@@ -400,10 +397,6 @@ def _box(cloud: Cloud, config: BoxCrop) -> np.ndarray:
         inside = np.logical_and.reduce([cloud.valid, *((v > low) & (v < high) for v, low, high in limits)])
         if config.range_max_m is not None:
             inside &= np.hypot(x, z) < config.range_max_m
-        if config.keep_fraction < 1.0 and inside.any():
-            part = config.keep_fraction
-            limits = [(v, part * v[inside].min(), part * v[inside].max()) for v in (x, y)]
-            inside = np.logical_and.reduce([inside, *((v > low) & (v < high) for v, low, high in limits)])
     return np.asarray(inside)
 
 

@@ -15,6 +15,7 @@ from typing import Annotated, Literal, Self
 
 import numba
 import numpy as np
+from numpy.polynomial.chebyshev import chebvander
 from pydantic import Field, model_validator
 from scipy.linalg import cho_solve, eigh
 
@@ -86,54 +87,25 @@ class Chebyshev:
         powers = np.array([(i, j) for i, j in orders if cross_terms or not (i and j)])
         return cls(powers, (low + high) / 2, np.maximum((high - low) / 2, TINY_M))
 
+    def _orders(self, xy_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return T_0, T_1, ... (d + 1, n) of u and of v at places (n, 2)."""
+        columns = zip(np.asarray(xy_m, np.float64).T, self.middle_m, self.half_m, strict=True)
+        u, v = (chebvander((x - middle) / half, int(self.powers.max())).T for x, middle, half in columns)
+        return u, v
+
     def basis(self, xy_m: np.ndarray) -> np.ndarray:
         """Return the products (p, n) at places (n, 2)."""
-        return _products(np.ascontiguousarray(xy_m, dtype=np.float64), self.middle_m, self.half_m, self.powers)
+        u, v = self._orders(xy_m)
+        return np.stack([u[a] * v[b] for a, b in self.powers])
 
     def summed(self, coefficients: np.ndarray, xy_m: np.ndarray) -> np.ndarray:
         """Return the products' sum (n,) by coefficients (p,)."""
-        table = np.zeros((self.powers.max() + 1,) * 2)
-        table[self.powers[:, 0], self.powers[:, 1]] = coefficients
-        return _sums(np.ascontiguousarray(xy_m, dtype=np.float64), self.middle_m, self.half_m, table)
-
-
-@numba.njit(**PLAIN)
-def _chebyshev(x: float, out: np.ndarray) -> None:
-    """Fill (d + 1,) with T_0(x) to T_d(x)."""
-    out[0] = 1.0
-    if len(out) > 1:
-        out[1] = x
-    for k in range(2, len(out)):
-        out[k] = 2.0 * x * out[k - 1] - out[k - 2]
-
-
-@numba.njit(**PLAIN)
-def _products(xy: np.ndarray, middle: np.ndarray, half: np.ndarray, powers: np.ndarray) -> np.ndarray:
-    n, terms = len(xy), len(powers)
-    out, table = np.empty((terms, n)), np.empty((2, powers.max() + 1))
-    for i in range(n):
-        for k in range(2):
-            _chebyshev((xy[i, k] - middle[k]) / half[k], table[k])
-        for j in range(terms):
-            out[j, i] = table[0, powers[j, 0]] * table[1, powers[j, 1]]
-    return out
-
-
-@numba.njit(**PLAIN)
-def _sums(xy: np.ndarray, middle: np.ndarray, half: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-    side = len(coefficients)
-    out, u, v = np.empty(len(xy)), np.empty(side), np.empty(side)
-    for i in range(len(xy)):
-        _chebyshev((xy[i, 0] - middle[0]) / half[0], u)
-        _chebyshev((xy[i, 1] - middle[1]) / half[1], v)
-        total = 0.0
-        for a in range(side):
-            inner = 0.0
-            for b in range(side - a):  # the total degree is below the side
-                inner += coefficients[a, b] * v[b]
-            total += inner * u[a]
-        out[i] = total
-    return out
+        u, v = self._orders(xy_m)
+        total = np.zeros(len(xy_m))
+        for order in range(len(u)):
+            of = np.flatnonzero(self.powers[:, 0] == order)
+            total += u[order] * sum(coefficients[k] * v[b] for k, b in zip(of, self.powers[of, 1], strict=True))
+        return total
 
 
 @dataclass(frozen=True)

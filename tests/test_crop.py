@@ -52,17 +52,6 @@ def test_the_default_box_is_the_thesis() -> None:
     np.testing.assert_array_equal(crop(cloud, BoxCrop()), expected)
 
 
-def test_keep_fraction_multiplies_the_extremes_like_the_script() -> None:
-    cloud, _ = board_before_wall()
-    whole = crop(cloud, BoxCrop())
-    x, y = cloud.points_m[..., 0], cloud.points_m[..., 1]
-    kept = whole.copy()
-    for v in (x, y):
-        kept &= (v < 0.75 * v[whole].max()) & (v > 0.75 * v[whole].min())
-    np.testing.assert_array_equal(crop(cloud, BoxCrop(keep_fraction=0.75)), kept)
-    assert 0.5 < kept.sum() / whole.sum() < 0.6
-
-
 def test_polygon_takes_pixel_centres_inside_in_sensor_coordinates() -> None:
     region = Region(20, 60, 30, 90)
     cloud = cloud_of(np.full(region.shape, 0.8), region)
