@@ -114,8 +114,7 @@ def _spline_sums(
 
 @lru_cache(maxsize=32)
 def _penalty(rows: int, columns: int) -> sparse.coo_array:
-    """Return the upper half of the sum of squared third differences of (rows, columns) coefficients, mixed ones three
-    times."""
+    """Return the upper half of the sum of squared third differences of coefficients, mixed ones three times."""
 
     def squared(count: int, order: int) -> np.ndarray:
         differences = np.diff(np.eye(count), order, axis=0)

@@ -4,12 +4,11 @@ Damage lies behind the surface. What stands out before it is noise, fixed patter
 (regions that stand before the surface as a whole, edges in the colour picture or the amplitude) and a margin are left
 out. The tail of these peaks is extrapolated to the threshold at which the wanted number of false calls is expected,
 bumps and hole-like calls together: exponential in (s^q - 1) / q of the score s, less the logarithm by which the maxima
-of normal noise in two dimensions are more. The data weigh the exponents, starting from `PRIOR`; rates are integrated
-out, and scales from where a unit of score is the noise's deviation.
+of normal noise in two dimensions are more. The data weigh the exponents, starting from `PRIOR`; rates and scales are
+integrated out.
 
 Not modelled: noise that is not symmetric beyond what `skew_of` sees in the core; damage towards the camera that is no
-larger than the noise; objects on clouds without a grid. Things on the target that are neither proud of it nor seen in a
-picture raise the threshold.
+larger than the noise; objects on clouds without a grid, or that neither stand out nor are seen in a picture.
 """
 
 from __future__ import annotations
@@ -216,8 +215,7 @@ class Tail:
 
 def _excess(ratios: np.ndarray, exponent: float, floor: float) -> np.ndarray:
     """Return how far scores, as ratios (n,) to the floor, lie above it, in factors of e by which peaks become fewer:
-    for the exponent 2 those of normal noise with deviation 1, whose maxima in two dimensions fall as s exp(-s^2 / 2)
-    (Adler 1981)."""
+    for the exponent 2 as of normal noise, whose maxima in two dimensions fall as s exp(-s^2 / 2) (Adler 1981)."""
     power = np.log(ratios) if exponent == 0.0 else (ratios**exponent - 1.0) / exponent
     return np.asarray(floor**2 * (power - _crowd(floor) * np.log(ratios)))
 

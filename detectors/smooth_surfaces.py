@@ -29,8 +29,7 @@ MOST_SURFACES, WIDE_PART = 8, 0.1
 WIDEST_SLOPE = 5.7
 """tan(80 degrees): no camera sees so far off its axis; a cloud that does was not recorded from its origin."""
 CELL_SPACINGS, CELL_GROWTH, CELLS_FILLED, MAX_RASTER = 1.5, 1.25, 0.99, 4096
-"""Least side of a raster's cell over the distance between neighbours, its growth until so many cells away from rims
-hold a point, and most cells a side."""
+"""Least side of a raster's cell in spacings, its growth until so many cells hold a point, and most cells a side."""
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,9 @@
 """The shapes that a target may have, fitted to points of which some are damage: polynomials z(x, y) (the thesis'
 "robust cubic" and others), quadrics (sphere, cylinder, cone, ...).
 
-Scaled co-ordinates (x and y to [-1, 1]) and Chebyshev products keep the normal equations well conditioned. Large clouds
-are solved on an even sample first and finished on all points. Not modelled: errors in x and y, correlated noise,
-overhangs, creases, several sheets. Damage of one to three sigma bends every point-wise robust fit by a third of a
-sigma.
+Large clouds are solved on an even sample first and finished on all points. Not modelled: errors in x and y, correlated
+noise, overhangs, creases, several sheets. Damage of one to three sigma bends every point-wise robust fit by a third of
+a sigma.
 """
 
 from __future__ import annotations
@@ -48,13 +47,12 @@ class ReferenceConfig(Config):
 
 
 class SurfaceConfig(Config):
-    """``shape``: ``polynomial`` of the stated degree; ``mesh``: the ``reference``, laid onto the cloud; ``auto``: the
-    simplest of plane, polynomials, quadric and free form that the cloud's own evidence asks for, whatever ``degree``
-    says; ``free_form`` in any case. ``scale_mm``: the width above which a free form follows the cloud. ``degree``:
-    total degree; 3 has the 10 terms of MATLAB's poly33. ``method``: ``lar`` least absolute residuals; ``bisquare``
-    Tukey's, from a least-squares start (MATLAB's semantics); ``lts`` a FAST-LTS start, then bisquare, which survives
-    damage of a third of the surface; ``least_squares``. ``drop_cross_terms``: no term in both x and
-    y (as the thesis' script)."""
+    """``shape``: ``polynomial`` of the stated total ``degree`` (3: MATLAB's poly33); ``mesh``: the ``reference``, laid
+    onto the cloud; ``auto``: the simplest of plane, polynomials, quadric and free form that the cloud's own evidence
+    asks for; ``free_form`` in any case. ``scale_mm``: the width above which a free form follows the cloud. ``method``:
+    ``lar`` least absolute residuals; ``bisquare`` Tukey's, from a least-squares start (MATLAB's semantics); ``lts`` a
+    FAST-LTS start, then bisquare, which survives damage of a third of the surface; ``least_squares``.
+    ``drop_cross_terms``: no term in both x and y (as the thesis' script)."""
 
     shape: Literal["polynomial", "auto", "free_form", "mesh"] = "polynomial"
     reference: ReferenceConfig | None = None
@@ -136,11 +134,11 @@ def fit_surface(x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray, config: Surfa
     fewer points than coefficients, or where all points lie on a line."""
     terms = (2 * config.degree + 1) if config.drop_cross_terms else (config.degree + 1) * (config.degree + 2) // 2
     if len(z_m) < terms:
-        raise UserError(
-            f"{len(z_m)} valid points cannot determine the {terms} coefficients of a surface of degree {config.degree}",
-            legal=f"at least {terms} points, and many more to be useful",
-            fix="widen the crop, lower surface.degree, or check the capture",
+        what = (
+            f"{len(z_m)} valid points cannot determine the {terms} coefficients of a surface of degree {config.degree}"
         )
+        legal, fix = f"{terms} points at least", "widen the crop, lower surface.degree, or check the capture"
+        raise UserError(what, legal=legal, fix=fix)
     xy = np.column_stack([x_m, y_m]).astype(np.float64)
     chebyshev = Chebyshev.over(xy, config.degree, not config.drop_cross_terms)
     basis = chebyshev.basis(xy)
@@ -148,10 +146,8 @@ def fit_surface(x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray, config: Surfa
     z = np.asarray(z_m, dtype=np.float64) - middle
     plain = _solved(basis, z) if config.method == "least_squares" else _solved(*_thinned(basis, z, SAMPLE_POINTS))
     if plain is None:
-        raise UserError(
-            f"the points do not determine a surface of degree {config.degree}: they lie on a line or a curve",
-            fix="widen the crop, or lower surface.degree",
-        )
+        what = f"the points do not determine a surface of degree {config.degree}: they lie on a line or a curve"
+        raise UserError(what, fix="widen the crop, or lower surface.degree")
     if config.method == "lar":
         c, steps, converged, note = _lar(basis, z, plain[0])
     elif config.method == "bisquare":
@@ -230,8 +226,7 @@ def _lar(basis: np.ndarray, z: np.ndarray, start: np.ndarray, knees: np.ndarray 
 
 @numba.njit(**PLAIN)
 def _huber(rows: np.ndarray, z: np.ndarray, c: np.ndarray, knee: float) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return the sum of Huber's function over its knee, its negative gradient (p,), and the normal matrix (p, p) of the
-    points inside the knee."""
+    """Return the sum of Huber's function over its knee, its negative gradient (p,), and the inner normal matrix."""
     terms = len(c)
     value, pull, inside = 0.0, np.zeros(terms), np.zeros((terms, terms))
     for i in range(len(z)):
@@ -368,9 +363,8 @@ def _ridged(design: np.ndarray, z: np.ndarray, weights: np.ndarray) -> np.ndarra
 
 
 def quadric(points: np.ndarray, weights: np.ndarray, central: bool) -> Fit | None:
-    """Fit the quadric with the least weighted squares of distances along the rays, to first order: Taubin's algebraic
-    fit (1991), then Gauss-Newton steps. None where the points lie on no single sheet. ``central``: rays leave the
-    origin; else they are parallel to z."""
+    """Fit the quadric with the least weighted squares along the rays, to first order: Taubin's algebraic fit (1991),
+    then Gauss-Newton. None without a single sheet. ``central``: rays leave the origin, else along z."""
     middle = np.average(points, axis=0, weights=weights)
     size = float(np.sqrt(np.average(((points - middle) ** 2).sum(axis=1), weights=weights))) or 1.0
     scaled = (points - middle) / size

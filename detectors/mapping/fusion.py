@@ -23,6 +23,7 @@ from itertools import combinations, product
 
 import numpy as np
 
+from detectors.average import pixel_medians
 from detectors.mapping import placing
 from detectors.noise import rounding_left_m2
 from detectors.surface import SurfaceConfig, fit_surface
@@ -155,25 +156,16 @@ def _outliers(heights: np.ndarray, variances: np.ndarray) -> np.ndarray:
     that is larger) from the median of at least three views, where they cannot be damage: as far before the fitted
     surface, where damage would have been in the others' way; or behind, but alone among its own neighbours, as a flying
     pixel is."""
-    middle = _middle(heights)
+    middle = pixel_medians(heights)
     deviation = heights - middle
-    limit = GATE_SIGMAS * np.maximum(1.4826 * _middle(np.abs(deviation)), np.sqrt(variances))
+    limit = GATE_SIGMAS * np.maximum(1.4826 * pixel_medians(np.abs(deviation)), np.sqrt(variances))
     several = np.isfinite(heights).sum(axis=0) >= 3
     rejected: np.ndarray = several & (deviation < -limit) & (heights < -limit)
     k, row, column = np.nonzero(several & (deviation > limit))
     padded = np.pad(heights, ((0, 0), (1, 1), (1, 1)), constant_values=np.nan)
     near = np.stack([padded[k, row + down, column + right] for down in range(3) for right in range(3)])
-    rejected[k, row, column] = near[4] - _middle(near) > limit[k, row, column]
+    rejected[k, row, column] = near[4] - pixel_medians(near) > limit[k, row, column]
     return rejected
-
-
-def _middle(values: np.ndarray) -> np.ndarray:
-    """Return the median of the known values along the first axis; NaN where there is none."""
-    ordered = np.sort(values, axis=0)
-    count = np.isfinite(values).sum(axis=0)
-    places = np.maximum(count - 1, 0) // 2, count // 2
-    low, high = (np.take_along_axis(ordered, place[None], axis=0)[0] for place in places)
-    return 0.5 * (low + high)
 
 
 LATERAL_PX = 0.1

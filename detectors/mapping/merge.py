@@ -66,11 +66,8 @@ def integrate(views: Sequence[ChosenView], voxel_m: float | None) -> tuple[Cloud
         rgb=None if rgb is None else np.round(255.0 * np.clip(rgb[order], 0.0, 1.0)).astype(np.uint8)[None],
         left_out=tuple(left for cloud in clouds for left in cloud.left_out),
     )
-    note = (
-        f"voxels of {1e3 * voxel:.2f} mm, cut off at {1e3 * voxel * TRUNCATION_VOXELS:.1f} mm;"
-        f" {len(points) - n} points on walls steeper than {WALL_DEG:.0f} degrees are left out"
-    )
-    return merged, (note,)
+    note = f"voxels of {1e3 * voxel:.2f} mm, cut off at {1e3 * voxel * TRUNCATION_VOXELS:.1f} mm;"
+    return merged, (f"{note} {len(points) - n} points on walls steeper than {WALL_DEG:.0f} degrees are left out",)
 
 
 def _undistorted(view: ChosenView) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
@@ -114,10 +111,8 @@ def _crossings(views: Sequence[ChosenView], voxel: float) -> tuple[np.ndarray, n
             found = field.extract_point_cloud(0.5)
         except RuntimeError as error:
             # Open3D cannot make a cloud of no points
-            raise UserError(
-                f"a volume with voxels of {1e3 * voxel:.3g} mm holds no surface of the target",
-                fix="choose smaller voxels, check the crop, or merge in another way",
-            ) from error
+            what = f"a volume with voxels of {1e3 * voxel:.3g} mm holds no surface of the target"
+            raise UserError(what, fix="choose smaller voxels, check the crop, or merge in another way") from error
         points, normals = (found.point[name].numpy().astype(np.float64) for name in ("positions", "normals"))
         return points, normals, found.point.colors.numpy().copy() if coloured else None
 
@@ -207,11 +202,9 @@ def merge(views: Sequence[PreparedView], registrations: Sequence[Registration], 
         else:
             chosen.append(view)
     if not chosen:
-        raise UserError(
-            f"no view is left to merge: {'; '.join(left_out)}",
-            legal="at least one view that is registered and holds points of the target",
-            fix="mend the views or their crop, or choose another way to register",
-        )
+        legal = "at least one view that is registered and holds points of the target"
+        fix = "mend the views or their crop, or choose another way to register"
+        raise UserError(f"no view is left to merge: {'; '.join(left_out)}", legal=legal, fix=fix)
     T_reference_cloud, surface_map, notes = np.eye(4), None, tuple[str, ...]()
     if isinstance(config, GridMerge):
         cloud = _on_grid(chosen, config.step_mm * MM)
@@ -243,11 +236,9 @@ def _on_grid(views: Sequence[ChosenView], step_m: float) -> Cloud:
         corner = np.min([low for low, high in overlaps if (low <= high).all()], axis=0)
         boxes = np.floor((points[shared] - corner) / step_m)
         if boxes.max() >= MAX_BOXES:
-            raise UserError(
-                f"{np.ptp(points[shared], axis=0).max():.3g} m of points hold too many boxes of {step_m * 1e3:.3g} mm",
-                legal=f"up to {MAX_BOXES} boxes along an axis",
-                fix="crop the views to the target, or raise merge.step_mm",
-            )
+            what = f"{np.ptp(points[shared], axis=0).max():.3g} m hold too many boxes of {step_m * 1e3:.3g} mm"
+            fix = "crop the views to the target, or raise merge.step_mm"
+            raise UserError(what, legal=f"up to {MAX_BOXES} boxes along an axis", fix=fix)
         x, y, z = boxes.astype(np.int64).T
         keys = (x << 42) | (y << 21) | z
         order = np.argsort(keys, kind="stable")

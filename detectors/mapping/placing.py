@@ -252,10 +252,9 @@ def grid_over(views: Sequence[PlacedView], cell_m: float | None) -> CellGrid:
     first, last = np.ceil(low / step), np.floor(high / step)
     columns, rows = (np.maximum(last - first, 0) + 1).astype(int)
     if not columns * rows <= MAX_CELLS:
-        raise UserError(
+        what = (
             f"a map of {high[0] - low[0]:.3g} x {high[1] - low[1]:.3g} m with cells of {step * 1e3:.3g} mm would have"
-            f" {columns * rows:.3g} cells",
-            legal=f"up to {MAX_CELLS:.2g} cells",
-            fix="crop the views to the target, or give a larger merge.cell_mm",
         )
+        fix = "crop the views to the target, or give a larger merge.cell_mm"
+        raise UserError(f"{what} {columns * rows:.3g} cells", legal=f"up to {MAX_CELLS:.2g} cells", fix=fix)
     return CellGrid(float(first[0] * step), float(first[1] * step), float(step), (int(rows), int(columns)))
