@@ -60,20 +60,11 @@ class Candidate:
         """Part of all pixels."""
         return self.pixels / self.own.size
 
-    @property
-    def distance_m(self) -> float:
-        """Median of z."""
-        return float(self._depths_m[1])
-
-    @property
-    def nearest_m(self) -> float:
-        """First percentile of z."""
-        return float(self._depths_m[0])
-
-    @property
-    def farthest_m(self) -> float:
-        """99th percentile of z."""
-        return float(self._depths_m[2])
+    @cached_property
+    def depths_m(self) -> tuple[float, float, float]:
+        """First, 50th and 99th percentile of z."""
+        near, middle, far = np.quantile(self._some[:, 2], (0.01, 0.5, 0.99)).tolist()
+        return near, middle, far
 
     @property
     def tilt_deg(self) -> float:
@@ -119,10 +110,6 @@ class Candidate:
         return np.asarray(self.grid.points_m.reshape(-1, 3)[places[:: max(1, len(places) // MOST_SAMPLES)]])
 
     @cached_property
-    def _depths_m(self) -> np.ndarray:
-        return np.quantile(self._some[:, 2], (0.01, 0.5, 0.99))
-
-    @cached_property
     def _plane(self) -> tuple[np.ndarray, np.ndarray]:
         """The sample about its middle, and its principal axes (3, 3), the normal first."""
         centred = self._some - self._some.mean(axis=0)
@@ -149,37 +136,13 @@ class _Border(NamedTuple):
     behind_m: float
 
 
-def propose(cloud: Cloud, crease_deg: float, smooth_px: int, inset_px: int, wanted: int | None) -> Choice:
-    """Choose the target of a cloud with a valid point: the proposal, or candidate number ``wanted``."""
-    grid, spacings = cloud, 1.0
-    if not cloud.organised:
-        grid, rows, columns, spacings = raster(cloud.points_m[cloud.valid], cloud)
-        smooth_px = max(3, 2 * round(smooth_px / spacings / 2) - 1)
-        # the cell that holds the rim, and every cell that a point inset_px - 1 spacings farther in may lie in
-        inset_px = math.ceil((inset_px - 1) / spacings) + 1 if inset_px else 0
-    candidates, doubts = _candidates(smooth_surfaces(grid, crease_deg, smooth_px), grid)
-    if wanted is not None and wanted > len(candidates):
-        known = "".join(f"\n  --target {n}: {described_text(each)}" for n, each in enumerate(candidates, start=1))
-        legal = f"1 to {len(candidates)}:{known}" if candidates else "none"
-        fix = "choose one of these, or draw the outline with --crop polygon:u,v,u,v,u,v"
-        raise UserError(f"--target {wanted}: there are {len(candidates)} large smooth surfaces", legal=legal, fix=fix)
-    taken = wanted or 1
-    mask = candidates[taken - 1].outline & grid.valid if candidates else np.zeros(grid.valid.shape, bool)
-    mask = inset(mask, inset_px)
-    if not cloud.organised:
-        kept, mask = mask, cloud.valid.copy()
-        mask[mask] = kept[rows, columns]
-    warnings = (f"it is doubtful which surface is the target: {'; '.join(doubts)}",) if doubts and not wanted else ()
-    return Choice(candidates, taken, mask, grid, warnings)
-
-
 def described_text(candidate: Candidate) -> str:
     """Return distance, extent, share of the view and tilt in words."""
     long, short = (f"{side / MM:.0f}" for side in candidate.extent_m)
-    depths = f"{candidate.nearest_m:.2f} to {candidate.farthest_m:.2f} m"
+    near, middle, far = candidate.depths_m
     share = f"{100 * candidate.share:.2g}" if candidate.share < 0.095 else f"{100 * candidate.share:.0f}"
     size = f"{long} x {short} mm, {share} % of the view, tilted by {candidate.tilt_deg:.0f} degrees"
-    return f"{candidate.distance_m:.2f} m away ({depths}), {size}"
+    return f"{middle:.2f} m away ({near:.2f} to {far:.2f} m), {size}"
 
 
 def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...], list[str]]:
@@ -225,7 +188,7 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
         it, other = described[i], described[j]
         ratio = it.weight / max(other.weight, 1e-9)
         facing = math.cos(math.radians(it.tilt_deg)) / max(math.cos(math.radians(other.tilt_deg)), 1e-2)
-        near = other.distance_m / max(it.distance_m, 1e-6)
+        near = other.depths_m[1] / max(it.depths_m[1], 1e-6)
         return _probability(ratio**0.5 * facing**2 * near), "two surfaces are about as large and as near"
 
     table = [[judged(i, j) for j in numbers] for i in numbers]
@@ -373,8 +336,28 @@ def crop(cloud: Cloud, config: AnyCrop) -> np.ndarray:
 
 
 def choice_of(cloud: Cloud, config: AutoCrop) -> Choice:
-    """Return the automatic crop and all that it chose from. Raises UserError where there is no candidate ``target``."""
-    return propose(cloud, config.crease_deg, config.smooth_px, config.inset_px, config.target)
+    """Return the automatic crop of a cloud with a valid point, and all that it chose from. Raises UserError where there
+    is no candidate ``target``."""
+    grid, smooth_px, inset_px, wanted = cloud, config.smooth_px, config.inset_px, config.target
+    if not cloud.organised:
+        grid, rows, columns, spacings = raster(cloud.points_m[cloud.valid], cloud)
+        smooth_px = max(3, 2 * round(smooth_px / spacings / 2) - 1)
+        # the cell that holds the rim, and every cell that a point inset_px - 1 spacings farther in may lie in
+        inset_px = math.ceil((inset_px - 1) / spacings) + 1 if inset_px else 0
+    candidates, doubts = _candidates(smooth_surfaces(grid, config.crease_deg, smooth_px), grid)
+    if wanted is not None and wanted > len(candidates):
+        known = "".join(f"\n  --target {n}: {described_text(each)}" for n, each in enumerate(candidates, start=1))
+        legal = f"1 to {len(candidates)}:{known}" if candidates else "none"
+        fix = "choose one of these, or draw the outline with --crop polygon:u,v,u,v,u,v"
+        raise UserError(f"--target {wanted}: there are {len(candidates)} large smooth surfaces", legal=legal, fix=fix)
+    taken = wanted or 1
+    mask = candidates[taken - 1].outline & grid.valid if candidates else np.zeros(grid.valid.shape, bool)
+    mask = inset(mask, inset_px)
+    if not cloud.organised:
+        kept, mask = mask, cloud.valid.copy()
+        mask[mask] = kept[rows, columns]
+    warnings = (f"it is doubtful which surface is the target: {'; '.join(doubts)}",) if doubts and not wanted else ()
+    return Choice(candidates, taken, mask, grid, warnings)
 
 
 def _box(cloud: Cloud, config: BoxCrop) -> np.ndarray:

@@ -166,9 +166,6 @@ def separated(captures: Sequence[FlatCapture], lens: Lens) -> Separated:
     return _with_doubts(found)
 
 
-# ---------------------------------------------------------------- the sum of pattern and shape
-
-
 def _averaged(residuals: np.ndarray, variances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the weighted mean (h, w) over captures and its variance; NaN where no capture counts."""
     weights = np.where(np.isfinite(residuals), 1 / variances, 0.0)
@@ -233,9 +230,6 @@ def _on_one_plane(captures: Sequence[FlatCapture]) -> tuple[FlatCapture, ...]:
     across /= np.linalg.norm(across)
     axes = np.stack([across, np.cross(normal, across)], axis=-1)
     return tuple(replace(capture, places_m=capture.places_m @ axes) for capture in captures)
-
-
-# ---------------------------------------------------------------- whether it can be trusted
 
 
 def _groups(distances: Sequence[float]) -> Iterator[list[int]]:

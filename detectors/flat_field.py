@@ -107,9 +107,6 @@ def _refuse_other(cloud: Cloud, field: FlatField) -> None:
             raise UserError(what, legal="the same camera in the same mode", fix=AGAIN)
 
 
-# ---------------------------------------------------------------- the file
-
-
 def save_flat_field(path: Path, field: FlatField) -> None:
     """Write the file, whole or not at all. Raises UserError where it cannot be written."""
     lens = field.lens

@@ -89,9 +89,6 @@ class PlaneRansacDetector(ScoreMapDetector[PlaneRansacConfig]):
         return tuple(plane.tolist())
 
 
-# ---------------------------------------------------------------- M3C2
-
-
 class M3c2Config(ScoreMapConfig):
     """``reference``: a capture of the same target without damage, any that ``harness.detect`` reads, in the frame of
     the clouds; without it the distance is to ``surface``, fitted to the cloud itself. ``registration_error_mm``: how
@@ -217,9 +214,6 @@ def _py4dgeo() -> Any:
     log.handlers.clear()
     log.setLevel(logging.WARNING)
     return py4dgeo
-
-
-# ---------------------------------------------------------------- features in a memory
 
 
 class FpfhMemoryConfig(ScoreMapConfig):

@@ -35,7 +35,7 @@ BISQUARE_CONVERGED, GAP_CONVERGED = 1e-2, 1e-6
 """Bisquare stops below this part of a standard error of the fit, LAR when the duality gap is within this part."""
 TINY_M = 1e-9  # residuals below a nanometre are rounding of the arithmetic
 
-Solution = tuple[np.ndarray, int, bool, str]  # coefficients (p,), steps, whether these converged, and what was done
+Solution = tuple[np.ndarray, str]  # coefficients (p,) and what was done
 
 
 class ReferenceConfig(Config):
@@ -112,8 +112,6 @@ class Surface:
 
     chebyshev: Chebyshev
     coefficients: np.ndarray
-    iterations: int
-    converged: bool
     note: str
 
     def evaluate(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
@@ -149,17 +147,17 @@ def fit_surface(x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray, config: Surfa
         what = f"the points do not determine a surface of degree {config.degree}: they lie on a line or a curve"
         raise UserError(what, fix="widen the crop, or lower surface.degree")
     if config.method == "lar":
-        c, steps, converged, note = _lar(basis, z, plain[0])
+        c, note = _lar(basis, z, plain[0])
     elif config.method == "bisquare":
-        c, steps, converged, note = _bisquare(basis, z, None, "bisquare from a least-squares start")
+        c, note = _bisquare(basis, z, None, "bisquare from a least-squares start")
     elif config.method == "lts":
         start = _lts_start(*_thinned(basis, z, LTS_SAMPLE))
-        c, steps, converged, note = _bisquare(basis, z, start, "bisquare from a FAST-LTS start")
+        c, note = _bisquare(basis, z, start, "bisquare from a FAST-LTS start")
     else:
-        c, steps, converged, note = plain[0], 1, True, "least squares"
+        c, note = plain[0], "least squares"
     c = c.copy()
     c[0] += middle
-    return Surface(chebyshev, c, steps, converged, note)
+    return Surface(chebyshev, c, note)
 
 
 def _solved(
@@ -200,7 +198,6 @@ def _lar(basis: np.ndarray, z: np.ndarray, start: np.ndarray, knees: np.ndarray 
         margin = 5.0 * 1.25 / 0.6745 * np.sqrt(len(basis) / len(few_z))
     r = z - c @ basis
     scale = max(float(np.median(np.abs(r[:: max(1, len(r) // SAMPLE_POINTS)]))), TINY_M)
-    steps, gap = 0, np.inf
     for knee in scale * knees:
         enough = 0.001 * GAP_CONVERGED * float(np.abs(r).sum())
         reach = max(margin * scale, 10.0 * knee)
@@ -209,8 +206,8 @@ def _lar(basis: np.ndarray, z: np.ndarray, start: np.ndarray, knees: np.ndarray 
             near = np.flatnonzero(~far)
             far_pull = basis @ np.where(far, np.sign(r), 0.0)
             rows = np.ascontiguousarray(np.take(basis, near, axis=1).T)
-            new, spent = _smoothed_descent(rows, z[near], far_pull, c, knee, enough)
-            after, steps = z - new @ basis, steps + spent
+            new = _smoothed_descent(rows, z[near], far_pull, c, knee, enough)
+            after = z - new @ basis
             # a far point may have crossed the surface, or come within the knee of it
             if not (far & ((r * after <= 0.0) | (np.abs(after) < knee))).any():
                 break
@@ -221,7 +218,7 @@ def _lar(basis: np.ndarray, z: np.ndarray, start: np.ndarray, knees: np.ndarray 
         gap = float((inside - inside**2 / knee).sum()) / max(float(sizes.sum()), TINY_M)
         if gap <= GAP_CONVERGED:
             break
-    return c, steps, gap <= GAP_CONVERGED, f"least absolute residuals, within {min(gap, 1.0):.0e} of the least sum"
+    return c, f"least absolute residuals, within {min(gap, 1.0):.0e} of the least sum"
 
 
 @numba.njit(**PLAIN)
@@ -248,7 +245,7 @@ def _huber(rows: np.ndarray, z: np.ndarray, c: np.ndarray, knee: float) -> tuple
 
 def _smoothed_descent(
     rows: np.ndarray, z: np.ndarray, far_pull: np.ndarray, start: np.ndarray, knee: float, enough: float
-) -> tuple[np.ndarray, int]:
+) -> np.ndarray:
     """Minimise sum huber(r, knee) - c' far_pull: Newton, or where it fails a majorising step, which always descends."""
 
     def state(c: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
@@ -261,21 +258,21 @@ def _smoothed_descent(
         return next((trial for trial in trials if trial[0] < value), None)
 
     value, c, pull, inside = state(start)
-    for step in range(1, LAR_STEPS + 1):
+    for _ in range(LAR_STEPS):
         factor, moved = _factor(inside), None
         if factor is not None:
             way = knee * cho_solve((factor, True), pull, check_finite=False)
             if way @ pull < enough:
-                return c, step
+                return c
             moved = lower(way)
         if moved is None:
             # reweighted least squares: each |r| beyond the knee under its tangent parabola
             weighted = rows / np.maximum(np.abs(z - rows @ c), knee)[:, None]
             moved = lower(np.linalg.lstsq(weighted.T @ rows, pull, rcond=1e-12)[0])
         if moved is None or value - moved[0] < enough:
-            return c, step
+            return c
         value, c, pull, inside = moved
-    return c, LAR_STEPS
+    return c
 
 
 def bisquare_weights(r: np.ndarray, limit: float) -> np.ndarray:
@@ -287,10 +284,7 @@ def _bisquare(basis: np.ndarray, z: np.ndarray, start: np.ndarray | None, note: 
     """Reweight least squares with MATLAB's robustfit semantics, on a sample first, then on all points."""
     few_basis, few_z = _thinned(basis, z, SAMPLE_POINTS)
     inner = _reweighted(few_basis, few_z, start, 50, note)
-    if len(few_z) == len(z):
-        return inner
-    c, steps, converged, note = _reweighted(basis, z, inner[0], 8, note)
-    return c, inner[1] + steps, converged, note
+    return inner if len(few_z) == len(z) else _reweighted(basis, z, inner[0], 8, note)
 
 
 def _reweighted(basis: np.ndarray, z: np.ndarray, start: np.ndarray | None, steps: int, note: str) -> Solution:
@@ -299,7 +293,7 @@ def _reweighted(basis: np.ndarray, z: np.ndarray, start: np.ndarray | None, step
     c, terms = plain[0] if start is None else start, len(basis)
     leverage = ((np.linalg.inv(plain[1]) @ basis) ** 2).sum(axis=0)
     adjust = 1.0 / np.sqrt(1.0 - np.minimum(leverage, 0.9999))
-    for step in range(1, steps + 1):
+    for _ in range(steps):
         adjusted = (z - c @ basis) * adjust
         # MATLAB's robust sigma: median of |r| without as many of the smallest as there are terms, over 0.6745
         sizes = np.abs(adjusted)
@@ -307,14 +301,14 @@ def _reweighted(basis: np.ndarray, z: np.ndarray, start: np.ndarray | None, step
         scale = max(float(np.partition(sizes, place)[place]) / 0.6745, TINY_M)
         found = _solved(basis, z, bisquare_weights(adjusted, BISQUARE_TUNING * scale))
         if found is None:
-            return c, step, False, note + "; stopped: too few points kept weight"
+            return c, note + "; stopped: too few points kept weight"
         new, factor = found
         # norm of the move in standard errors of the fit: factor' (new - c) has unit covariance times scale^2
         moved = float(np.linalg.norm(factor.T @ (new - c))) / scale
         c = new
         if moved < BISQUARE_CONVERGED * np.sqrt(terms):
-            return c, step, True, note
-    return c, steps, False, note
+            break
+    return c, note
 
 
 def _lts_start(basis: np.ndarray, z: np.ndarray) -> np.ndarray:

@@ -65,7 +65,6 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
         typical = 1.0 if deviation is None else median_of(deviation)
         scale = max(spread, floor) if deviation is None else np.maximum(spread * deviation, floor)
         notes = {"surface": surface.note, "points": len(z), "spread_m": spread * typical, "floor_m": floor}
-        notes |= {"surface_iterations": surface.iterations, "surface_converged": surface.converged}
         score, residual_m, z_m = (on_grid(each, mask) for each in (np.abs(residual) / scale, residual, fitted))
         return Evidence(score, residual_m, z_m, float(np.median(scale)), notes)
 

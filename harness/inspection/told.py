@@ -124,7 +124,9 @@ def choice_facts(choice: Choice | None) -> dict[str, Any] | None:
     candidates = [
         {
             "number": n,
-            **{f"{name}_mm": getattr(each, f"{name}_m") / MM for name in ("distance", "nearest", "farthest")},
+            **{
+                f"{name}_mm": m / MM for name, m in zip(("nearest", "distance", "farthest"), each.depths_m, strict=True)
+            },
             "extent_mm": [side / MM for side in each.extent_m],
             "share_of_view": each.share,
             "tilt_deg": each.tilt_deg,
