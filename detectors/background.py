@@ -353,11 +353,9 @@ def _misfit(cells: _Cells, fit: Fit, name: str) -> tuple[str, dict[str, Any]]:
     beyond = enough & (np.abs(smooth) > np.maximum(chance, SEEN * pixel))
     rms_m = float(np.sqrt(np.mean(smooth[enough] ** 2))) if enough.any() else 0.0
     share = float(beyond.sum() / max(enough.sum(), 1))
-    text = (
-        f"the surface does not fit here: {name} leaves {1e3 * rms_m:.2g} mm rms at scales above"
-        f" {STRUCTURE_CELLS * cells.side_m / MM:.2g} mm, where the noise of a pixel is {1e3 * pixel:.2g} mm, on"
-        f" {100 * share:.0f} % of the target; findings there may be its shape"
-    )
+    text = f"the surface does not fit here: {name} leaves {1e3 * rms_m:.2g} mm rms at scales above"
+    text += f" {STRUCTURE_CELLS * cells.side_m / MM:.2g} mm, where the noise of a pixel is {1e3 * pixel:.2g} mm, on"
+    text += f" {100 * share:.0f} % of the target; findings there may be its shape"
     notes = {"misfit_share": share, "misfit_rms_m": rms_m, "local_noise_m": pixel}
     return (text if share >= MISFIT_FROM else ""), notes
 

@@ -257,9 +257,9 @@ def _with_doubts(found: Separated) -> Separated:
     said, captures, field, rms_m = [], found.captures, found.field, found.field.rms_m
     if len(captures) == 1 or not _moved(captures):
         told = "one capture" if len(captures) == 1 else "nothing shows that the camera moved between the captures"
+        told += ": the surface's own shape cannot be told from the pattern, and the surface is taken to be flat"
         said.append(
-            f"{told}: the surface's own shape cannot be told from the pattern, and the surface is taken to be flat"
-            f" (move the camera by {LEAST_SHIFT_M / MM:.0f} mm or more, and state --poses where only along the surface)"
+            f"{told} (move the camera by {LEAST_SHIFT_M / MM:.0f} mm or more; if along the surface, state --poses)"
         )
     parts = ((found.in_time, "from the first captures to the last"), (found.in_range, "with distance"))
     changes = [(part, apart) for part, apart in parts if part is not None and part.is_change_of(rms_m)]

@@ -161,13 +161,6 @@ def _painted(
     return images
 
 
-def derivatives(patch: HolePatch, hole: np.ndarray) -> np.ndarray:
-    """Return the derivatives (5, h, w) of a hole's residual by its numbers (5,), from differences."""
-    steps = _steps(hole)
-    image, *moved = pictures(patch, np.vstack([hole, hole + np.diag(steps)]))
-    return np.asarray((np.array(moved) - image) / steps[:, None, None])
-
-
 @numba.njit(**PLAIN)
 def _steps(hole: np.ndarray) -> np.ndarray:
     depth = hole[3] if hole[3] != 0.0 else STEP

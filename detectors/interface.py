@@ -69,11 +69,9 @@ class MissingReturns:
     def blind_text(self) -> str:
         """Sentence on how much of the target is blind, and how much of that chance explains."""
         places = f"{len(self.detections)} place{'' if len(self.detections) == 1 else 's'}"
-        return (
-            f"blind: {100 * self.blind:.2g} % of the target's pixels returned nothing; {places} of {self.least_points}"
-            f" connected pixels and more ({self.expected:.1g} expected by chance; scattered dropouts"
-            f" {100 * self.dropouts:.2g} %)"
-        )
+        chance = f"{self.expected:.1g} expected by chance; scattered dropouts {100 * self.dropouts:.2g} %"
+        places += f" of {self.least_points} connected pixels and more ({chance})"
+        return f"blind: {100 * self.blind:.2g} % of the target's pixels returned nothing; {places}"
 
     @property
     def facts(self) -> dict[str, float]:

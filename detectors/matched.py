@@ -147,9 +147,8 @@ class MatchedDetector(LocalDetector):
             residual_m = np.where(known, evidence.residual_m, 0.0)
             covariance = _covariance(_in_deviations(residual_m, known.astype(np.float32), (0.0, 0.0))[0], known)
         reach = np.arange(-whitening.LONGEST_LAG_PX, whitening.LONGEST_LAG_PX + 1)
-        lags = scipy.fft.irfft2(
-            whitening.spectrum(covariance, (whitening.GRID, whitening.GRID)), (whitening.GRID, whitening.GRID)
-        )[np.ix_(reach, reach)]
+        grid = (whitening.GRID, whitening.GRID)
+        lags = scipy.fft.irfft2(whitening.spectrum(covariance, grid), grid)[np.ix_(reach, reach)]
         return np.asarray(lags / lags[whitening.LONGEST_LAG_PX, whitening.LONGEST_LAG_PX], np.float64)
 
     def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:

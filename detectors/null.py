@@ -82,18 +82,12 @@ def own_threshold(detector: Detector, cloud: Cloud, evidence: Evidence, false_ca
     doubts = []
     skew = skew_of(evidence)
     if abs(skew) > MOST_SKEW:
-        side = "behind" if skew > 0 else "before"
-        doubts.append(
-            f"the residual is not symmetric: its quartiles reach {(1 + abs(skew)) / (1 - abs(skew)):.1f} times as far"
-            f" {side} the surface as to the other side"
-        )
+        farther = f"{(1 + abs(skew)) / (1 - abs(skew)):.1f} times as far {'behind' if skew > 0 else 'before'}"
+        doubts.append(f"the residual is not symmetric: its quartiles reach {farther} the surface as to the other side")
     if len(peaks) < FEWEST_PEAKS:
-        doubts.append(
-            f"only {len(peaks)} peaks of noise stand out towards the camera, too few to set a threshold by"
-            f" ({FEWEST_PEAKS} at least)"
-        )
-        nan = float("nan")
-        return OwnThreshold(nan, nan, nan, nan, len(peaks), floor, objects, 0, evidence, tuple(doubts))
+        few = f"only {len(peaks)} peaks of noise stand out towards the camera, too few to set a threshold by"
+        doubts.append(f"{few} ({FEWEST_PEAKS} at least)")
+        return OwnThreshold(*(float("nan"),) * 4, len(peaks), floor, objects, 0, evidence, tuple(doubts))
     # all peaks, or the higher half, and again, while too many lie above the threshold: a few wide waves of a fixed
     # pattern are then higher than the noise of many pixels, and one tail does not hold both
     falling, number = np.sort(peaks)[::-1], false_calls / 2.0
@@ -108,10 +102,8 @@ def own_threshold(detector: Detector, cloud: Cloud, evidence: Evidence, false_ca
     low, high = (2.0 * bound for bound in tail.interval(threshold))
     hidden = int((covered & known).sum())
     if hidden > MOST_MASKED * known.sum():
-        doubts.append(
-            f"{100 * hidden / known.sum():.0f} % of what is judged lies under or beside objects before the surface,"
-            " and the rest may not stand for the whole"
-        )
+        share = f"{100 * hidden / known.sum():.0f} % of what is judged"
+        doubts.append(f"{share} lies under or beside objects, and the rest may not stand for the whole")
     expected, searched = 2.0 * tail.expected(threshold), _only(evidence, ~rim)
     told = (tail.peaks, tail.floor, objects, int(rim.sum()))
     return OwnThreshold(threshold, expected, low, high, *told, searched, tuple(doubts))

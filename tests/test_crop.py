@@ -82,7 +82,7 @@ def test_the_wall_can_be_asked_for_and_is_taken_without_the_board() -> None:
     choice = choice_of(cloud, AutoCrop(target=2, inset_px=0))
     first, second = choice.candidates
     assert choice.taken == 2 and not choice.warnings
-    assert first.distance_m == pytest.approx(0.7, abs=0.01) and second.distance_m == pytest.approx(1.2, abs=0.001)
+    assert first.depths_m[1] == pytest.approx(0.7, abs=0.01) and second.depths_m[1] == pytest.approx(1.2, abs=0.001)
     # 130 x 90 pixels of 2.8 mm, and 200 x 150 of 4.8 mm
     assert first.extent_m == pytest.approx((0.364, 0.252), abs=0.01)
     assert second.extent_m == pytest.approx((0.96, 0.72), abs=0.01)

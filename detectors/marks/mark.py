@@ -102,7 +102,7 @@ def off_line_problem(marks: Sequence[Mark]) -> str:
     error = float(np.sqrt(np.mean([np.linalg.eigvalsh(mark.covariance_m2)[-1] for mark in marks])))
     if sizes[1] >= max(OFF_LINE_SIGMAS * error, OFF_LINE_SHARE * sizes[0]):
         return ""
+    off = f"{sizes[1] / MM:.1f} mm off it"
     return (
-        f"the {len(marks)} marks lie on a line, {sizes[1] / MM:.1f} mm off it, which leaves the turn about it open;"
-        " a mark beside the line is missing"
+        f"the {len(marks)} marks lie on a line, {off}, which leaves the turn about it open: add a mark beside the line"
     )

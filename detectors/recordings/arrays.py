@@ -277,11 +277,7 @@ def _named_array(
         found = [key for key in arrays if key.lower() in usual] or list(arrays)
         if len(found) != 1:
             what = f"{name}: no array, or several arrays, that could be the depth (it holds {held})"
-            fix = (
-                f"choose by --array NAME, for instance --array {found[0]} (of a height map with --pitch)"
-                if found
-                else None
-            )
+            fix = f"choose one, for instance --array {found[0]} (of a height map with --pitch)" if found else None
             raise UserError(what, legal=f"one array named {', '.join(usual)}; {LEGAL_AXES}", fix=fix)
         (key,) = found
     if key not in arrays:

@@ -108,9 +108,9 @@ def judge(
     if judged.failure:
         return judged
     if not agreement.beside >= registered.MIN_OVERLAP:
+        needed = f"{100 * registered.MIN_OVERLAP:.0f} % needed"
         elsewhere = (
-            f"the views do not overlap: {100 * agreement.beside:.0f} % of this view's target lies beside the"
-            f" reference's ({100 * registered.MIN_OVERLAP:.0f} % needed)"
+            f"the views do not overlap: {100 * agreement.beside:.0f} % of the view lies beside the reference ({needed})"
         )
     else:
         elsewhere = _jump(judged, reference, view)
@@ -121,10 +121,12 @@ def judge(
     undetermined, apart = "", _apart(agreement)
     if error_m > limit_m:
         undetermined = (
-            "not determined: the points let the target slide or turn (they lie on a line, or on a surface that slides"
-            f" in itself); the predicted error over the target is {error_m / MM:.1f} mm, which would blur the map (up"
-            f" to {limit_m / MM:.1f} mm are merged)"
+            "not determined: the points let the target slide or turn (they lie on a line, or the surface slides"
         )
+        undetermined += (
+            f" in itself); the predicted error over the target is {error_m / MM:.1f} mm, which would blur the"
+        )
+        undetermined += f" map (up to {limit_m / MM:.1f} mm are merged)"
     if judged.method in UNJUDGED_AGREEMENT:
         return replace(judged, failure=undetermined, notes=(*judged.notes, *([apart] if apart else [])))
     failure = "; ".join(reason for reason in (undetermined, apart) if reason)
@@ -142,10 +144,9 @@ def _jump(registration: registered.Registration, reference: PreparedView, view: 
     shift = np.linalg.norm(transform_points(registration.T_reference_view, centre) - transform_points(guess, centre))
     if turn <= MAX_JUMP_DEG and shift <= MAX_JUMP_M:
         return ""
-    return (
-        f"stands {turn:.0f} degrees and {shift / MM:.0f} mm from its guess (up to {MAX_JUMP_DEG:.0f} degrees and"
-        f" {MAX_JUMP_M / MM:.0f} mm are credible): marks matched wrongly, another target, or a wrong guess"
-    )
+    credible = f"up to {MAX_JUMP_DEG:.0f} degrees and {MAX_JUMP_M / MM:.0f} mm are credible"
+    stands = f"stands {turn:.0f} degrees and {shift / MM:.0f} mm from its guess ({credible})"
+    return f"{stands}: marks matched wrongly, another target, or a wrong guess"
 
 
 def _apart(agreement: Agreement) -> str:
@@ -161,10 +162,8 @@ def _apart(agreement: Agreement) -> str:
         limit = marks_limit
     else:
         return ""
-    return (
-        f"{said.format(f'{distance / MM:.1f}')}, which would blur the map (up to {limit / MM:.1f} mm are merged): a"
-        " wrong registration, or different targets"
-    )
+    blur = f"which would blur the map (up to {limit / MM:.1f} mm are merged)"
+    return f"{said.format(f'{distance / MM:.1f}')}, {blur}: a wrong registration, or different targets"
 
 
 def _widened(
@@ -190,8 +189,8 @@ def _widened(
     parts = [f"{m / MM:.2g} mm {way}" for m, way in ((more_across, "across"), (more_within, "along")) if m]
     note = (
         f"the views disagree by {' and '.join(parts)} the surface beyond what noise explains: an error that each view"
-        " shares (offset, wiggling, lens); the covariance is widened by it"
     )
+    note += " shares (offset, wiggling, lens); the covariance is widened by it"
     return replace(registration, covariance=covariance, notes=(*registration.notes, note))
 
 
