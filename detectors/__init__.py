@@ -41,11 +41,8 @@ def detector_names() -> tuple[str, ...]:
 
 
 def detector_type(name: str) -> Any:
-    """Return the class behind a name; its ``settings_type`` is the Config that validates its settings.
-
-    Raises UserError on an unknown name, a name taken twice, a package that is not installed, and a plug-in that is no
-    detector or is called otherwise.
-    """
+    """Return the class behind a name; its ``settings_type`` is the Config that validates its settings. Raises UserError
+    on an unknown name, a name taken twice, a package that is not installed, and a plug-in that is no detector."""
     from harness.vocabulary.config import Config
 
     offer = DETECTORS.offer(name)
@@ -65,10 +62,8 @@ def detector_type(name: str) -> Any:
 
 
 def load_detector(name: str, settings: dict[str, Any]) -> Detector:
-    """Return the detector of that name with these settings (plain data, as YAML holds it).
-
-    Raises UserError as `detector_type`, and where the settings are not legal (every problem at once).
-    """
+    """Return the detector of that name with these settings (plain data, as YAML holds it). Raises UserError as
+    `detector_type`, and where the settings are not legal (every problem at once)."""
     from harness.vocabulary.declaration.diagnose import settings_of
 
     kind = detector_type(name)

@@ -1,8 +1,5 @@
-"""Streamed averages that make one cloud of frames; frames that do not belong are noticed, left out and named.
-
-Frames are judged by the first `REFERENCE_FRAMES`: a source whose first frames are mostly bad, or a camera that is moved
-during the capture, is not healed.
-"""
+"""Streamed averages that make one cloud of frames; frames that do not belong are left out and named. Frames are judged
+by the first `REFERENCE_FRAMES`: a source whose first frames are mostly bad, or a camera that moves, is not healed."""
 
 from __future__ import annotations
 
@@ -34,10 +31,9 @@ class AverageConfig(Config):
     ``method``: ``mean`` as in the thesis; ``median`` per pixel (holds all frames' z in memory); ``clipped``: mean of
     the samples within ``clip_sigmas`` of the pixel's median over the first five frames. ``frames``: use the first so
     many. A frame *jumps* if the median over pixels of its difference to the reference exceeds the larger of
-    ``jump_sigmas`` standard errors of that median and ``jump_mm`` (ten times the wander of a static Azure Kinect). It
-    is *disturbed* if more than ``disturbed_fraction`` of its pixels (beyond 1.5 times what the reference frames show)
-    lost their range or changed by more than the larger of ``changed_sigmas`` of one frame's noise and
-    ``changed_mm``.
+    ``jump_sigmas`` standard errors and ``jump_mm`` (ten times the wander of a static Azure Kinect). It is *disturbed*
+    if more than ``disturbed_fraction`` of its pixels (beyond 1.5 times what the reference frames show) lost their range
+    or changed by more than the larger of ``changed_sigmas`` of one frame's noise and ``changed_mm``.
     """
 
     method: Literal["mean", "median", "clipped"] = "mean"
@@ -60,8 +56,7 @@ def average(source: FrameSource, config: AverageConfig) -> Cloud:
 
 
 def prefix_averages(source: FrameSource, counts: Sequence[int], config: AverageConfig) -> dict[int, Cloud]:
-    """Average the first ``n`` frames for each ``n`` in ``counts``, in one pass: equal, bit by bit, to ``average`` with
-    ``frames`` = n. Raises UserError as `average`."""
+    """Average the first ``n`` frames for each of ``counts`` in one pass, bit by bit as `average`. Raises UserError."""
     wanted = sorted(set(counts))
     if not wanted or wanted[0] < 1:
         raise UserError(f"numbers of frames to average: {list(counts)}", legal="one or more whole numbers from 1")
@@ -89,11 +84,9 @@ def _averages(source: FrameSource, wanted: list[int] | None, config: AverageConf
     elif wanted is None:
         raise UserError(f"{source.name}: no frames to average", fix="check the path")
     if wanted and offered < wanted[-1]:
-        raise UserError(
-            f"{source.name}: {wanted[-1]} frames to average, but there are {offered}",
-            legal=f"1 to {offered} frames" if offered else None,
-            fix="ask for fewer frames, or leave the number out to use all" if offered else "check the path",
-        )
+        legal = f"1 to {offered} frames" if offered else None
+        fix = "ask for fewer frames, or leave the number out to use all" if offered else "check the path"
+        raise UserError(f"{source.name}: {wanted[-1]} frames to average, but there are {offered}", legal=legal, fix=fix)
     return clouds
 
 
@@ -109,11 +102,9 @@ def _of_one_size(source: FrameSource, frames: Iterator[Frame]) -> Iterator[Frame
 
 
 class FrameSums:
-    """Sums of frames that belong, from which the mean cloud follows: float64 of z less a per-pixel offset.
-
-    A good frame is what the first frames show: the median of those that agree; ``sample`` are the flat indices of the
-    judged pixels, all valid in it. The clipped mean uses no larger deviation from the offset than ``gate``.
-    """
+    """Sums of frames that belong, from which the mean cloud follows: float64 of z less a per-pixel offset. A good frame
+    is what the first frames show: the median of those that agree; ``sample`` are the flat indices of the judged pixels,
+    all valid in it. The clipped mean uses no larger deviation from the offset than ``gate``."""
 
     def __init__(self, source: FrameSource, frames: list[Frame], config: AverageConfig) -> None:
         """Sum the ``frames``, at most `REFERENCE_FRAMES`, which are the reference too."""
@@ -150,7 +141,7 @@ class FrameSums:
         self.change_m = max(config.changed_sigmas * sigma, config.changed_mm * MM)
         agreeing = stack[np.abs(between[:, middle]) <= self.jump_m]
         # the median of two frames is their mean, which a fault in either spoils
-        z = _pixel_medians(agreeing) if len(agreeing) > 2 else stack[middle]
+        z = pixel_medians(agreeing) if len(agreeing) > 2 else stack[middle]
         self.sampled_z_m, self.offset = z[self.sample], z.astype(np.float64)
         # the reference frames look better than others, because they chose the pixels that are judged
         usual = [self._change(row)[1] for row in agreeing]
@@ -160,7 +151,7 @@ class FrameSums:
             self.gate = np.full(z.shape, np.inf, dtype=np.float32)
             if len(agreeing) > 2:
                 # some sigmas of the frame or, where larger, of the pixel itself
-                own = _pixel_medians(np.abs(agreeing - z)) / np.float32(0.6745)
+                own = pixel_medians(np.abs(agreeing - z)) / np.float32(0.6745)
                 self.gate = (config.clip_sigmas * np.fmax(own, np.float32(sigma))).astype(np.float32)
         return z.size
 
@@ -183,13 +174,12 @@ class FrameSums:
         if not np.isfinite(shift):
             return "no pixel has a range"
         if abs(shift) > self.jump_m:
-            allowed = f"(allowed {self.jump_m / MM:.1f} mm)"
-            return f"the whole range jumps by {shift / MM:+.1f} mm against {against} {allowed}"
-        if fraction > self.fraction:
             return (
-                f"disturbed: {100 * fraction:.1f} % of the pixels lost their range or changed by more than"
-                f" {self.change_m / MM:.1f} mm against {against} (allowed {100 * self.fraction:.1f} %)"
+                f"the whole range jumps by {shift / MM:+.1f} mm against {against} (allowed {self.jump_m / MM:.1f} mm)"
             )
+        if fraction > self.fraction:
+            changed = f"lost their range or changed by more than {self.change_m / MM:.1f} mm against {against}"
+            return f"disturbed: {100 * fraction:.1f} % of the pixels {changed} (allowed {100 * self.fraction:.1f} %)"
         return None
 
     def take(self, frame: Frame) -> None:
@@ -204,12 +194,10 @@ class FrameSums:
             kept, allowed = len(self.stack), int(self.config.median_memory_mb * 1e6)
             needed = 2 * 4 * z.size * (kept + 1)
             if needed > allowed:
-                raise UserError(
-                    f"{frame.name}: the median of {kept + 1} frames of {z.size} pixels needs"
-                    f" {needed / 1e6:.0f} MB, more than median_memory_mb = {allowed / 1e6:.0f}",
-                    legal=f"up to {kept} frames",
-                    fix="use method clipped (constant memory), fewer frames, or raise median_memory_mb",
-                )
+                what = f"{frame.name}: the median of {kept + 1} frames of {z.size} pixels needs {needed / 1e6:.0f} MB,"
+                what += f" more than median_memory_mb = {allowed / 1e6:.0f}"
+                fix = "use method clipped (constant memory), fewer frames, or raise median_memory_mb"
+                raise UserError(what, legal=f"up to {kept} frames", fix=fix)
             self.stack.append(z.astype(np.float32))
         self.frames += 1
         gate = np.full(1, np.nan, np.float32) if self.gate is None else self.gate
@@ -230,17 +218,15 @@ class FrameSums:
         source, count = self.source, self.count
         if not count.any():
             named = "; ".join(f"{left.name}: {left.why}" for left in self.left_out[:3])
-            raise UserError(
-                f"{source.name}: no pixel has a range in any frame" + (f" ({named})" if named else ""),
-                legal="at least one frame with valid depth",
-                fix="check the files, their unit and the camera's mode",
-            )
+            what = f"{source.name}: no pixel has a range in any frame" + (f" ({named})" if named else "")
+            fix = "check the files, their unit and the camera's mode"
+            raise UserError(what, legal="at least one frame with valid depth", fix=fix)
         with np.errstate(invalid="ignore", divide="ignore"):
             z = self.offset + self.total / count
             variance = (self.squares - self.total**2 / count) / (count - 1)
             means = {name: total / known for name, (total, known) in self.channels.items()}
         if self.config.method == "median":
-            z = _pixel_medians(np.stack(self.stack)).astype(np.float64)
+            z = pixel_medians(np.stack(self.stack)).astype(np.float64)
         z = z.reshape(self.shape)
         if source.slopes is None and "xy" not in means:
             raise ValueError("a source without slopes must give each frame its xy_m")
@@ -269,8 +255,7 @@ def _added(  # type: ignore[no-untyped-def]
     z, reason, gate, offset, count, total, squares, reasons
 ):
     """Add a frame's z (n,) less the ``offset`` to the sums, and return (n,) bool where it counts: not where it is
-    farther off than the ``gate`` (n,). NaN, for a pixel that the first frames never saw, or one NaN for all, is no
-    gate."""
+    farther off than the ``gate`` (n,), of which NaN, for a pixel or for all, is none."""
     used = np.zeros(len(z), np.bool_)
     for i in range(len(z)):
         if not np.isfinite(z[i]):
@@ -302,7 +287,7 @@ def _median_finite(values: np.ndarray) -> float:
     return float(np.median(finite)) if len(finite) else np.nan
 
 
-def _pixel_medians(stack: np.ndarray) -> np.ndarray:
+def pixel_medians(stack: np.ndarray) -> np.ndarray:
     """Return the median (n,) of each pixel's finite samples in (r, n); NaN where there is none."""
     ordered, count = np.sort(stack, axis=0), np.isfinite(stack).sum(axis=0)
     places = (np.maximum(count - 1, 0) // 2, count // 2)

@@ -1,9 +1,9 @@
 """The undamaged surface behind a cloud: its shape is chosen by evidence, and its goodness of fit is judged.
 
-Shapes are chosen on the medians of cells of some 16 pixels or more: each shape predicts tiles of cells that it was not
-fitted to, and the simplest whose errors are not significantly larger than the best shape's is taken. Polynomials and
-quadrics come first; where neighbouring cells still depart together, smooth free forms of ever shorter wavelength are
-tried. Not modelled: creases, several sheets, surfaces with real structure that is as small as damage.
+Each shape, fitted to the medians of cells of some 16 pixels or more, predicts tiles of cells that it was not fitted to;
+the simplest whose errors are not significantly larger than the best shape's is taken. Where neighbouring cells still
+depart together, smooth free forms of ever shorter wavelength are tried. Not modelled: creases, several sheets, surfaces
+with real structure that is as small as damage.
 """
 
 from __future__ import annotations
@@ -21,27 +21,17 @@ from detectors.free_form import free_form, picture_places
 from detectors.masks import grown, on_grid
 from detectors.noise import median_of, sigma_of
 from detectors.reference import laid_on
-from detectors.surface import (
-    BISQUARE_TUNING,
-    Fit,
-    SurfaceConfig,
-    bisquare_weights,
-    fit_surface,
-    polynomial,
-    quadric,
-)
+from detectors.surface import BISQUARE_TUNING, Fit, SurfaceConfig, bisquare_weights, fit_surface, polynomial, quadric
 from harness.vocabulary.geometry import MM, Cloud
 
 MOST_CELLS, CELL_POINTS, EVEN_CELL_POINTS, ENOUGH_CELLS, FEW_CELLS = 3600, 16, 64, 600, 40
-"""Cells at most, points in each at least, in each where there are enough cells; with few the shape is not
-questioned."""
+"""Cells at most, points in each at least, in each where there are enough; with few the shape is not questioned."""
 TILE_CELLS, FOLDS = 3, 5
 """Side of what is predicted together, in cells, and the number of parts that these tiles are dealt to."""
 LEAST_SCALE_M = 0.04
 """Damage is taken to be narrower, unless the settings say otherwise: no free form is chosen that follows it."""
 WORTH = 0.1
-"""A shape whose typical error of prediction is above the best by no more than this share of a pixel's noise is as
-good."""
+"""A shape is as good as the best whose error of prediction is above by this share of a pixel's noise."""
 NOISIER = 1.25
 """Five standard errors of the median of 49 deviations of 16 pixels each: below it noise is taken to be even."""
 STEEPEST_DEG = 75.0
@@ -73,7 +63,7 @@ class Background:
 @dataclass(frozen=True)
 class _Cells:
     """``points`` (c, 3) metres: a ray through each cell and its median z; ``weights`` (c,); ``noise`` (c,): of a pixel
-    in the cell; ``level_noise``: of a median; ``of`` (n,): each point's cell, -1 for none; ``side``: in the picture's
+    in the cell; ``level_noise``: of a median; ``of`` (n,): each point's cell or -1; ``side``: in the picture's
     units."""
 
     points: np.ndarray
@@ -363,11 +353,9 @@ def _misfit(cells: _Cells, fit: Fit, name: str) -> tuple[str, dict[str, Any]]:
     beyond = enough & (np.abs(smooth) > np.maximum(chance, SEEN * pixel))
     rms_m = float(np.sqrt(np.mean(smooth[enough] ** 2))) if enough.any() else 0.0
     share = float(beyond.sum() / max(enough.sum(), 1))
-    text = (
-        f"the surface does not fit here: {name} leaves {1e3 * rms_m:.2g} mm rms at scales above"
-        f" {STRUCTURE_CELLS * cells.side_m / MM:.2g} mm, where the noise of a pixel is {1e3 * pixel:.2g} mm, on"
-        f" {100 * share:.0f} % of the target; findings there may be its shape"
-    )
+    text = f"the surface does not fit here: {name} leaves {1e3 * rms_m:.2g} mm rms at scales above"
+    text += f" {STRUCTURE_CELLS * cells.side_m / MM:.2g} mm, where the noise of a pixel is {1e3 * pixel:.2g} mm, on"
+    text += f" {100 * share:.0f} % of the target; findings there may be its shape"
     notes = {"misfit_share": share, "misfit_rms_m": rms_m, "local_noise_m": pixel}
     return (text if share >= MISFIT_FROM else ""), notes
 

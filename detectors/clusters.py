@@ -37,11 +37,9 @@ def nested_clusters(
     # a little below distance / sqrt(3): rounding must not put two points of one cell beyond the distance
     cells = np.floor((points_m - points_m.min(axis=0)) / (distance_m / np.sqrt(3.0) * (1.0 - 1e-9)))
     if cells.max() >= MAX_CELLS:
-        raise UserError(
-            f"points spread over {np.ptp(points_m, axis=0).max():.3g} m cannot be clustered with a distance of"
-            f" {distance_m * 1e3:.3g} mm",
-            fix="crop the cloud, check its unit, or choose a larger cluster distance",
-        )
+        what = f"points spread over {np.ptp(points_m, axis=0).max():.3g} m cannot be clustered with a distance of"
+        fix = "crop the cloud, check its unit, or choose a larger cluster distance"
+        raise UserError(f"{what} {distance_m * 1e3:.3g} mm", fix=fix)
     x, y, z = cells.astype(np.int64).T
     falling = np.argsort(-scores, kind="stable")
     key = ((x << 42) | (y << 21) | z)[falling]
@@ -71,9 +69,8 @@ def root_of(parent: np.ndarray, i: int) -> int:
 def _nested(  # type: ignore[no-untyped-def]
     points, scores, falling, order, starts, ends, near, limit, least, thresholds
 ):
-    """`nested_clusters` of points of which each cell c holds those at ``order[starts[c]:starts[c + 1]]``, and has
-    points no farther than twice the distance in the cells ``near[ends[c]:ends[c + 1]]``. ``limit``: the distance
-    squared. Points come in ``falling`` order of their scores."""
+    """`nested_clusters` of points of which each cell c holds those at ``order[starts[c]:starts[c + 1]]`` and is near to
+    the cells ``near[ends[c]:ends[c + 1]]``. ``limit``: the distance squared. ``falling``: the points by score."""
     n = len(falling)
     parent, sizes, held = np.arange(len(starts) - 1), np.zeros(len(starts) - 1, np.int64), np.zeros_like(starts)
     completed, cell = np.full(len(parent), -np.inf), np.empty_like(falling)

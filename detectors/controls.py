@@ -67,10 +67,10 @@ class Oracle:
 
     def _known(self) -> tuple[TrueDamage, ...]:
         if self._truth is None:
-            raise UserError(
-                "the detector 'oracle' was not told the truth: it tests studies on simulated boards, and finds nothing",
-                fix="use it in an experiment with a simulated source, or choose another detector",
+            what = (
+                "the detector 'oracle' was not told the truth: it tests studies on simulated boards, and finds nothing"
             )
+            raise UserError(what, fix="use it in an experiment with a simulated source, or choose another detector")
         return self._truth
 
 

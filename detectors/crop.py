@@ -1,8 +1,8 @@
 """The pixels that belong to the target: a box, a polygon in the image, or the nearest large smooth surface.
 
 Every two surfaces are compared by what is seen at their outlines: one stands before the other, lies on it, shows
-through its hole, or they only meet. The surface with the best odds is proposed; where some are poor, the choice is
-called doubtful. The odds are a model of how people take pictures of a target, not a measured rate.
+through its hole, or they only meet. The surface with the best odds, a model of how people take pictures of a target, is
+proposed; where some are poor, the choice is called doubtful.
 """
 
 from __future__ import annotations
@@ -24,8 +24,7 @@ from harness.vocabulary.geometry import MM, Cloud
 
 DOUBTFUL_BELOW = 0.8  # probability of a comparison below which the choice is called doubtful
 CENTRE_SPREAD = 0.25
-"""Standard deviation of the weight that pixels have, as a share of the picture's width and height: people aim at the
-target."""
+"""Deviation of the weight that pixels have, as a share of the picture's sides: people aim at the target."""
 LYING_WEIGHT, STANDING_WEIGHT = 0.10, 0.02
 """Weight in the view at which a thing is as likely the target as the surface that it lies on, or stands far before."""
 OBSTACLE_AREA = 0.2
@@ -35,8 +34,7 @@ GRAZING = 0.5
 pixels that mix two surfaces look like a third that is seen so."""
 STEEPNESS = 2.0  # odds grow with this power of weights and areas
 SURROUNDED, BORDERING, STEP_PART = 0.7, 0.1, 0.3
-"""Part of its outline that must border on a surface for a thing to lie on it; from which on two are neighbours; and
-part of a common border that must be a step."""
+"""Part of the outline that borders on what a thing lies on; of neighbours; of a border that must be a step."""
 CUT_OFF = 0.15
 """Part of its outline on the edge of the picture from which on a surface goes on outside of it, as walls and floors."""
 ENCLOSED, MOST_SAMPLES = 0.9, 20_000
@@ -45,8 +43,7 @@ ENCLOSED, MOST_SAMPLES = 0.9, 20_000
 @dataclass(frozen=True, eq=False)
 class Candidate:
     """A surface that may be the target. ``own``, ``filled`` (h, w) bool on the choice's ``grid``: its pixels, and what
-    they enclose too; ``outline``: the same but for other candidates before it. What describes it is found when asked
-    for."""
+    they enclose too; ``outline``: the same but for other candidates before it."""
 
     own: np.ndarray
     filled: np.ndarray
@@ -63,20 +60,11 @@ class Candidate:
         """Part of all pixels."""
         return self.pixels / self.own.size
 
-    @property
-    def distance_m(self) -> float:
-        """Median of z."""
-        return float(self._depths_m[1])
-
-    @property
-    def nearest_m(self) -> float:
-        """First percentile of z."""
-        return float(self._depths_m[0])
-
-    @property
-    def farthest_m(self) -> float:
-        """99th percentile of z."""
-        return float(self._depths_m[2])
+    @cached_property
+    def depths_m(self) -> tuple[float, float, float]:
+        """First, 50th and 99th percentile of z."""
+        near, middle, far = np.quantile(self._some[:, 2], (0.01, 0.5, 0.99)).tolist()
+        return near, middle, far
 
     @property
     def tilt_deg(self) -> float:
@@ -85,8 +73,7 @@ class Candidate:
 
     @cached_property
     def extent_m(self) -> tuple[float, float]:
-        """Sides of the smallest rectangle around it in its mean plane, longer first, without the outermost
-        hundredth."""
+        """Sides of the smallest rectangle around all but a hundredth of it in its mean plane, longer first."""
         plan = self._plane[0] @ self._plane[1][:, 1:]
         turn = math.radians(float(cv2.minAreaRect(plan.astype(np.float32))[2]))
         along = plan @ np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
@@ -123,10 +110,6 @@ class Candidate:
         return np.asarray(self.grid.points_m.reshape(-1, 3)[places[:: max(1, len(places) // MOST_SAMPLES)]])
 
     @cached_property
-    def _depths_m(self) -> np.ndarray:
-        return np.quantile(self._some[:, 2], (0.01, 0.5, 0.99))
-
-    @cached_property
     def _plane(self) -> tuple[np.ndarray, np.ndarray]:
         """The sample about its middle, and its principal axes (3, 3), the normal first."""
         centred = self._some - self._some.mean(axis=0)
@@ -153,41 +136,13 @@ class _Border(NamedTuple):
     behind_m: float
 
 
-def propose(cloud: Cloud, crease_deg: float, smooth_px: int, inset_px: int, wanted: int | None) -> Choice:
-    """Choose the target of a cloud with a valid point: the proposal, or candidate number ``wanted``."""
-    grid, spacings = cloud, 1.0
-    if not cloud.organised:
-        grid, rows, columns, spacings = raster(cloud.points_m[cloud.valid], cloud)
-        smooth_px = max(3, 2 * round(smooth_px / spacings / 2) - 1)
-        # the cell that holds the rim, and every cell that a point inset_px - 1 spacings farther in may lie in
-        inset_px = math.ceil((inset_px - 1) / spacings) + 1 if inset_px else 0
-    candidates, doubts = _candidates(smooth_surfaces(grid, crease_deg, smooth_px), grid)
-    if wanted is not None and wanted > len(candidates):
-        known = "".join(f"\n  --target {n}: {described_text(each)}" for n, each in enumerate(candidates, start=1))
-        raise UserError(
-            f"--target {wanted}: there are {len(candidates)} large smooth surfaces",
-            legal=f"1 to {len(candidates)}:{known}" if candidates else "none",
-            fix="choose one of these, or draw the outline with --crop polygon:u,v,u,v,u,v",
-        )
-    taken = wanted or 1
-    mask = candidates[taken - 1].outline & grid.valid if candidates else np.zeros(grid.valid.shape, bool)
-    mask = inset(mask, inset_px)
-    if not cloud.organised:
-        kept, mask = mask, cloud.valid.copy()
-        mask[mask] = kept[rows, columns]
-    warnings = (f"it is doubtful which surface is the target: {'; '.join(doubts)}",) if doubts and not wanted else ()
-    return Choice(candidates, taken, mask, grid, warnings)
-
-
 def described_text(candidate: Candidate) -> str:
     """Return distance, extent, share of the view and tilt in words."""
     long, short = (f"{side / MM:.0f}" for side in candidate.extent_m)
-    depths = f"{candidate.nearest_m:.2f} to {candidate.farthest_m:.2f} m"
+    near, middle, far = candidate.depths_m
     share = f"{100 * candidate.share:.2g}" if candidate.share < 0.095 else f"{100 * candidate.share:.0f}"
-    return (
-        f"{candidate.distance_m:.2f} m away ({depths}), {long} x {short} mm, {share} % of the view, tilted by"
-        f" {candidate.tilt_deg:.0f} degrees"
-    )
+    size = f"{long} x {short} mm, {share} % of the view, tilted by {candidate.tilt_deg:.0f} degrees"
+    return f"{middle:.2f} m away ({near:.2f} to {far:.2f} m), {size}"
 
 
 def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...], list[str]]:
@@ -233,7 +188,7 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
         it, other = described[i], described[j]
         ratio = it.weight / max(other.weight, 1e-9)
         facing = math.cos(math.radians(it.tilt_deg)) / max(math.cos(math.radians(other.tilt_deg)), 1e-2)
-        near = other.distance_m / max(it.distance_m, 1e-6)
+        near = other.depths_m[1] / max(it.depths_m[1], 1e-6)
         return _probability(ratio**0.5 * facing**2 * near), "two surfaces are about as large and as near"
 
     table = [[judged(i, j) for j in numbers] for i in numbers]
@@ -282,8 +237,7 @@ def _borders(surfaces: Surfaces, grid: Cloud, number: int) -> dict[int, _Border]
 
 
 RIM_PX = 3
-"""Width of the rim where a depth pixel mixes target and background: a 5 x 5 window reaches 2 pixels, and the edge
-passes through a third."""
+"""Width of the rim where target and background mix: a 5 x 5 window reaches 2 pixels, and the edge passes a third."""
 
 
 class _Crop(Config):
@@ -300,16 +254,13 @@ class NoCrop(_Crop):
 
 
 class BoxCrop(_Crop):
-    """Points inside an open box in the camera's frame; the defaults are the thesis'. ``range_max_m`` limits sqrt(x^2 +
-    z^2). ``keep_fraction`` then multiplies the remaining points' extreme x and y, as the thesis' fit script does with
-    0.75."""
+    """Points inside an open box in the camera's frame, by the thesis' defaults. ``range_max_m``: of sqrt(x^2 + z^2)."""
 
     kind: Literal["box"] = "box"
     x_mm: tuple[float, float] = (-500.0, 400.0)
     y_mm: tuple[float, float] = (-300.0, 190.0)
     z_mm: tuple[float, float] = (0.0, 1100.0)
     range_max_m: float | None = Field(default=1.0, gt=0)
-    keep_fraction: float = Field(default=1.0, gt=0, le=1)
 
     @model_validator(mode="after")
     def _ordered(self) -> BoxCrop:
@@ -332,8 +283,8 @@ class AutoCrop(_Crop):
 
     Neighbours are joined where the step in z is no more than a tilted surface and noise explain and the surface does
     not bend by more than ``crease_deg`` over ``smooth_px``; then its holes are filled, and ``inset_px`` comes off its
-    rim. A background so close behind that the camera's blur leaves no crease is taken for target (13 mm behind the
-    face, at 0.7 m with a 5 x 5 window). Without a pixel grid: the same on a raster of the nearest points.
+    rim. A background so near that blur leaves no crease is taken for target (13 mm behind the face, at 0.7 m with a 5 x
+    5 window). Without a pixel grid: the same on a raster of the nearest points.
     """
 
     kind: Literal["auto"] = "auto"
@@ -374,23 +325,39 @@ def crop(cloud: Cloud, config: AnyCrop) -> np.ndarray:
         asked = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in limits)
         asked += "" if config.range_max_m is None else f" mm and sqrt(x^2 + z^2) < {1e3 * config.range_max_m:g}"
         unit = "; the cloud looks as if its unit were not the metre" if z1 > 50_000 or z1 < 5 else ""
-        raise UserError(
-            f"the crop box ({asked} mm) holds none of the cloud's {len(points)} points{unit}",
-            legal=f"limits that meet the cloud: {extent}",
-            fix="change crop.x_mm, crop.y_mm, crop.z_mm, or use crop.kind: auto",
-        )
+        what = f"the crop box ({asked} mm) holds none of the cloud's {len(points)} points{unit}"
+        fix = "change crop.x_mm, crop.y_mm, crop.z_mm, or use crop.kind: auto"
+        raise UserError(what, legal=f"limits that meet the cloud: {extent}", fix=fix)
     seen = cloud.region
     where = f"columns {seen.col0} to {seen.col1 - 1}, rows {seen.row0} to {seen.row1 - 1}"
-    raise UserError(
-        f"the crop ({config.kind}, inset {config.inset_px} px) leaves none of the cloud's {len(points)} points",
-        legal=f"a crop that meets the cloud: {where}; {extent}",
-        fix="change the crop or lower crop.inset_px",
-    )
+    what = f"the crop ({config.kind}, inset {config.inset_px} px) leaves none of the cloud's {len(points)} points"
+    legal = f"a crop that meets the cloud: {where}; {extent}"
+    raise UserError(what, legal=legal, fix="change the crop or lower crop.inset_px")
 
 
 def choice_of(cloud: Cloud, config: AutoCrop) -> Choice:
-    """Return the automatic crop and all that it chose from. Raises UserError where there is no candidate ``target``."""
-    return propose(cloud, config.crease_deg, config.smooth_px, config.inset_px, config.target)
+    """Return the automatic crop of a cloud with a valid point, and all that it chose from. Raises UserError where there
+    is no candidate ``target``."""
+    grid, smooth_px, inset_px, wanted = cloud, config.smooth_px, config.inset_px, config.target
+    if not cloud.organised:
+        grid, rows, columns, spacings = raster(cloud.points_m[cloud.valid], cloud)
+        smooth_px = max(3, 2 * round(smooth_px / spacings / 2) - 1)
+        # the cell that holds the rim, and every cell that a point inset_px - 1 spacings farther in may lie in
+        inset_px = math.ceil((inset_px - 1) / spacings) + 1 if inset_px else 0
+    candidates, doubts = _candidates(smooth_surfaces(grid, config.crease_deg, smooth_px), grid)
+    if wanted is not None and wanted > len(candidates):
+        known = "".join(f"\n  --target {n}: {described_text(each)}" for n, each in enumerate(candidates, start=1))
+        legal = f"1 to {len(candidates)}:{known}" if candidates else "none"
+        fix = "choose one of these, or draw the outline with --crop polygon:u,v,u,v,u,v"
+        raise UserError(f"--target {wanted}: there are {len(candidates)} large smooth surfaces", legal=legal, fix=fix)
+    taken = wanted or 1
+    mask = candidates[taken - 1].outline & grid.valid if candidates else np.zeros(grid.valid.shape, bool)
+    mask = inset(mask, inset_px)
+    if not cloud.organised:
+        kept, mask = mask, cloud.valid.copy()
+        mask[mask] = kept[rows, columns]
+    warnings = (f"it is doubtful which surface is the target: {'; '.join(doubts)}",) if doubts and not wanted else ()
+    return Choice(candidates, taken, mask, grid, warnings)
 
 
 def _box(cloud: Cloud, config: BoxCrop) -> np.ndarray:
@@ -400,18 +367,13 @@ def _box(cloud: Cloud, config: BoxCrop) -> np.ndarray:
         inside = np.logical_and.reduce([cloud.valid, *((v > low) & (v < high) for v, low, high in limits)])
         if config.range_max_m is not None:
             inside &= np.hypot(x, z) < config.range_max_m
-        if config.keep_fraction < 1.0 and inside.any():
-            part = config.keep_fraction
-            limits = [(v, part * v[inside].min(), part * v[inside].max()) for v in (x, y)]
-            inside = np.logical_and.reduce([inside, *((v > low) & (v < high) for v, low, high in limits)])
     return np.asarray(inside)
 
 
 def _polygon(cloud: Cloud, config: PolygonCrop) -> np.ndarray:
     if not cloud.organised:
-        raise UserError(
-            "a polygon in pixels cannot crop a cloud without a pixel grid", legal="crop.kind none, box or auto"
-        )
+        what = "a polygon in pixels cannot crop a cloud without a pixel grid"
+        raise UserError(what, legal="crop.kind none, box or auto")
     v, u = np.mgrid[cloud.region.row0 : cloud.region.row1, cloud.region.col0 : cloud.region.col1].astype(float)
     inside = np.zeros(u.shape, dtype=bool)
     corners = np.array(config.vertices_px)

@@ -1,16 +1,12 @@
 """A unit's fixed pattern from captures of a flat surface: what moves with the pixels, what moves with the surface.
 
-Each capture's average is a smooth fit, the pattern P at each pixel, the surface's own shape S at each place, and noise:
-
-    range - fit = P(pixel) + S(place on the surface) + noise
-
+Each capture's average is a smooth fit, the pattern P at each pixel, the surface's own shape S at each place, and noise.
 Where the captures' poses are known, P and S are solved for together by least squares, with the noise's variances and
 the variance of S, which the captures' disagreement tells. Without poses each capture sees an S of its own, which counts
 as noise and averages out; a camera that did not move sees the same S each time, and nothing can part it from P.
 
-The smooth fit is a polynomial in 1/z over the rays' slopes, in which a plane is exact; it takes up what of P, of S and
-of the lens' and the modulation's errors is wider than some sixth of the image. Not modelled: errors of the stated
-poses, and noise that neighbouring pixels share (its variance counts, its correlation does not).
+The smooth fit is a polynomial in 1/z over the rays' slopes, in which a plane is exact; it takes up what is wider than
+some sixth of the image. Not modelled: errors of the stated poses, and the correlation of noise.
 """
 
 from __future__ import annotations
@@ -33,8 +29,7 @@ STABLE_SHARE = 0.2
 """Part of the pattern's rms by which two parts of the captures may differ beyond their noise: 4 % of its variance are
 then left. Where the surface's shape is solved for, it takes up to half of such a change."""
 SURE = 1.1
-"""Ratio of a difference to its noise from which on it is one: noise that 25 pixels share, over 30,000 pixels, makes 3 %
-of it."""
+"""Ratio of a difference to its noise from which on it is one: shared noise over 30,000 pixels makes 3 % of it."""
 SAME_PLACE_M, SAME_TURN = 2 * MM, 0.003
 """Change of distance and of the plane's normal (rad) below which nothing shows that a camera was moved by hand: ten
 times the wander of a static Azure Kinect, and what that wander makes over an image."""
@@ -46,9 +41,8 @@ BELIEF_STEPS = 5
 @dataclass(frozen=True)
 class FlatCapture:
     """One capture of a flat surface. ``residual_m`` (h, w): range along the ray less the smooth fit, NaN where it does
-    not count; ``variance_m2`` (h, w): of it, by the frames' noise. ``normal`` (3,): of the plane through it, towards
-    the camera. ``places_m`` (h, w, 2): where each pixel sees the surface, in co-ordinates of the surface that all
-    captures share; None where poses are unknown."""
+    not count; ``variance_m2`` (h, w): of it, by the frames' noise. ``normal`` (3,): of the plane, towards the camera.
+    ``places_m`` (h, w, 2): where each pixel sees the surface, in its co-ordinates; None where poses are unknown."""
 
     name: str
     frames: int
@@ -101,9 +95,8 @@ class PatternChange:
 @dataclass(frozen=True)
 class Separated:
     """A flat field and what was found on the way. ``surface_m``: standard deviation of what captures do not share
-    beyond their noise (the surface's shape, and what of the pattern is not stable), NaN for one capture; ``separated``:
-    whether it was solved for. ``in_time``: first captures beside last ones, at equal distances; ``in_range``: near
-    beside far ones; None where there are not enough."""
+    beyond their noise, or NaN; ``separated``: whether the shape was solved for. ``in_time``: first captures beside last
+    ones, at equal distances; ``in_range``: near beside far ones; None where there are not enough."""
 
     field: FlatField
     captures: tuple[FlatCapture, ...]
@@ -173,9 +166,6 @@ def separated(captures: Sequence[FlatCapture], lens: Lens) -> Separated:
     return _with_doubts(found)
 
 
-# ---------------------------------------------------------------- the sum of pattern and shape
-
-
 def _averaged(residuals: np.ndarray, variances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the weighted mean (h, w) over captures and its variance; NaN where no capture counts."""
     weights = np.where(np.isfinite(residuals), 1 / variances, 0.0)
@@ -198,9 +188,8 @@ def _solved(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return pattern (h, w), its variance, and the surface's shape as each capture sees it (c, h, w), by the least sum
     of squares of noise, pattern and shape, each over its own variance. The variance follows from beliefs passed between
-    pixels and cells, which is exact but for loops and for what each capture's smooth fit takes of the shape. For an
-    Azure Kinect before a wall rough by a fifth of the pattern the true deviation is the one that follows, before one
-    rough by half of it 1.3 times that."""
+    pixels and cells, exact but for loops and for what smooth fits take of the shape: before a wall rough by half of an
+    Azure Kinect's pattern the true deviation is 1.3 times as large."""
     from scipy import sparse
     from scipy.sparse.linalg import lsqr
 
@@ -243,9 +232,6 @@ def _on_one_plane(captures: Sequence[FlatCapture]) -> tuple[FlatCapture, ...]:
     return tuple(replace(capture, places_m=capture.places_m @ axes) for capture in captures)
 
 
-# ---------------------------------------------------------------- whether it can be trusted
-
-
 def _groups(distances: Sequence[float]) -> Iterator[list[int]]:
     """Yield the numbers of captures at like distances, nearest first, each in their own order."""
     waiting = sorted(range(len(distances)), key=lambda number: distances[number])
@@ -271,9 +257,9 @@ def _with_doubts(found: Separated) -> Separated:
     said, captures, field, rms_m = [], found.captures, found.field, found.field.rms_m
     if len(captures) == 1 or not _moved(captures):
         told = "one capture" if len(captures) == 1 else "nothing shows that the camera moved between the captures"
+        told += ": the surface's own shape cannot be told from the pattern, and the surface is taken to be flat"
         said.append(
-            f"{told}: the surface's own shape cannot be told from the pattern, and the surface is taken to be flat"
-            f" (move the camera by {LEAST_SHIFT_M / MM:.0f} mm or more, and state --poses where only along the surface)"
+            f"{told} (move the camera by {LEAST_SHIFT_M / MM:.0f} mm or more; if along the surface, state --poses)"
         )
     parts = ((found.in_time, "from the first captures to the last"), (found.in_range, "with distance"))
     changes = [(part, apart) for part, apart in parts if part is not None and part.is_change_of(rms_m)]

@@ -1,9 +1,8 @@
 """A unit's fixed pattern as a map over its sensor: its file, and the correction of a cloud by it.
 
-The pattern is taken for an error of range along each pixel's ray that is the same at every distance and in every
-capture. Not modelled: a pattern that changes with distance, temperature or brightness; `detectors.flat_captures` tests
-the first two between captures. What a depth engine's filter mixes at the edge of a hole differs from what it mixes on a
-flat surface, so the correction is less exact there.
+The pattern is taken for an error of range along each pixel's ray that is the same in every capture. Not modelled: a
+pattern that changes with distance, temperature or brightness (`detectors.flat_captures` tests the first two), and what
+a depth engine's filter mixes at the edge of a hole.
 """
 
 from __future__ import annotations
@@ -43,9 +42,8 @@ class FlatFieldConfig(Config):
 @dataclass(frozen=True)
 class FlatField:
     """A unit's fixed pattern. ``error_m`` (h, w): how much farther along its ray each pixel of the whole sensor sees a
-    surface, NaN where unknown; smooth parts, which a fitted surface takes up, are not in it. ``variance_m2`` (h, w) of
-    that error. ``distances_m``: the nearest and the farthest at which it was measured. ``warnings``: full sentences on
-    what makes it doubtful."""
+    surface, without smooth parts; NaN where unknown. ``variance_m2`` (h, w) of that error. ``distances_m``: the nearest
+    and the farthest at which it was measured. ``warnings``: full sentences on what makes it doubtful."""
 
     error_m: np.ndarray
     variance_m2: np.ndarray
@@ -60,10 +58,9 @@ class FlatField:
 
 
 def corrected(cloud: Cloud, field: FlatField) -> Cloud:
-    """Return the cloud with its points moved along their rays to where they would be without the pattern; where the
-    pattern is unknown they stay. ``mean_variance_m2`` is then the frames' noise (of a single frame unknown, and it
-    stays None) and the map's variance, of pixels that stay the pattern's mean square. Raises UserError where the cloud
-    has no pixel grid or is of another camera, size or lens."""
+    """Return the cloud with its points moved along their rays to where they would be without the pattern; where it is
+    unknown they stay. ``mean_variance_m2`` is the frames' noise (None of a single frame) and the map's variance, or the
+    pattern's mean square. Raises UserError where the cloud has no pixel grid or is of another camera, size or lens."""
     _refuse_other(cloud, field)
     at = cloud.region.within(field.lens.whole)
     error_m, variance_m2 = field.error_m[at].astype(float), field.variance_m2[at].astype(float)
@@ -110,9 +107,6 @@ def _refuse_other(cloud: Cloud, field: FlatField) -> None:
             raise UserError(what, legal="the same camera in the same mode", fix=AGAIN)
 
 
-# ---------------------------------------------------------------- the file
-
-
 def save_flat_field(path: Path, field: FlatField) -> None:
     """Write the file, whole or not at all. Raises UserError where it cannot be written."""
     lens = field.lens
@@ -130,8 +124,7 @@ def save_flat_field(path: Path, field: FlatField) -> None:
 
 
 def load_flat_field(path: Path) -> FlatField:
-    """Read a file of `save_flat_field`. Raises UserError where it is none, is broken, too large or of a newer
-    version."""
+    """Read a file of `save_flat_field`. Raises UserError where it is none, is broken, too large or newer."""
     from detectors.recordings.arrays import load_npz
 
     held = load_npz(path)

@@ -75,20 +75,16 @@ def _splines(places: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.nda
     return values, numbers
 
 
-@numba.njit(**PLAIN)
 def _normal_bands(
     values: np.ndarray, numbers: np.ndarray, weights: np.ndarray, z: np.ndarray, width: int, size: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the weighted normal matrix of the splines as upper bands (width + 1, size), and the right side (size,)."""
-    banded, right = np.zeros((width + 1, size)), np.zeros(size)
-    for i in range(len(z)):
-        for a in range(16):
-            row, weighted = numbers[i, a], weights[i] * values[i, a]
-            right[row] += weighted * z[i]
-            for b in range(a, 16):
-                column = numbers[i, b]
-                banded[width + row - column, column] += weighted * values[i, b]
-    return banded, right
+    weighted = weights[:, None] * values
+    a, b = np.triu_indices(16)
+    rows, columns = numbers[:, a], numbers[:, b]
+    places, squares = (width + rows - columns) * size + columns, weighted[:, a] * values[:, b]
+    banded = np.bincount(places.ravel(), squares.ravel(), (width + 1) * size).reshape(width + 1, size)
+    return banded, np.bincount(numbers.ravel(), (weighted * z[:, None]).ravel(), size)
 
 
 @numba.njit(error_model="numpy", **PLAIN)
@@ -114,8 +110,7 @@ def _spline_sums(
 
 @lru_cache(maxsize=32)
 def _penalty(rows: int, columns: int) -> sparse.coo_array:
-    """Return the upper half of the sum of squared third differences of (rows, columns) coefficients, mixed ones three
-    times."""
+    """Return the upper half of the sum of squared third differences of coefficients, mixed ones three times."""
 
     def squared(count: int, order: int) -> np.ndarray:
         differences = np.diff(np.eye(count), order, axis=0)

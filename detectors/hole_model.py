@@ -1,9 +1,8 @@
 """The model of a blurred hole, and its fit to the residuals around one detection.
 
 A round tube that starts with the surface's mouth, and behind it a floor of one depth, seen and lit obliquely, averaged
-over ``blur_px`` x ``blur_px`` pixels. A ray that has come as deep as t has passed the mouth and the circle at depth t,
-and so has the light that comes back along it; in the image each is an ellipse, shifted by parallax. The tube's length
-over the depth is fitted too.
+over ``blur_px`` x ``blur_px`` pixels. Light that has come as deep as t has passed the mouth and the circle at depth t
+on its way in and out; in the image each is an ellipse, shifted by parallax. The tube's length is fitted too.
 
 Not modelled: light between wall and floor, which makes a wall look deeper than it is; walls darker than the floor; a
 floor that is not flat; the loss of weight of deep neighbours in a bilateral filter (holes of 2 to 3 times the blur come
@@ -26,18 +25,15 @@ STRIPS = 64
 NODES, WEIGHTS = np.array([0.5 - 0.15**0.5, 0.5, 0.5 + 0.15**0.5, 1.0]), np.array([5.0, 8.0, 5.0, 0.0]) / 18.0
 """Gauss and Legendre's rule of three points on (0, 1), for the integral over the depth of the wall; and its end."""
 STEP = 1e-3
-"""Size of the differences that stand for derivatives: in pixels, relative for radius and depth, absolute for the wall.
-"""
+"""Size of differences that stand for derivatives: in pixels, relative for radius and depth, absolute for the wall."""
 MOST_STEPS, TOLERANCE = 40, 1e-5  # limits of a descent: its steps, and the relative gain below which it ends
 DAMPING, LEAST_M, SMALLEST = 1e-3, 1e-9, 1e-18
 """Damping of the first step; deviation that is rounding of the arithmetic, and its square."""
 MODEL_ERROR, RADIUS_ERROR_PX, DEPTH_ERROR = 0.02, 0.05, 0.05
-"""Errors that light between wall and floor leaves, as simulated clouds show beyond their noise: a pixel's share of its
-depth, by which the likelihood trusts it less, and parts of the fitted radius and depth, which their standard errors
-include."""
+"""Errors that light between wall and floor leaves on simulated clouds: a pixel's share of its depth, and parts of the
+fitted radius and depth."""
 MOST_MISFIT = 1.5
-"""Deviation of what the fit leaves from which on the model does not hold: 0.3 to 1.05 on simulated boards of its own
-optics, 1.1 to 3 before lenses that blur otherwise."""
+"""Deviation of what the fit leaves beyond which the model fails: .3 to 1.05 on its own optics, 1.1 to 3 on others."""
 WALL_PRIOR = (0.5, 12.0**-0.5)
 """Mean and standard deviation of the tube's length over the depth before the image is seen: uniform from 0 to 1."""
 
@@ -56,12 +52,11 @@ def normal_of(per_px_m: np.ndarray) -> np.ndarray:
 def sight(centre_m: np.ndarray, per_px_m: np.ndarray, emitter_m: np.ndarray, share: float = 1.0) -> np.ndarray:
     """Return the place (8,) from where a hole is seen and lit, reduced to what moves in the image: the cosine between
     ray and normal, times the ray's length per z; the drift along u and v; the shrinking; the beam along u and v; the
-    emitter's height; the share of the image that is seen from here. ``centre_m`` (3,) in the camera's frame,
-    ``per_px_m`` (2, 3).
+    emitter's height; the share of the image that is seen from here. ``centre_m`` (3,) camera frame, ``per_px_m`` (2,
+    3).
 
     A circle at depth h along the normal looks like the same circle on the surface, moved by h * drift / (1 + h *
-    shrinking), and smaller by that divisor. Light that comes back from depth h came in at beam * h / (h + height) from
-    it.
+    shrinking), and smaller by that divisor. Light from depth h came in at beam * h / (h + height) from it.
     """
     normal = normal_of(per_px_m)
     normal = normal / np.copysign(np.linalg.norm(normal), normal @ centre_m)
@@ -166,13 +161,6 @@ def _painted(
     return images
 
 
-def derivatives(patch: HolePatch, hole: np.ndarray) -> np.ndarray:
-    """Return the derivatives (5, h, w) of a hole's residual by its numbers (5,), from differences."""
-    steps = _steps(hole)
-    image, *moved = pictures(patch, np.vstack([hole, hole + np.diag(steps)]))
-    return np.asarray((np.array(moved) - image) / steps[:, None, None])
-
-
 @numba.njit(**PLAIN)
 def _steps(hole: np.ndarray) -> np.ndarray:
     depth = hole[3] if hole[3] != 0.0 else STEP
@@ -199,9 +187,8 @@ def fit_hole(patch: HolePatch, u: float, v: float, radius_m: float, depth_m: flo
     """Fit by least squares (Levenberg and Marquardt) from a start, to six used pixels and more: the likelihood's
     maximum where the patch knows the noise's covariance, else with `sandwich_covariance`.
 
-    Fitted are (u, v, ln radius, depth * radius^2, offset, x) with the wall sin^2(pi x / 2). The fourth is the hole's
-    volume, which the blur keeps, so that a small hole still has one well-determined direction for each parameter but
-    its radius. The wall has `WALL_PRIOR`: a small hole, or one seen straight on, does not determine it.
+    Fitted are (u, v, ln radius, depth * radius^2, offset, x) with the wall sin^2(pi x / 2), which has `WALL_PRIOR`. The
+    fourth is the hole's volume, which the blur keeps, so that of a small hole only the radius is ill determined.
     """
     h, w = patch.used.shape
     # keeps a wild trial step finite: no disc is larger than ten patches
@@ -316,9 +303,9 @@ def _likelihood_covariance(patch: HolePatch, hole: np.ndarray, rows: np.ndarray,
 
 def sandwich_covariance(patch: HolePatch, by: np.ndarray, square_m2: float) -> np.ndarray:
     """Return the covariance (6, 6) of (u, v, radius, depth, offset, wall) from derivatives (6, n) by them and the sum
-    of squares that is left, under noise that the square filter correlates, NaN where none is determined: cov = A^-1
-    (s^2 J' C J + p^2 W) A^-1 with A = J' J + W, W the prior's square weight on the wall, p^2 its variance; s^2 from the
-    misfit, E[misfit' misfit] = s^2 (n - trace(A^-1 J' C J))."""
+    of squares that is left, under noise that the square filter correlates, or NaN: A^-1 (s^2 J' C J + p^2 W) A^-1 with
+    A = J' J + W, W the prior's square weight on the wall, p^2 its variance; E[misfit' misfit] = s^2 (n - trace(A^-1 J'
+    C J))."""
     columns = np.zeros((6, *patch.used.shape))
     columns[:, patch.used] = by
     # the odd numbers of pixels nearest to the blur: pixels so far apart have no noise in common

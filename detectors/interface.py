@@ -19,8 +19,8 @@ class Evidence:
     ``residual_m`` (h, w): distance along the viewing axis behind (+) or before (-) the fitted surface, ``surface_z_m``
     (h, w). ``scale_m``: the standard deviation that one unit of score is. ``warnings``: full sentences on what makes
     these numbers unreliable; every program shows them first. ``behind`` (h, w) bool: whether the score speaks for
-    something behind the surface; None where the residual's own sign says so. ``unit``: what a unit of score is, in
-    words, where scores are not residuals over a deviation; ``scale_m`` is then the least that it is at a typical point.
+    something behind the surface; None: by the residual's sign. ``unit``: what a unit of score is, in words, where
+    scores are not residuals over a deviation; ``scale_m`` is then the least that it is at a typical point.
     """
 
     score: np.ndarray
@@ -36,10 +36,9 @@ class Evidence:
 @dataclass(frozen=True)
 class Detection:
     """One finding. ``score``: the lowest threshold at which it is found no more. ``pixels`` (n,): flat indices into the
-    cloud's (h, w) grid, ascending; ``centre_m`` (3,): where it is, in the cloud's frame: what decides which damage it
-    counts for. ``kind``: "depth" for points that depart from the surface, "no return" for connected pixels inside the
-    target's outline that returned nothing (``pixels`` are then those invalid pixels), "object" for a
-    thing that lies on the target."""
+    cloud's (h, w) grid, ascending; ``centre_m`` (3,): its place in the cloud's frame, which decides for which damage it
+    counts. ``kind``: "depth" for points that depart from the surface, "no return" for connected pixels (then invalid)
+    inside the target's outline that returned nothing, "object" for a thing that lies on the target."""
 
     score: float
     pixels: np.ndarray
@@ -52,10 +51,10 @@ class MissingReturns:
     """Pixels without a return inside the target's ``outline`` (h, w) bool.
 
     ``unseen`` (h, w): share of the frames (of a map 0 or 1) in which a pixel returned nothing. ``blind``: share of the
-    outline's pixels without any return. ``dropouts``: rate of scattered missing pixels. ``least_points``: connected
-    pixels from which on a cluster is a finding, ``expected`` the number of chance clusters of that size and more.
-    ``detections``: kind "no return", largest first; the score is the Gaussian deviation that is as improbable as the
-    expected number of chance clusters as large, at most 37.
+    outline's pixels without any return. ``dropouts``: rate of scattered missing pixels. ``least_points``: size from
+    which on a cluster is a finding, ``expected`` the number of such chance clusters. ``detections``: kind "no return",
+    largest first; the score is the Gaussian deviation as improbable as the expected number of chance clusters as large,
+    at most 37.
     """
 
     outline: np.ndarray
@@ -70,11 +69,9 @@ class MissingReturns:
     def blind_text(self) -> str:
         """Sentence on how much of the target is blind, and how much of that chance explains."""
         places = f"{len(self.detections)} place{'' if len(self.detections) == 1 else 's'}"
-        return (
-            f"blind: {100 * self.blind:.2g} % of the target's pixels returned nothing; {places} of {self.least_points}"
-            f" connected pixels and more ({self.expected:.1g} expected by chance; scattered dropouts"
-            f" {100 * self.dropouts:.2g} %)"
-        )
+        chance = f"{self.expected:.1g} expected by chance; scattered dropouts {100 * self.dropouts:.2g} %"
+        places += f" of {self.least_points} connected pixels and more ({chance})"
+        return f"blind: {100 * self.blind:.2g} % of the target's pixels returned nothing; {places}"
 
     @property
     def facts(self) -> dict[str, float]:

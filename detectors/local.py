@@ -1,13 +1,11 @@
-"""Holes, dents and bumps against the surface around them: filters of several widths, each on the scale of its own local
-noise.
+"""Holes, dents and bumps against the surface around them: filters of several widths, each on its own local noise.
 
 A pixel is judged by means over windows of several widths against the mean of the surroundings of each. One unit of
 score is the standard deviation of that difference as it is measured round about, so that correlated noise, a fixed
-pattern and texture raise the threshold where they are, and only there. Findings are peaks of the score, so that
-neighbouring holes stay apart.
+pattern and texture raise the threshold where they are. Findings are peaks of the score.
 
-Not modelled: the noise's spectrum (filters are not prewhitened), damage that is narrower than a pixel or wider than the
-widest filter, what texture has in common with damage, and steps of the noise within a window.
+Not modelled: the noise's spectrum, damage that is narrower than a pixel or wider than the widest filter, what texture
+has in common with damage, and steps of the noise within a window.
 """
 
 from __future__ import annotations
@@ -37,16 +35,14 @@ HALF_WIDTHS = (1, 2, 3, 5, 8, 12, 18, 27, 40, 60, 90)
 """Half-widths of the filters in pixels: a tent of half-width h is as wide at half of its height as a hole of 2 h + 1
 pixels. The ratio of 1.5 keeps nine tenths of the signal of a width between two."""
 SURROUNDINGS, WIDEST_SHARE = 3, 6.0
-"""The filter so many steps wider, 3.4 times as wide, is a filter's surroundings; the target is at least so many times
-as wide as the widest filter."""
+"""The filter so many steps wider is a filter's surroundings; and the target's least width in widest filters."""
 FAINT = 0.02
 """Weight that 0 has in every mean."""
 CLIP_SIGMAS, LEVEL_SIGMAS = 6.0, 2.0
 """Deviations of the local noise beyond which no single pixel counts for more: a flying pixel alone is no finding; and
 the same for the local level and for surroundings, which damage must not draw."""
 STRONG = 4.0
-"""Pixels with such scores are kept out of surroundings and noise; from there to twice as much, by and by, out of the
-wider means of other pixels too."""
+"""Pixels with such scores are kept out of surroundings and noise; with twice as much, out of others' wider means."""
 GATE_SHARE, GATE_SIGMAS = 0.5, 1.5
 """Share of a wider filter's signal that narrower ones must confirm, and the noise that is granted to them."""
 WINDOW_WIDTHS, LEAST_WINDOW, SAMPLES_SIDE, LEAST_SAMPLES = 6, 32, 14, 32
@@ -54,15 +50,13 @@ WINDOW_WIDTHS, LEAST_WINDOW, SAMPLES_SIDE, LEAST_SAMPLES = 6, 32, 14, 32
 independent means, which give a standard deviation to 8 %; samples from its middle to its edge, as neighbours in a mean
 tell nothing new; and fewest finite samples of a local median."""
 SADDLE, PROMINENCE = 0.75, 1.5
-"""Two peaks are one finding where the saddle between them is higher than this share of the lower, or fewer units of
-score below it than that."""
+"""Two peaks are one where the saddle is higher than this share of the lower, or fewer units of score below it."""
 CORE = 0.5
 """A finding's size is taken of the pixels with this share of its score or more."""
 
 
 class LocalConfig(Config):
-    """``surface``: the shape of the undamaged surface; chosen by evidence where neither shape nor degree is given.
-    ``hole_model``: what sizes are measured with."""
+    """``surface``: chosen by evidence where neither shape nor degree is given. ``hole_model``: measures sizes."""
 
     crop: CropConfig = Field(default_factory=AutoCrop)
     surface: SurfaceConfig = Field(default_factory=SurfaceConfig)
@@ -87,8 +81,7 @@ class LocalEvidence(Evidence):
 
 
 class LocalPicture(NamedTuple):
-    """Input of `LocalDetector.scored`: the surface, each point's cell (h, w) as in `LocalEvidence`, and
-    ``residuals``, its arguments."""
+    """Input of `LocalDetector.scored`: the surface, each point's cell (h, w), and ``residuals``, its arguments."""
 
     ground: Background
     cell: np.ndarray
@@ -214,11 +207,10 @@ def _scored(
 ) -> tuple[np.ndarray, list[int], float]:
     """Return signed scores (r, c) of a picture ``residual`` (r, c) metres with ``weights`` (r, c), 0 where nothing is
     known; the filters' widths in pixels; and the deviation of the narrowest at a typical point, metres.
-    ``rounding_m2``: variances that rounding leaves, as `detectors.noise.rounding_variances` has them.
 
     From the narrowest filter to the widest: a pixel that is sure in one, by a share from 0 to 1, takes no part in the
-    wider ones of other pixels, over which it would spread; a strong pixel takes no part in surroundings and noise. A
-    sure pixel's score still grows with the width, where narrower means confirm it (`_strongest`).
+    wider ones of other pixels; a strong pixel takes no part in surroundings and noise. A sure pixel's score still grows
+    with the width, where narrower means confirm it (`_strongest`).
     """
     seen = weights > 0
     # in units of the typical pixel's noise: single precision is then enough
@@ -269,8 +261,7 @@ def _scored(
 
 
 def _mean(values: np.ndarray, weights: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weighted mean (r, c) of values, drawn towards 0 where hardly anything is known, and that of
-    weights."""
+    """Return the weighted mean (r, c) of values, drawn towards 0 where little is known, and that of weights."""
     covered = _tent(weights, half)
     return _tent(values * weights, half) / (covered + FAINT), covered
 
@@ -284,8 +275,7 @@ def _tent(image: np.ndarray, half: int) -> np.ndarray:
 
 def _worth(weights: np.ndarray, covered: np.ndarray, half: int) -> np.ndarray:
     """Return the variance (r, c) of a tent's mean of white noise where all weights are 1 over that of its mean by
-    ``weights``, whose own mean is ``covered``. Beside a rim or an object single pixels may be all that a narrow filter
-    holds."""
+    ``weights``, whose own mean is ``covered``."""
     side = np.convolve(np.ones(2 * half + 1), np.ones(2 * half + 1)) ** 2
     side /= side.sum()
     # in double precision, so that the order of its sums does not tell which way the picture is turned
@@ -322,8 +312,7 @@ def local_sigma(
 
 @numba.njit(**PLAIN)
 def _local_medians(values: np.ndarray, rows: np.ndarray, columns: np.ndarray, half: int, stride: int) -> np.ndarray:
-    """Return the medians (r, c) of the finite values' (h, w) sizes in windows of 2 ``half`` + 1 pixels about the nodes,
-    every ``stride``-th along both axes."""
+    """Return the medians (r, c) of finite sizes in windows of 2 ``half`` + 1 about nodes, every ``stride``-th."""
     h, w = values.shape
     medians = np.full((len(rows), len(columns)), np.nan)
     side = 2 * (half // stride) + 1

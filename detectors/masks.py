@@ -67,8 +67,7 @@ def nearest_pixel(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def components(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Number the sets of nodes (h, w) that links to the right and downwards join, largest first; return each pixel's
-    number (h, w), 0 for none, and the sizes."""
+    """Number the sets of nodes (h, w) that links join, largest first; return the numbers (h, w), and sizes."""
     labels = _labelled(nodes, right, down)
     sizes = np.bincount(labels.ravel())[1:]
     order = np.argsort(-sizes, kind="stable")

@@ -2,31 +2,23 @@
 
 The residuals' autocovariance, temporal noise and fixed pattern together, is measured on the capture itself, off what
 stands out, or learned from hole-free clouds. Each template t (discs of several radii through a camera's window or lens,
-slots at several angles, dents) is then compared with the residuals r under that covariance C, restricted to the pixels
-that are known:
+slots at several angles, dents) is then compared with the residuals r of the known pixels under that covariance C:
 
-    score = t' C^-1 r / sqrt(t' C^-1 t)
+score = t' C^-1 r / sqrt(t' C^-1 t)
 
-which has the deviation 1 where there is no damage, whatever the noise's spectrum. C^-1 r is solved for by conjugate
-gradients, so missing pixels and borders add nothing and need no filling. Background structure that is not damage is
-part of the covariance, and counts as little as its power demands. The scores of each template are then divided by the
-deviation that they have, for each distance from the outline on its own: what an estimated spectrum, the outline and
-heavy tails change shows there.
+C^-1 r is solved for by conjugate gradients, so missing pixels and borders add nothing and need no filling. The scores
+of each template are then divided by the deviation that they have, for each distance from the outline on its own. Wide
+templates have few independent places, so their scores are raised (`detectors.whitening.Worth`).
 
-Wide templates have few independent places, so that their highest score by chance is lower. Their scores are raised
-(`detectors.whitening.Worth`), or a dent would be held to a hole's threshold.
+What stands out strongly is taken out (its pixels count as unknown) and the rest is judged again, so that no filter sees
+the shoulder of a neighbour's hole. What pixels along the target's outline share beyond those farther in is subtracted.
+Depth that was upsampled is judged on squares of pixels in which its noise reaches no farther than a camera's window.
 
-What stands out strongly is taken out (its pixels count as unknown) and the rest is judged again, so that no filter
-sees the shoulder of a neighbour's hole. What pixels along the target's outline share beyond those farther in is
-subtracted: what lies behind the edge, and light from beside, have a part in them. Depth that was upsampled, so that its
-noise reaches beyond a camera's window, is judged on squares of pixels in which it does not.
-
-Not modelled: slots that no template fits, but for what they have in common with one; slots within `RIM_PX` of outlines
-and of what was taken out; templates' distortion where a surface is steep; missing returns but for the few that are no
-findings by themselves (`detectors.missing`). The denominator takes the share of a template's whitened energy on known
-pixels for t' C^-1 t, by a rectangle that spreads as widely, which is exact where all of the template is seen; places
-where less than `LEAST_SEEN` of it is seen are not judged by that template. Scores of slots are taken on every second
-pixel.
+Not modelled: slots that no template fits; slots within `RIM_PX` of outlines and of what was taken out; templates'
+distortion where a surface is steep; missing returns but for the few that are no findings by themselves
+(`detectors.missing`). The denominator takes the share of a template's whitened energy on known pixels for t' C^-1 t, by
+a rectangle that spreads as widely; places where less than `LEAST_SEEN` of it is seen are not judged by that template.
+Scores of slots are taken on every second pixel.
 """
 
 from __future__ import annotations
@@ -42,6 +34,7 @@ import scipy.fft
 from pydantic import model_validator
 from scipy import special
 
+from detectors import whitening
 from detectors.clusters import PLAIN
 from detectors.interface import Evidence
 from detectors.local import (
@@ -57,23 +50,6 @@ from detectors.local import (
 from detectors.masks import grown
 from detectors.missing import missing_evidence
 from detectors.noise import median_of
-from detectors.whitening import (
-    GRID,
-    LONGEST_LAG_PX,
-    WINDOWS_PX,
-    Worth,
-    bank,
-    grid_of,
-    halved,
-    inverse_times,
-    noise_covariance,
-    response,
-    spectra,
-    spectrum,
-    transformed,
-    window_of,
-    worths,
-)
 from harness.vocabulary.geometry import Cloud
 
 LEAST_SEEN = 0.6
@@ -84,8 +60,8 @@ QUIET_SIGMAS = 4.0
 CLIP_SIGMAS = 5.0
 """Deviations beyond which no pixel counts for more than its neighbours: a flying pixel alone is no finding."""
 STRONG, LOUD_SIGMAS, MARGIN_PX = 6.0, 3.0, 2
-"""A peak of this score, with the pixels joined to it that are louder than so many deviations, and those around them, is
-taken out before the rest is judged."""
+"""A peak of this score, the louder pixels joined to it, and those around them are taken out; the rest is judged
+again."""
 LOUD_SHARE = 0.5
 """The loud pixels at a peak fill at least this share of its template's disc."""
 ALONE_PX = 7
@@ -97,8 +73,7 @@ RIM_ENDS_PX = (1, 2, 3, 5, 8, 12)
 N_ZONES = len(RIM_ENDS_PX) + 1
 ZONES = np.searchsorted(RIM_ENDS_PX, np.arange(RIM_ENDS_PX[-1] + 2)).astype(np.uint8)
 WINDOW_RADII, PART_PX, UNEVEN = 6, 8, 1.25
-"""Half of the window of the local scatter in radii, the side of the squares that it is taken from, and how much of it
-chance and damage may explain."""
+"""Half of the window of the local scatter in radii, the side of its squares, and what chance and damage may explain."""
 CAP, FEWEST = 2.0, 200
 """Scores count for no more in their scatter, and fewer do not tell it."""
 DEVIATIONS = np.geomspace(0.2, 50.0, 200)
@@ -110,8 +85,7 @@ CAPPED_UNEVEN = float(np.interp(UNEVEN, DEVIATIONS, CAPPED))
 FAINT = 3.5
 """Scores below are raised by the same factor: what is counted there is not maxima."""
 LOBE_SHARE = 0.5
-"""A score so much smaller than one of the other sign within `RIM_PX` is the lobe that whitening leaves beside
-damage."""
+"""A score so much smaller than one of the other sign within `RIM_PX` is the lobe that whitening leaves."""
 WIDE_PX = 5.0
 """Radius from which on noise may break a template's finding into several peaks."""
 TAIL_PX, TAIL_SHARE, TAIL_SIGMAS = 1.5, 0.0005, 3.29
@@ -120,8 +94,7 @@ a Gaussian has it. Wider means are near Gaussian, and too few of them are indepe
 
 
 class MatchedConfig(LocalConfig):
-    """The settings of `local`, but for ``surface``: the thesis' polynomial, unless ``shape: auto`` asks for a chosen
-    shape, whose uncertain long waves count as noise here."""
+    """The settings of `local`, but ``surface`` is the thesis' polynomial unless ``shape: auto`` is asked for."""
 
     @model_validator(mode="before")
     @classmethod
@@ -153,9 +126,8 @@ class MatchedDetector(LocalDetector):
         return replace(evidence, score=score, signed=signed)
 
     def picture(self, cloud: Cloud, pixels: int = 1) -> LocalPicture:
-        """Return the residuals on a grid in which noise reaches no farther than through a camera's own window: depth
-        that was upsampled is no sharper than its camera's pixels."""
-        return super().picture(cloud, max(pixels, round(cloud.noise_reach_px / max(WINDOWS_PX))))
+        """Return the residuals on a grid in which noise reaches no farther than through a camera's own window."""
+        return super().picture(cloud, max(pixels, round(cloud.noise_reach_px / max(whitening.WINDOWS_PX))))
 
     def scored(
         self, residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]
@@ -174,13 +146,13 @@ class MatchedDetector(LocalDetector):
             known = np.isfinite(evidence.residual_m)
             residual_m = np.where(known, evidence.residual_m, 0.0)
             covariance = _covariance(_in_deviations(residual_m, known.astype(np.float32), (0.0, 0.0))[0], known)
-        reach = np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1)
-        lags = scipy.fft.irfft2(spectrum(covariance, (GRID, GRID)), (GRID, GRID))[np.ix_(reach, reach)]
-        return np.asarray(lags / lags[LONGEST_LAG_PX, LONGEST_LAG_PX], np.float64)
+        reach = np.arange(-whitening.LONGEST_LAG_PX, whitening.LONGEST_LAG_PX + 1)
+        grid = (whitening.GRID, whitening.GRID)
+        lags = scipy.fft.irfft2(whitening.spectrum(covariance, grid), grid)[np.ix_(reach, reach)]
+        return np.asarray(lags / lags[whitening.LONGEST_LAG_PX, whitening.LONGEST_LAG_PX], np.float64)
 
     def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
-        """Return the mean covariance of the clouds' residuals, in squared deviations of the noise round about, by
-        lag."""
+        """Return the mean covariance of the clouds' residuals, in squared deviations of the local noise, by lag."""
         pictures = (self.picture(cloud) for cloud in hole_free)
         seen = [_covariance(*_in_deviations(*one.residuals)[::2]) for one in pictures]
         return {"covariance": np.mean(seen, axis=0)} if seen else {}
@@ -212,30 +184,29 @@ def _covariance(noise: np.ndarray, known: np.ndarray) -> np.ndarray:
     inner = known & (_depth_px(known) > RIM_PX)
     inner = inner if 2 * inner.sum() > known.sum() else known
     loud = cv2.dilate((np.abs(noise) > QUIET_SIGMAS).astype(np.uint8), np.ones((5, 5), np.uint8))
-    return noise_covariance(noise, inner & (loud == 0), grid_of(noise.shape))
+    return whitening.noise_covariance(noise, inner & (loud == 0), whitening.grid_of(noise.shape))
 
 
 class _Noise(NamedTuple):
-    """The bank before a picture's noise: ``grid`` of its transforms, ``power`` there, and each template's
-    `Worth` through the window that the noise shows."""
+    """The bank before a picture's noise: ``grid`` of its transforms, ``power`` there, and each template's `Worth`."""
 
     grid: tuple[int, ...]
     power: np.ndarray
     window_px: int
-    worths: tuple[Worth, ...]
+    worths: tuple[whitening.Worth, ...]
 
 
 def _judged(values: np.ndarray, known: np.ndarray, covariance: np.ndarray | None) -> tuple[np.ndarray, float]:
     """Return signed scores (r, c) of residuals in deviations, and the deviation of the narrowest template's height."""
-    grid = grid_of(values.shape)
+    grid = whitening.grid_of(values.shape)
     covariance = _covariance(values, known) if covariance is None else covariance
-    window_px = window_of(covariance)
-    worth_of = worths(spectrum(covariance, (GRID, GRID)), window_px)
-    noise = _Noise(grid, spectrum(covariance, grid), window_px, worth_of)
+    window_px = whitening.window_of(covariance)
+    worth_of = whitening.worths(whitening.spectrum(covariance, (whitening.GRID, whitening.GRID)), window_px)
+    noise = _Noise(grid, whitening.spectrum(covariance, grid), window_px, worth_of)
     tamed = _tamed(values)
     # what stands out strongly, as round templates see it
     signed, by, solved = _scored(tamed, known, noise, rough=True)
-    radius_px = np.array([each.radius_px for each in bank(window_px)], np.float32)
+    radius_px = np.array([each.radius_px for each in whitening.bank(window_px)], np.float32)
     size = np.abs(signed)
     peaks = np.argwhere((size > STRONG) & _highest(size))
     core, taken = _cores(peaks, size, radius_px[by], values, known)
@@ -264,17 +235,17 @@ def _scored(
     """Return each pixel's strongest score (r, c) with its sign, the template that it is by, and C^-1 r, from the pixels
     ``seen`` (r, c); ``start`` is near to that. ``rough``: by round templates in the middles of pixels
     alone, without the scatter of scores, which what stands out would spoil."""
-    solved = inverse_times(values, seen, noise.power, noise.grid, start)
+    solved = whitening.inverse_times(values, seen, noise.power, noise.grid, start)
     (h, w), depth_px = seen.shape, _depth_px(seen)
     views, best, shares, tail = [], [], {}, 1.0
     for coarse in range(1 if rough else 2):
-        spectrum_of = (halved if coarse else transformed)(solved, noise.grid)
+        spectrum_of = (whitening.halved if coarse else whitening.transformed)(solved, noise.grid)
         there, depth = (_halved(each) if coarse else each for each in (seen, depth_px))
         zone = ZONES[np.ceil(np.minimum(depth, len(ZONES) - 1)).astype(np.intp)]
         views.append((spectrum_of, there.astype(np.float32), zone, depth > RIM_PX))
         best.append((np.zeros(there.shape, np.float32), np.zeros(there.shape, np.uint8)))
-    templates = spectra(noise.grid, noise.window_px)
-    for number, (template, worth) in enumerate(zip(bank(noise.window_px), noise.worths, strict=True)):
+    templates = whitening.spectra(noise.grid, noise.window_px)
+    for number, (template, worth) in enumerate(zip(whitening.bank(noise.window_px), noise.worths, strict=True)):
         if rough and (template.coarse or any(template.halves)):
             continue
         spectrum_of, there, zone, inner = views[template.coarse]
@@ -284,7 +255,7 @@ def _scored(
             # what light and flying pixels leave along outlines looks like a slot
             enough = (share > LEAST_SEEN) & (there > 0) & (inner if template.slot else True)
             shares[key] = np.where(enough, np.maximum(share, LEAST_SEEN) ** -0.5, np.float32(0.0))
-        score = response(spectrum_of, templates[number], there.shape, not any(template.halves))
+        score = whitening.response(spectrum_of, templates[number], there.shape, not any(template.halves))
         cv2.multiply(score, shares[key], dst=score, scale=worth.energy**-0.5)
         deviations = np.ones(N_ZONES)
         if not rough:
@@ -315,9 +286,8 @@ def _halved(image: np.ndarray) -> np.ndarray:
 
 
 def _deviations(score: np.ndarray, zone: np.ndarray, reach_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the deviation (z,) of the scores (r, c) in each ``zone`` (r, c), by means of sizes up to `CAP`: of the
-    last where there are too few, and nowhere less than there; and (r, c) bool, the scores that do not tell it: those
-    within ``reach_px`` of scores that stand out."""
+    """Return the deviation (z,) of the scores (r, c) in each ``zone`` (r, c), by sizes up to `CAP`, no less than the
+    last; and (r, c) bool, the scores within ``reach_px`` of some that stand out, which do not tell it."""
     loud = np.zeros(score.shape, np.bool_)
     found, count = _scatter(score, zone, loud)
     if reach_px:
@@ -340,8 +310,7 @@ def _calm(score: np.ndarray, loud: np.ndarray, deviation: float, half_px: float)
 
 @numba.njit(**PLAIN)
 def _parts(score: np.ndarray, loud: np.ndarray, cap: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sums of the sizes, ``cap`` at most, of scores that are not loud, in squares of some `PART_PX` pixels,
-    and their number; 0 is no score."""
+    """Return the sums of the sizes, ``cap`` at most, of quiet scores in squares of `PART_PX`, and their number."""
     h, w = score.shape
     rows, columns = max(1, h // PART_PX), max(1, w // PART_PX)
     sums, counts = np.zeros((rows, columns)), np.zeros((rows, columns))
@@ -368,8 +337,7 @@ def _scatter(score: np.ndarray, zone: np.ndarray, loud: np.ndarray) -> tuple[np.
 
 @numba.njit(**PLAIN)
 def _capped(score: np.ndarray, zone: np.ndarray, loud: np.ndarray, zones: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sums of the scores' sizes, `CAP` at most, in each zone, less the loud ones, and their number; 0 is no
-    score."""
+    """Return the sums of the sizes, `CAP` at most, of quiet scores in each zone, and their number."""
     sums, counts = np.zeros(zones), np.zeros(zones, np.int64)
     for i in range(score.shape[0]):
         total, number = 0.0, 0  # of the last zone, where most pixels lie
@@ -417,8 +385,7 @@ def _keep_stronger(
 
 
 def _tail(scores: np.ndarray) -> float:
-    """Return how much farther the tail of scores (r, c) reaches than a Gaussian's, on the side where it is shorter,
-    since damage lengthens one; 1 at least."""
+    """Return how much farther the tail of scores (r, c) reaches than a Gaussian's, on its shorter side; 1 at least."""
     count = int(TAIL_SHARE * np.count_nonzero(scores))
     sides = [np.sort(np.abs(scores[beyond])) for beyond in (scores > TAIL_SIGMAS, scores < -TAIL_SIGMAS)]
     if count == 0 or min(map(len, sides)) < count:
@@ -427,8 +394,7 @@ def _tail(scores: np.ndarray) -> float:
 
 
 def _fill_discs(signed: np.ndarray, radius_px: np.ndarray) -> None:
-    """Raise the scores (r, c) inside the disc of each wide template that peaks, so that what it explains is one
-    finding."""
+    """Raise the scores (r, c) inside the disc of each wide template that peaks, so that it is one finding."""
     size = np.abs(signed)
     peaks = (size > STRONG / 2) & (radius_px >= WIDE_PX) & _highest(size)
     for row, column in np.argwhere(peaks).tolist():
@@ -448,9 +414,8 @@ def _cores(
     peaks: np.ndarray, size: np.ndarray, radius_px: np.ndarray, values: np.ndarray, known: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return (r, c) bool: the loud pixels, and what lies between them, that ``peaks`` (n, 2) of the scores' ``size``
-    stand on, where they fill a disc of the template's ``radius_px`` (r, c): of what is wide and shallow only the
-    loudest pixels would go. Further their signed scores (r, c), in proportion to the values over 3 x 3 pixels, so that
-    two holes that touch keep two peaks."""
+    stand on, where they fill a disc of the template's ``radius_px`` (r, c). Further their signed scores (r, c), in
+    proportion to the values over 3 x 3 pixels, so that two holes that touch keep two peaks."""
     core, signed = np.zeros(size.shape, bool), np.zeros(size.shape)
     loud = known & (np.abs(values) > LOUD_SIGMAS)
     around = (cv2.blur(each, (3, 3)) for each in (values, known.astype(np.float32)))

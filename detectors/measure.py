@@ -1,9 +1,5 @@
 """Size and place of a detection: the thesis' extents, and beside them the model of a blurred hole, or where that does
-not hold the contour at half depth.
-
-Depths are measured along the optical axis from the fitted surface, positive behind it. Sizes are measured on the
-surface.
-"""
+not hold the contour at half depth. Depths are along the optical axis, positive behind the surface, sizes on it."""
 
 from __future__ import annotations
 
@@ -16,16 +12,7 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from detectors.clusters import PLAIN
-from detectors.hole_model import (
-    MOST_MISFIT,
-    HoleFit,
-    HolePatch,
-    fit_hole,
-    normal_of,
-    pictures,
-    sight,
-    straight_sight,
-)
+from detectors.hole_model import MOST_MISFIT, HoleFit, HolePatch, fit_hole, normal_of, pictures, sight, straight_sight
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.masks import grown, parts_with
 from detectors.noise import median_of, sigma_of
@@ -83,8 +70,7 @@ def extents(points_m: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def centres_of(points_m: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
-    """Return the centres (count, 3) that `extents` has of the clusters that the ``labels`` (n,) of points (n, 3)
-    make."""
+    """Return the centres (count, 3) by `extents` of the clusters of points (n, 3) that ``labels`` (n,) make."""
     return np.asarray(points_m[_extremes(points_m, labels, count)].mean(axis=1))
 
 
@@ -119,8 +105,8 @@ def measure_detection(
     config: HoleModelConfig,
     correlation: np.ndarray | None = None,
 ) -> Measurement:
-    """Measure one detection both ways; NaN and a note where a measure cannot be made. ``correlation`` (odd, odd): of
-    the noise, by lag, where it is known."""
+    """Measure one detection both ways; NaN and a note where a measure cannot be made. ``correlation`` of noise by
+    lag."""
     if not cloud.organised:
         return measure_extents(cloud, detection, "no pixel grid: extents only")
     placed = measure_extents(cloud, detection, "too few valid pixels around for a model")

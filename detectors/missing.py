@@ -1,10 +1,9 @@
 """Missing returns as evidence: connected pixels inside the target's outline from which no light came back.
 
-What tells a hole from chance is its size: cameras lose scattered pixels anywhere. A place that touches the outline's
-edge or that of the image is no finding. Chance is simulated: scattered dropouts are places where white noise averaged
-over a square of 1 to 5 pixels falls below a level; the square gives the share of missing neighbours, the level the
-local rate, both from the clusters that are too small to be findings. Not modelled: dropouts that come in equal blobs
-wider than 3 pixels.
+What tells a hole from chance is its size; a place that touches the edge of the outline or image is no finding. Chance
+is simulated: scattered dropouts are places where white noise averaged over a square of 1 to 5 pixels falls below a
+level; the square gives the share of missing neighbours, the level the local rate, both from clusters that are too small
+to be findings. Not modelled: dropouts that come in equal blobs wider than 3 pixels.
 """
 
 from __future__ import annotations
@@ -52,9 +51,8 @@ REASONS: dict[int, str] = {
 
 
 class _Gaps(NamedTuple):
-    """Pixels without a return inside the target's ``outline`` (h, w): ``unseen`` (h, w) as in `MissingReturns`,
-    ``missing`` (h, w) bool; ``labels`` (h, w) and ``sizes`` by label of their clusters, and which are ``free`` of the
-    outline's edge."""
+    """Pixels without a return inside the target's ``outline`` (h, w): ``unseen`` as in `MissingReturns`, ``missing``
+    (h, w) bool; ``labels`` (h, w) and ``sizes`` of their clusters, and which are ``free`` of the outline's edge."""
 
     outline: np.ndarray
     unseen: np.ndarray
@@ -65,8 +63,7 @@ class _Gaps(NamedTuple):
 
 
 def _gaps(cloud: Cloud, evidence: Evidence) -> _Gaps | None:
-    """Return what is missing inside the outline of what was judged: these pixels, gaps narrower than 3 pixels, and all
-    that they enclose. None for a cloud without a pixel grid."""
+    """Return what is missing inside the outline of what was judged. None without a pixel grid."""
     judged = np.isfinite(evidence.score)
     if not cloud.organised or not judged.any():
         return None
@@ -118,8 +115,7 @@ def _counted(image: np.ndarray, kernel: np.ndarray) -> np.ndarray:
 
 
 def missing_returns(cloud: Cloud, evidence: Evidence) -> MissingReturns | None:
-    """Look for missing returns inside the outline of what was judged. None for a cloud without a pixel grid.
-    Deterministic."""
+    """Look for missing returns inside the outline of what was judged. None for a cloud without a pixel grid."""
     gaps = _gaps(cloud, evidence)
     if gaps is None:
         return None

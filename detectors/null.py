@@ -4,12 +4,11 @@ Damage lies behind the surface. What stands out before it is noise, fixed patter
 (regions that stand before the surface as a whole, edges in the colour picture or the amplitude) and a margin are left
 out. The tail of these peaks is extrapolated to the threshold at which the wanted number of false calls is expected,
 bumps and hole-like calls together: exponential in (s^q - 1) / q of the score s, less the logarithm by which the maxima
-of normal noise in two dimensions are more. The data weigh the exponents, starting from `PRIOR`; rates are integrated
-out, and scales from where a unit of score is the noise's deviation.
+of normal noise in two dimensions are more. The data weigh the exponents, starting from `PRIOR`; rates and scales are
+integrated out.
 
 Not modelled: noise that is not symmetric beyond what `skew_of` sees in the core; damage towards the camera that is no
-larger than the noise; objects on clouds without a grid. Things on the target that are neither proud of it nor seen in a
-picture raise the threshold.
+larger than the noise; objects on clouds without a grid, or that neither stand out nor are seen in a picture.
 """
 
 from __future__ import annotations
@@ -83,18 +82,12 @@ def own_threshold(detector: Detector, cloud: Cloud, evidence: Evidence, false_ca
     doubts = []
     skew = skew_of(evidence)
     if abs(skew) > MOST_SKEW:
-        side = "behind" if skew > 0 else "before"
-        doubts.append(
-            f"the residual is not symmetric: its quartiles reach {(1 + abs(skew)) / (1 - abs(skew)):.1f} times as far"
-            f" {side} the surface as to the other side"
-        )
+        farther = f"{(1 + abs(skew)) / (1 - abs(skew)):.1f} times as far {'behind' if skew > 0 else 'before'}"
+        doubts.append(f"the residual is not symmetric: its quartiles reach {farther} the surface as to the other side")
     if len(peaks) < FEWEST_PEAKS:
-        doubts.append(
-            f"only {len(peaks)} peaks of noise stand out towards the camera, too few to set a threshold by"
-            f" ({FEWEST_PEAKS} at least)"
-        )
-        nan = float("nan")
-        return OwnThreshold(nan, nan, nan, nan, len(peaks), floor, objects, 0, evidence, tuple(doubts))
+        few = f"only {len(peaks)} peaks of noise stand out towards the camera, too few to set a threshold by"
+        doubts.append(f"{few} ({FEWEST_PEAKS} at least)")
+        return OwnThreshold(*(float("nan"),) * 4, len(peaks), floor, objects, 0, evidence, tuple(doubts))
     # all peaks, or the higher half, and again, while too many lie above the threshold: a few wide waves of a fixed
     # pattern are then higher than the noise of many pixels, and one tail does not hold both
     falling, number = np.sort(peaks)[::-1], false_calls / 2.0
@@ -109,10 +102,8 @@ def own_threshold(detector: Detector, cloud: Cloud, evidence: Evidence, false_ca
     low, high = (2.0 * bound for bound in tail.interval(threshold))
     hidden = int((covered & known).sum())
     if hidden > MOST_MASKED * known.sum():
-        doubts.append(
-            f"{100 * hidden / known.sum():.0f} % of what is judged lies under or beside objects before the surface,"
-            " and the rest may not stand for the whole"
-        )
+        share = f"{100 * hidden / known.sum():.0f} % of what is judged"
+        doubts.append(f"{share} lies under or beside objects, and the rest may not stand for the whole")
     expected, searched = 2.0 * tail.expected(threshold), _only(evidence, ~rim)
     told = (tail.peaks, tail.floor, objects, int(rim.sum()))
     return OwnThreshold(threshold, expected, low, high, *told, searched, tuple(doubts))
@@ -216,8 +207,7 @@ class Tail:
 
 def _excess(ratios: np.ndarray, exponent: float, floor: float) -> np.ndarray:
     """Return how far scores, as ratios (n,) to the floor, lie above it, in factors of e by which peaks become fewer:
-    for the exponent 2 those of normal noise with deviation 1, whose maxima in two dimensions fall as s exp(-s^2 / 2)
-    (Adler 1981)."""
+    for the exponent 2 as of normal noise, whose maxima in two dimensions fall as s exp(-s^2 / 2) (Adler 1981)."""
     power = np.log(ratios) if exponent == 0.0 else (ratios**exponent - 1.0) / exponent
     return np.asarray(floor**2 * (power - _crowd(floor) * np.log(ratios)))
 

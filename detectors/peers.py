@@ -1,9 +1,8 @@
 """Methods of other fields and libraries behind the same interface, to be compared on the same clouds.
 
-`m3c2` asks the library py4dgeo for the distance to a surface and its level of detection, as geomorphologists measure
-change; `plane_ransac` takes Open3D's plane, as most tutorials do; `fpfh_memory` compares features of shape with those
-of undamaged targets, which found more than deep networks did on the data set MVTec 3D-AD. Each has the settings and the
-formula of its source; none knows the camera's noise.
+`m3c2` asks py4dgeo for the distance to a surface and its level of detection; `plane_ransac` takes Open3D's plane;
+`fpfh_memory` compares features of shape with those of undamaged targets. Each has the settings and the formula of its
+source; none knows the camera's noise.
 """
 
 from __future__ import annotations
@@ -90,17 +89,13 @@ class PlaneRansacDetector(ScoreMapDetector[PlaneRansacConfig]):
         return tuple(plane.tolist())
 
 
-# ---------------------------------------------------------------- M3C2
-
-
 class M3c2Config(ScoreMapConfig):
     """``reference``: a capture of the same target without damage, any that ``harness.detect`` reads, in the frame of
     the clouds; without it the distance is to ``surface``, fitted to the cloud itself. ``registration_error_mm``: how
-    well the two agree where nothing has changed; without it the scatter of the distances is taken, as most of the
-    target is unchanged. ``cylinder_radius_mm``: half of the scale over which points are averaged: 4 mm hold some 20 of
-    the pixels of 1.4 mm that an Azure Kinect has at 0.7 m, as Lague et al. ask for. ``normal_radius_mm``: of the
-    neighbourhood that a normal is fitted to, 20 times a noise of 1 mm. ``reach_mm``: half of a cylinder's length;
-    deeper points have no counterpart."""
+    well the two agree where nothing has changed; none: by the scatter of the distances. ``cylinder_radius_mm``: half of
+    the scale over which points are averaged: 4 mm hold some 20 of the pixels of an Azure Kinect at 0.7 m, as Lague et
+    al. ask for. ``normal_radius_mm``: of the neighbourhood that a normal is fitted to, 20 times a noise of 1 mm.
+    ``reach_mm``: half of a cylinder's length; deeper points have no counterpart."""
 
     crop: CropConfig = Field(default_factory=AutoCrop)
     surface: SurfaceConfig = Field(default_factory=SurfaceConfig)
@@ -141,10 +136,8 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
         judged = np.isfinite(distance_m)
         alone = 1.0 - float(judged.mean())
         if not judged.any():
-            fix = "check that both are in one frame, or enlarge cylinder_radius_mm or reach_mm"
-            raise UserError(
-                f"no point of the target has {LEAST_SAMPLES} neighbours there and in {notes['surface']}", fix=fix
-            )
+            what = f"no point of the target has {LEAST_SAMPLES} neighbours there and in {notes['surface']}"
+            raise UserError(what, fix="check that both are in one frame, or enlarge cylinder_radius_mm or reach_mm")
         if settings.registration_error_mm is None:
             scatter_m = sigma_of(distance_m[judged] - median_of(distance_m[judged]))
             error_m = float(np.sqrt(max(scatter_m**2 - median_of(deviation_m[judged]) ** 2, 0.0)))
@@ -153,14 +146,11 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
         deviation_m = np.maximum(deviation_m + error_m, rounding_floor(cloud, mask))
         signed = on_grid(distance_m / deviation_m, mask)
         if settings.reference is not None and np.nanmedian(np.abs(signed)) > LOD_SIGMAS:
-            off_mm = median_of(np.abs(distance_m[judged])) / MM
-            warnings.append(
-                f"the target lies {off_mm:.2g} mm off its reference scan: it moved, or is not registered to it"
-            )
+            off = f"{median_of(np.abs(distance_m[judged])) / MM:.2g} mm"
+            warnings.append(f"the target lies {off} off its reference scan: it moved, or is not registered to it")
         if alone > MOST_ALONE:
-            warnings.append(
-                f"{100 * alone:.0f} % of the target has no counterpart in {notes['surface']} and is not judged"
-            )
+            share = f"{100 * alone:.0f} % of the target"
+            warnings.append(f"{share} has no counterpart in {notes['surface']} and is not judged")
         notes |= {"points": len(points), "registration_error_m": error_m, "without_counterpart": alone}
         return Evidence(
             score=np.abs(signed),
@@ -173,8 +163,7 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
         )
 
     def places(self, points_m: np.ndarray) -> np.ndarray:
-        """Return the places across the view: a score belongs to the surface, so that a rim and what lies deep behind it
-        are one finding."""
+        """Return the places across the view, so that a rim and what lies deep behind it are one finding."""
         return points_m * [1.0, 1.0, 0.0]
 
     @cached_property
@@ -227,14 +216,10 @@ def _py4dgeo() -> Any:
     return py4dgeo
 
 
-# ---------------------------------------------------------------- features in a memory
-
-
 class FpfhMemoryConfig(ScoreMapConfig):
     """``normal_neighbours``, ``feature_neighbours``: points in the sphere of a normal and of a feature, at a typical
-    place, and ``pool_px``: side of the square of pixels over which features are averaged (30, 100 and 8 in the
-    paper's program). ``memory``: features of undamaged targets that are kept. ``surface``: what sizes are measured
-    from."""
+    place, and ``pool_px``: side of the square over which features are averaged (30, 100 and 8 in the paper's program).
+    ``memory``: features of undamaged targets that are kept. ``surface``: what sizes are measured from."""
 
     crop: CropConfig = Field(default_factory=AutoCrop)
     surface: SurfaceConfig = Field(default_factory=SurfaceConfig)
@@ -249,10 +234,10 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
 
     Horwitz and Hoshen, "Back to the Feature", CVPR workshops 2023: FPFH (Rusu et al., ICRA 2009), averaged over a
     window; the memory is a greedy k-centre coreset (Roth et al., CVPR 2022); the score is the Euclidean distance to its
-    nearest feature, in units of the median distance of one more undamaged target. Only the shape of some 100 neighbours
-    counts: a wide hole shows by its rim alone, and a step that is sharp and deeper than their sphere is wide is not
-    seen, as both its sides are flat. Not done: the paper's smoothing of scores. A score is no length; ``scale_m`` is
-    the deviation of the residuals."""
+    nearest feature, in units of the median distance of one more undamaged target. A wide hole shows by its rim alone,
+    and a step that is sharp and deeper than the spheres is not seen. Not done: the paper's smoothing of scores. A score
+    is no length; ``scale_m`` is the deviation of the residuals.
+    """
 
     settings_type: ClassVar[type[FpfhMemoryConfig]] = FpfhMemoryConfig
     name = "fpfh_memory"
@@ -263,8 +248,7 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
         self._learned = learned
 
     def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
-        """Return ``memory`` (m, 33) and ``unit`` (): the median distance of the last cloud's features from it. Raises
-        UserError for fewer than two clouds."""
+        """Return ``memory`` (m, 33) and ``unit`` (): a cloud's median distance. Raises UserError for one cloud."""
         if len(hole_free) < 2:
             raise UserError(f"the detector {self.name!r} learns from two hole-free clouds at least")
         of_clouds = []
@@ -283,10 +267,9 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
     def analyse(self, cloud: Cloud) -> Evidence:
         """Score the distance from the memory in the crop. Raises UserError without a memory, and for few points."""
         if self._learned is None:
-            raise UserError(
-                f"the detector {self.name!r} has no memory of hole-free targets to compare this cloud with",
-                fix="use it in a study, which has hole-free boards, or call its `calibrate` with clouds of your own",
-            )
+            what = f"the detector {self.name!r} has no memory of hole-free targets to compare this cloud with"
+            fix = "use it in a study, which has hole-free boards, or call its `calibrate` with clouds of your own"
+            raise UserError(what, fix=fix)
         mask = crop(cloud, self.settings.crop)
         features, _, _ = self._features(cloud, mask)
         score = nearest(features, self._learned["memory"]) / max(float(self._learned["unit"]), 1e-9)

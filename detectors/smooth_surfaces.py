@@ -7,10 +7,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
-import numba
 import numpy as np
 
-from detectors.clusters import PLAIN
 from detectors.masks import components, grown, holes_filled, nearest_pixel, parts_with, shrunk
 from harness.vocabulary.geometry import MM, Cloud, Region
 
@@ -31,8 +29,7 @@ MOST_SURFACES, WIDE_PART = 8, 0.1
 WIDEST_SLOPE = 5.7
 """tan(80 degrees): no camera sees so far off its axis; a cloud that does was not recorded from its origin."""
 CELL_SPACINGS, CELL_GROWTH, CELLS_FILLED, MAX_RASTER = 1.5, 1.25, 0.99, 4096
-"""Least side of a raster's cell over the distance between neighbours, its growth until so many cells away from rims
-hold a point, and most cells a side."""
+"""Least side of a raster's cell in spacings, its growth until so many cells hold a point, and most cells a side."""
 
 
 @dataclass(frozen=True)
@@ -111,80 +108,46 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
 
 def sees_from_origin(cloud: Cloud) -> bool:
     """Return whether the cloud's grid samples rays through the origin, as a camera does."""
-    if cloud.projection != "central":
+    return cloud.projection == "central" and _before_lens(cloud.points_m[np.isfinite(cloud.points_m[..., 2])])
+
+
+def _before_lens(points: np.ndarray) -> bool:
+    """Return whether all points (n, 3), one or more, may be seen by a camera in the origin."""
+    if not len(points) or not points[:, 2].min() > 0:
         return False
-    return _widest_slope(cloud.points_m) < WIDEST_SLOPE
+    return float(np.abs(points[:, :2] / points[:, 2:]).max()) < WIDEST_SLOPE
 
 
-@numba.njit(error_model="numpy", **PLAIN)
-def _widest_slope(points_m: np.ndarray) -> float:
-    """Return the largest |x / z| or |y / z| of points (h, w, 3); infinite without a point, or with one behind z = 0."""
-    widest = -1.0
-    for i in range(points_m.shape[0]):
-        for j in range(points_m.shape[1]):
-            x, y, z = points_m[i, j, 0], points_m[i, j, 1], points_m[i, j, 2]
-            if z <= 0.0:
-                return np.inf
-            if np.isfinite(z):
-                widest = max(widest, abs(x / z), abs(y / z))
-    return widest if widest >= 0.0 else np.inf
-
-
-@numba.njit(error_model="numpy", **PLAIN)
 def links(points_m: np.ndarray, tilt: float, noise_m: float, central: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return whether each of the pixels (h, w, 3) lies on one surface with its right (h, w) and its lower neighbour (h,
     w). ``central``: the way across is measured between the two rays at the nearer depth."""
-    h, w, _ = points_m.shape
-    plan = np.empty((h, w, 2))
-    for i in range(h):
-        for j in range(w):
-            for k in range(2):
-                plan[i, j, k] = points_m[i, j, k] / points_m[i, j, 2] if central else points_m[i, j, k]
-    linked = np.zeros((2, h, w), dtype=np.bool_)
-    for axis in range(2):
-        for i in range(h - axis):
-            for j in range(w - 1 + axis):
-                a, b = (i, j), (i + axis, j + 1 - axis)
-                near = min(points_m[a][2], points_m[b][2]) if central else 1.0
-                dx, dy = (plan[b][0] - plan[a][0]) * near, (plan[b][1] - plan[a][1]) * near
-                step = abs(points_m[b][2] - points_m[a][2])
-                linked[axis, i, j] = step <= tilt * np.sqrt(dx * dx + dy * dy) + noise_m
+    (x, y, z), linked = np.ascontiguousarray(np.moveaxis(points_m, 2, 0)), np.zeros((2, *points_m.shape[:2]), bool)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        x, y = (x / z, y / z) if central else (x, y)
+        for found, axis, low, high in ((0, 1, np.s_[:, :-1], np.s_[:, 1:]), (1, 0, np.s_[:-1], np.s_[1:])):
+            near = np.minimum(z[low], z[high]) if central else 1.0
+            dx, dy = (np.diff(each, axis=axis) * near for each in (x, y))
+            linked[found][low] = np.abs(np.diff(z, axis=axis)) <= tilt * np.sqrt(dx * dx + dy * dy) + noise_m
     return linked[0], linked[1]
 
 
-@numba.njit(**PLAIN)
 def unit_normals(surface_m: np.ndarray) -> np.ndarray:
     """Return the normals (h, w, 3) of a surface's points (h, w, 3), by central differences; 0 where it has no area."""
-    h, w, _ = surface_m.shape
-    normals, u, v = np.zeros((h, w, 3)), np.empty(3), np.empty(3)
-    if min(h, w) < 2:
-        return normals
-    for i in range(h):
-        up, low = max(i - 1, 0), min(i + 1, h - 1)
-        for j in range(w):
-            left, right = max(j - 1, 0), min(j + 1, w - 1)
-            for k in range(3):
-                u[k] = (surface_m[i, right, k] - surface_m[i, left, k]) / (right - left)
-                v[k] = (surface_m[low, j, k] - surface_m[up, j, k]) / (low - up)
-            x, y, z = u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
-            length = max(np.sqrt(x * x + y * y + z * z), 1e-15)
-            normals[i, j, 0], normals[i, j, 1], normals[i, j, 2] = x / length, y / length, z / length
-    return normals
+    if min(surface_m.shape[:2]) < 2:
+        return np.zeros(surface_m.shape)
+    down, right = np.gradient(surface_m, axis=(0, 1))
+    normals = np.cross(right, down)
+    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=-1), 1e-15)[..., None])
 
 
-@numba.njit(**PLAIN)
 def turns(normals: np.ndarray, half: int, least_cosine: float) -> np.ndarray:
     """Return (h, w) bool: unit normals ``half`` pixels to either side enclose a wider angle."""
-    h, w, _ = normals.shape
-    turned = np.zeros((h, w), dtype=np.bool_)
-    for i in range(h):
-        for j in range(w):
-            for down, right in ((half, 0), (0, half)):
-                if down <= i < h - down and right <= j < w - right:
-                    cosine = 0.0
-                    for k in range(3):
-                        cosine += normals[i + down, j + right, k] * normals[i - down, j - right, k]
-                    turned[i, j] |= cosine < least_cosine
+    turned = np.zeros(normals.shape[:2], dtype=bool)
+    for ahead, middle, back in (
+        (np.s_[2 * half :], np.s_[half:-half], np.s_[: -2 * half]),
+        (np.s_[:, 2 * half :], np.s_[:, half:-half], np.s_[:, : -2 * half]),
+    ):
+        turned[middle] |= np.einsum("ijk,ijk->ij", normals[ahead], normals[back]) < least_cosine
     return turned
 
 
@@ -274,46 +237,19 @@ def _trim_rims(
         apart, nearest = nearest_pixel(inner)
         pixels = np.flatnonzero(rim & (apart <= 3 * reach))
         seeds = nearest.reshape(-1)[pixels]
-        leaves = _leaves(points, means, normals, pixels, seeds, valid.shape, reach, apart_m)
+        way = points[pixels] - means[seeds]
+        off, distance = np.abs((way * normals[seeds]).sum(axis=1)), np.linalg.norm(way, axis=1)
+        # the bend of the surface over as many pixels inwards, radians per metre
+        start = np.stack(np.unravel_index(seeds, valid.shape), axis=1)
+        inwards = start - np.stack(np.unravel_index(pixels, valid.shape), axis=1)
+        step = inwards * (reach / np.maximum(np.hypot(*inwards.T), 1.0))[:, None]
+        end = np.ravel_multi_index(np.rint(start + step).astype(np.intp).T, valid.shape, mode="clip")
+        cosine = np.clip((normals[seeds] * normals[end]).sum(axis=1), 0.0, 1.0)
+        bend = np.arccos(cosine) / np.maximum(np.linalg.norm(means[seeds] - means[end], axis=1), 1e-9)
+        turn = np.minimum(math.radians(RIM_TURN_DEG) + bend * distance / 2.0, np.pi / 2)
+        leaves = (off > apart_m) & (off > np.sin(turn) * distance)
         own[number].reshape(-1)[pixels[leaves]] = False
         own[number] = parts_with(own[number], inner, connectivity=4)
-
-
-@numba.njit(**PLAIN)
-def _leaves(
-    points: np.ndarray,
-    means: np.ndarray,
-    normals: np.ndarray,
-    pixels: np.ndarray,
-    seeds: np.ndarray,
-    shape: tuple[int, int],
-    reach: int,
-    apart_m: float,
-) -> np.ndarray:
-    """Return (n,) bool: points at ``pixels`` depart from the surface at ``seeds`` farther than it may bend."""
-    leaves = np.zeros(len(pixels), dtype=np.bool_)
-    for i in range(len(pixels)):
-        seed = seeds[i]
-        off, distance = 0.0, 0.0
-        for k in range(3):
-            way = points[pixels[i], k] - means[seed, k]
-            off += way * normals[seed, k]
-            distance += way**2
-        off, distance = abs(off), np.sqrt(distance)
-        if off <= apart_m:
-            continue
-        # the bend of the surface over as many pixels inwards, radians per metre
-        row, column = seed // shape[1], seed % shape[1]
-        down, across = row - pixels[i] // shape[1], column - pixels[i] % shape[1]
-        step = reach / max(np.hypot(down, across), 1.0)
-        inner_row = min(max(np.rint(row + step * down), 0), shape[0] - 1)
-        inner_column = min(max(np.rint(column + step * across), 0), shape[1] - 1)
-        inwards = int(inner_row) * shape[1] + int(inner_column)
-        cosine = min(max((normals[seed] * normals[inwards]).sum(), 0.0), 1.0)
-        bend = np.arccos(cosine) / max(np.sqrt(((means[seed] - means[inwards]) ** 2).sum()), 1e-9)
-        turn = math.radians(RIM_TURN_DEG) + bend * distance / 2.0
-        leaves[i] = off > np.sin(min(turn, np.pi / 2)) * distance
-    return leaves
 
 
 def raster(points: np.ndarray, cloud: Cloud) -> tuple[Cloud, np.ndarray, np.ndarray, float]:
@@ -322,7 +258,7 @@ def raster(points: np.ndarray, cloud: Cloud) -> tuple[Cloud, np.ndarray, np.ndar
     from scipy.spatial import cKDTree
 
     plan, z = points[:, :2], points[:, 2:]
-    if z.min() > 0 and float(np.abs(plan / z).max()) < WIDEST_SLOPE:
+    if _before_lens(points):
         plan = plan / z
     # what nine in ten of the distances to the nearest neighbour do not exceed, of some 2000 places
     some = plan[:: max(1, len(plan) // 2000)]

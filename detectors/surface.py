@@ -1,10 +1,9 @@
 """The shapes that a target may have, fitted to points of which some are damage: polynomials z(x, y) (the thesis'
 "robust cubic" and others), quadrics (sphere, cylinder, cone, ...).
 
-Scaled co-ordinates (x and y to [-1, 1]) and Chebyshev products keep the normal equations well conditioned. Large clouds
-are solved on an even sample first and finished on all points. Not modelled: errors in x and y, correlated noise,
-overhangs, creases, several sheets. Damage of one to three sigma bends every point-wise robust fit by a third of a
-sigma.
+Large clouds are solved on an even sample first and finished on all points. Not modelled: errors in x and y, correlated
+noise, overhangs, creases, several sheets. Damage of one to three sigma bends every point-wise robust fit by a third of
+a sigma.
 """
 
 from __future__ import annotations
@@ -15,6 +14,7 @@ from typing import Annotated, Literal, Self
 
 import numba
 import numpy as np
+from numpy.polynomial.chebyshev import chebvander
 from pydantic import Field, model_validator
 from scipy.linalg import cho_solve, eigh
 
@@ -35,7 +35,7 @@ BISQUARE_CONVERGED, GAP_CONVERGED = 1e-2, 1e-6
 """Bisquare stops below this part of a standard error of the fit, LAR when the duality gap is within this part."""
 TINY_M = 1e-9  # residuals below a nanometre are rounding of the arithmetic
 
-Solution = tuple[np.ndarray, int, bool, str]  # coefficients (p,), steps, whether these converged, and what was done
+Solution = tuple[np.ndarray, str]  # coefficients (p,) and what was done
 
 
 class ReferenceConfig(Config):
@@ -47,13 +47,12 @@ class ReferenceConfig(Config):
 
 
 class SurfaceConfig(Config):
-    """``shape``: ``polynomial`` of the stated degree; ``mesh``: the ``reference``, laid onto the cloud; ``auto``: the
-    simplest of plane, polynomials, quadric and free form that the cloud's own evidence asks for, whatever ``degree``
-    says; ``free_form`` in any case. ``scale_mm``: the width above which a free form follows the cloud. ``degree``:
-    total degree; 3 has the 10 terms of MATLAB's poly33. ``method``: ``lar`` least absolute residuals; ``bisquare``
-    Tukey's, from a least-squares start (MATLAB's semantics); ``lts`` a FAST-LTS start, then bisquare, which survives
-    damage of a third of the surface; ``least_squares``. ``drop_cross_terms``: no term in both x and
-    y (as the thesis' script)."""
+    """``shape``: ``polynomial`` of the stated total ``degree`` (3: MATLAB's poly33); ``mesh``: the ``reference``, laid
+    onto the cloud; ``auto``: the simplest of plane, polynomials, quadric and free form that the cloud's own evidence
+    asks for; ``free_form`` in any case. ``scale_mm``: the width above which a free form follows the cloud. ``method``:
+    ``lar`` least absolute residuals; ``bisquare`` Tukey's, from a least-squares start (MATLAB's semantics); ``lts`` a
+    FAST-LTS start, then bisquare, which survives damage of a third of the surface; ``least_squares``.
+    ``drop_cross_terms``: no term in both x and y (as the thesis' script)."""
 
     shape: Literal["polynomial", "auto", "free_form", "mesh"] = "polynomial"
     reference: ReferenceConfig | None = None
@@ -86,54 +85,25 @@ class Chebyshev:
         powers = np.array([(i, j) for i, j in orders if cross_terms or not (i and j)])
         return cls(powers, (low + high) / 2, np.maximum((high - low) / 2, TINY_M))
 
+    def _orders(self, xy_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return T_0, T_1, ... (d + 1, n) of u and of v at places (n, 2)."""
+        columns = zip(np.asarray(xy_m, np.float64).T, self.middle_m, self.half_m, strict=True)
+        u, v = (chebvander((x - middle) / half, int(self.powers.max())).T for x, middle, half in columns)
+        return u, v
+
     def basis(self, xy_m: np.ndarray) -> np.ndarray:
         """Return the products (p, n) at places (n, 2)."""
-        return _products(np.ascontiguousarray(xy_m, dtype=np.float64), self.middle_m, self.half_m, self.powers)
+        u, v = self._orders(xy_m)
+        return np.stack([u[a] * v[b] for a, b in self.powers])
 
     def summed(self, coefficients: np.ndarray, xy_m: np.ndarray) -> np.ndarray:
         """Return the products' sum (n,) by coefficients (p,)."""
-        table = np.zeros((self.powers.max() + 1,) * 2)
-        table[self.powers[:, 0], self.powers[:, 1]] = coefficients
-        return _sums(np.ascontiguousarray(xy_m, dtype=np.float64), self.middle_m, self.half_m, table)
-
-
-@numba.njit(**PLAIN)
-def _chebyshev(x: float, out: np.ndarray) -> None:
-    """Fill (d + 1,) with T_0(x) to T_d(x)."""
-    out[0] = 1.0
-    if len(out) > 1:
-        out[1] = x
-    for k in range(2, len(out)):
-        out[k] = 2.0 * x * out[k - 1] - out[k - 2]
-
-
-@numba.njit(**PLAIN)
-def _products(xy: np.ndarray, middle: np.ndarray, half: np.ndarray, powers: np.ndarray) -> np.ndarray:
-    n, terms = len(xy), len(powers)
-    out, table = np.empty((terms, n)), np.empty((2, powers.max() + 1))
-    for i in range(n):
-        for k in range(2):
-            _chebyshev((xy[i, k] - middle[k]) / half[k], table[k])
-        for j in range(terms):
-            out[j, i] = table[0, powers[j, 0]] * table[1, powers[j, 1]]
-    return out
-
-
-@numba.njit(**PLAIN)
-def _sums(xy: np.ndarray, middle: np.ndarray, half: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-    side = len(coefficients)
-    out, u, v = np.empty(len(xy)), np.empty(side), np.empty(side)
-    for i in range(len(xy)):
-        _chebyshev((xy[i, 0] - middle[0]) / half[0], u)
-        _chebyshev((xy[i, 1] - middle[1]) / half[1], v)
-        total = 0.0
-        for a in range(side):
-            inner = 0.0
-            for b in range(side - a):  # the total degree is below the side
-                inner += coefficients[a, b] * v[b]
-            total += inner * u[a]
-        out[i] = total
-    return out
+        u, v = self._orders(xy_m)
+        total = np.zeros(len(xy_m))
+        for order in range(len(u)):
+            of = np.flatnonzero(self.powers[:, 0] == order)
+            total += u[order] * sum(coefficients[k] * v[b] for k, b in zip(of, self.powers[of, 1], strict=True))
+        return total
 
 
 @dataclass(frozen=True)
@@ -142,8 +112,6 @@ class Surface:
 
     chebyshev: Chebyshev
     coefficients: np.ndarray
-    iterations: int
-    converged: bool
     note: str
 
     def evaluate(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
@@ -164,11 +132,11 @@ def fit_surface(x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray, config: Surfa
     fewer points than coefficients, or where all points lie on a line."""
     terms = (2 * config.degree + 1) if config.drop_cross_terms else (config.degree + 1) * (config.degree + 2) // 2
     if len(z_m) < terms:
-        raise UserError(
-            f"{len(z_m)} valid points cannot determine the {terms} coefficients of a surface of degree {config.degree}",
-            legal=f"at least {terms} points, and many more to be useful",
-            fix="widen the crop, lower surface.degree, or check the capture",
+        what = (
+            f"{len(z_m)} valid points cannot determine the {terms} coefficients of a surface of degree {config.degree}"
         )
+        legal, fix = f"{terms} points at least", "widen the crop, lower surface.degree, or check the capture"
+        raise UserError(what, legal=legal, fix=fix)
     xy = np.column_stack([x_m, y_m]).astype(np.float64)
     chebyshev = Chebyshev.over(xy, config.degree, not config.drop_cross_terms)
     basis = chebyshev.basis(xy)
@@ -176,22 +144,20 @@ def fit_surface(x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray, config: Surfa
     z = np.asarray(z_m, dtype=np.float64) - middle
     plain = _solved(basis, z) if config.method == "least_squares" else _solved(*_thinned(basis, z, SAMPLE_POINTS))
     if plain is None:
-        raise UserError(
-            f"the points do not determine a surface of degree {config.degree}: they lie on a line or a curve",
-            fix="widen the crop, or lower surface.degree",
-        )
+        what = f"the points do not determine a surface of degree {config.degree}: they lie on a line or a curve"
+        raise UserError(what, fix="widen the crop, or lower surface.degree")
     if config.method == "lar":
-        c, steps, converged, note = _lar(basis, z, plain[0])
+        c, note = _lar(basis, z, plain[0])
     elif config.method == "bisquare":
-        c, steps, converged, note = _bisquare(basis, z, None, "bisquare from a least-squares start")
+        c, note = _bisquare(basis, z, None, "bisquare from a least-squares start")
     elif config.method == "lts":
         start = _lts_start(*_thinned(basis, z, LTS_SAMPLE))
-        c, steps, converged, note = _bisquare(basis, z, start, "bisquare from a FAST-LTS start")
+        c, note = _bisquare(basis, z, start, "bisquare from a FAST-LTS start")
     else:
-        c, steps, converged, note = plain[0], 1, True, "least squares"
+        c, note = plain[0], "least squares"
     c = c.copy()
     c[0] += middle
-    return Surface(chebyshev, c, steps, converged, note)
+    return Surface(chebyshev, c, note)
 
 
 def _solved(
@@ -232,7 +198,6 @@ def _lar(basis: np.ndarray, z: np.ndarray, start: np.ndarray, knees: np.ndarray 
         margin = 5.0 * 1.25 / 0.6745 * np.sqrt(len(basis) / len(few_z))
     r = z - c @ basis
     scale = max(float(np.median(np.abs(r[:: max(1, len(r) // SAMPLE_POINTS)]))), TINY_M)
-    steps, gap = 0, np.inf
     for knee in scale * knees:
         enough = 0.001 * GAP_CONVERGED * float(np.abs(r).sum())
         reach = max(margin * scale, 10.0 * knee)
@@ -241,8 +206,8 @@ def _lar(basis: np.ndarray, z: np.ndarray, start: np.ndarray, knees: np.ndarray 
             near = np.flatnonzero(~far)
             far_pull = basis @ np.where(far, np.sign(r), 0.0)
             rows = np.ascontiguousarray(np.take(basis, near, axis=1).T)
-            new, spent = _smoothed_descent(rows, z[near], far_pull, c, knee, enough)
-            after, steps = z - new @ basis, steps + spent
+            new = _smoothed_descent(rows, z[near], far_pull, c, knee, enough)
+            after = z - new @ basis
             # a far point may have crossed the surface, or come within the knee of it
             if not (far & ((r * after <= 0.0) | (np.abs(after) < knee))).any():
                 break
@@ -253,13 +218,12 @@ def _lar(basis: np.ndarray, z: np.ndarray, start: np.ndarray, knees: np.ndarray 
         gap = float((inside - inside**2 / knee).sum()) / max(float(sizes.sum()), TINY_M)
         if gap <= GAP_CONVERGED:
             break
-    return c, steps, gap <= GAP_CONVERGED, f"least absolute residuals, within {min(gap, 1.0):.0e} of the least sum"
+    return c, f"least absolute residuals, within {min(gap, 1.0):.0e} of the least sum"
 
 
 @numba.njit(**PLAIN)
 def _huber(rows: np.ndarray, z: np.ndarray, c: np.ndarray, knee: float) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return the sum of Huber's function over its knee, its negative gradient (p,), and the normal matrix (p, p) of the
-    points inside the knee."""
+    """Return the sum of Huber's function over its knee, its negative gradient (p,), and the inner normal matrix."""
     terms = len(c)
     value, pull, inside = 0.0, np.zeros(terms), np.zeros((terms, terms))
     for i in range(len(z)):
@@ -281,7 +245,7 @@ def _huber(rows: np.ndarray, z: np.ndarray, c: np.ndarray, knee: float) -> tuple
 
 def _smoothed_descent(
     rows: np.ndarray, z: np.ndarray, far_pull: np.ndarray, start: np.ndarray, knee: float, enough: float
-) -> tuple[np.ndarray, int]:
+) -> np.ndarray:
     """Minimise sum huber(r, knee) - c' far_pull: Newton, or where it fails a majorising step, which always descends."""
 
     def state(c: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
@@ -294,21 +258,21 @@ def _smoothed_descent(
         return next((trial for trial in trials if trial[0] < value), None)
 
     value, c, pull, inside = state(start)
-    for step in range(1, LAR_STEPS + 1):
+    for _ in range(LAR_STEPS):
         factor, moved = _factor(inside), None
         if factor is not None:
             way = knee * cho_solve((factor, True), pull, check_finite=False)
             if way @ pull < enough:
-                return c, step
+                return c
             moved = lower(way)
         if moved is None:
             # reweighted least squares: each |r| beyond the knee under its tangent parabola
             weighted = rows / np.maximum(np.abs(z - rows @ c), knee)[:, None]
             moved = lower(np.linalg.lstsq(weighted.T @ rows, pull, rcond=1e-12)[0])
         if moved is None or value - moved[0] < enough:
-            return c, step
+            return c
         value, c, pull, inside = moved
-    return c, LAR_STEPS
+    return c
 
 
 def bisquare_weights(r: np.ndarray, limit: float) -> np.ndarray:
@@ -320,10 +284,7 @@ def _bisquare(basis: np.ndarray, z: np.ndarray, start: np.ndarray | None, note: 
     """Reweight least squares with MATLAB's robustfit semantics, on a sample first, then on all points."""
     few_basis, few_z = _thinned(basis, z, SAMPLE_POINTS)
     inner = _reweighted(few_basis, few_z, start, 50, note)
-    if len(few_z) == len(z):
-        return inner
-    c, steps, converged, note = _reweighted(basis, z, inner[0], 8, note)
-    return c, inner[1] + steps, converged, note
+    return inner if len(few_z) == len(z) else _reweighted(basis, z, inner[0], 8, note)
 
 
 def _reweighted(basis: np.ndarray, z: np.ndarray, start: np.ndarray | None, steps: int, note: str) -> Solution:
@@ -332,7 +293,7 @@ def _reweighted(basis: np.ndarray, z: np.ndarray, start: np.ndarray | None, step
     c, terms = plain[0] if start is None else start, len(basis)
     leverage = ((np.linalg.inv(plain[1]) @ basis) ** 2).sum(axis=0)
     adjust = 1.0 / np.sqrt(1.0 - np.minimum(leverage, 0.9999))
-    for step in range(1, steps + 1):
+    for _ in range(steps):
         adjusted = (z - c @ basis) * adjust
         # MATLAB's robust sigma: median of |r| without as many of the smallest as there are terms, over 0.6745
         sizes = np.abs(adjusted)
@@ -340,14 +301,14 @@ def _reweighted(basis: np.ndarray, z: np.ndarray, start: np.ndarray | None, step
         scale = max(float(np.partition(sizes, place)[place]) / 0.6745, TINY_M)
         found = _solved(basis, z, bisquare_weights(adjusted, BISQUARE_TUNING * scale))
         if found is None:
-            return c, step, False, note + "; stopped: too few points kept weight"
+            return c, note + "; stopped: too few points kept weight"
         new, factor = found
         # norm of the move in standard errors of the fit: factor' (new - c) has unit covariance times scale^2
         moved = float(np.linalg.norm(factor.T @ (new - c))) / scale
         c = new
         if moved < BISQUARE_CONVERGED * np.sqrt(terms):
-            return c, step, True, note
-    return c, steps, False, note
+            break
+    return c, note
 
 
 def _lts_start(basis: np.ndarray, z: np.ndarray) -> np.ndarray:
@@ -396,9 +357,8 @@ def _ridged(design: np.ndarray, z: np.ndarray, weights: np.ndarray) -> np.ndarra
 
 
 def quadric(points: np.ndarray, weights: np.ndarray, central: bool) -> Fit | None:
-    """Fit the quadric with the least weighted squares of distances along the rays, to first order: Taubin's algebraic
-    fit (1991), then Gauss-Newton steps. None where the points lie on no single sheet. ``central``: rays leave the
-    origin; else they are parallel to z."""
+    """Fit the quadric with the least weighted squares along the rays, to first order: Taubin's algebraic fit (1991),
+    then Gauss-Newton. None without a single sheet. ``central``: rays leave the origin, else along z."""
     middle = np.average(points, axis=0, weights=weights)
     size = float(np.sqrt(np.average(((points - middle) ** 2).sum(axis=1), weights=weights))) or 1.0
     scaled = (points - middle) / size

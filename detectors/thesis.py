@@ -1,14 +1,14 @@
 """The thesis' detector: points farther from a surface than k deviations, in clusters at 10 mm. The text's variant:
-robust cubic, robust deviations of the residual; the script's: least squares without cross terms, those of the *raw
-z*. The text also says that the threshold excludes all outliers that are no damage: `highest_before` takes it from the
-cloud itself."""
+robust cubic, robust deviations of the residual. The script's: ``surface: {method: least_squares, drop_cross_terms:
+true}, scale: raw_z_std``, at k = 1.2. `highest_before` excludes all outliers that are no damage, as the text also
+asks."""
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from detectors.background import background
 from detectors.crop import BoxCrop, CropConfig, crop
@@ -18,36 +18,18 @@ from detectors.score_map import ScoreMapConfig, ScoreMapDetector, on_grid
 from detectors.surface import SurfaceConfig, fit_surface
 from harness.vocabulary.geometry import Cloud
 
-SCRIPT_VARIANT: dict[str, Any] = {
-    "surface": {"degree": 3, "method": "least_squares", "drop_cross_terms": True},
-    "scale": "raw_z_std",
-}
-SCRIPT_THRESHOLD = 1.2  # the script's k, in standard deviations of the raw z
-
 
 class ThesisConfig(ScoreMapConfig):
-    """``variant: script`` sets ``surface`` and ``scale`` as the script has them; what is given beside it still counts.
-    With a shape other than ``polynomial`` one unit of score is the local noise. ``scale``: the deviation that one unit
-    of score means: ``mad`` (median |residual| / 0.6745), ``residual_std``, ``raw_z_std``, or ``highest_before``: the
-    largest residual of this cloud towards the camera, where no hole can be; k = 1 then leaves out what is as large
-    behind the surface. Nothing may stand out of the face. ``use_variance``: where a map states each point's variance,
-    one unit of score is a multiple of each point's own deviation (but for ``raw_z_std``)."""
+    """``scale``: the deviation that one unit of score means: ``mad`` (median |residual| / 0.6745), ``residual_std``,
+    ``raw_z_std``, or ``highest_before``: the largest residual of this cloud towards the camera, where no hole can be; k
+    = 1 then leaves out what is as large behind the surface. With a shape other than ``polynomial`` it is the local
+    noise. ``use_variance``: where a map states each point's variance, one unit of score is a multiple of each point's
+    own deviation (but for ``raw_z_std``)."""
 
-    variant: Literal["text", "script"] = "text"
     crop: CropConfig = Field(default_factory=BoxCrop)
     surface: SurfaceConfig = Field(default_factory=SurfaceConfig)
     scale: Literal["mad", "residual_std", "raw_z_std", "highest_before"] = "mad"
     use_variance: bool = True
-
-    @model_validator(mode="before")
-    @classmethod
-    def _preset(cls, data: Any) -> Any:
-        if not isinstance(data, dict) or data.get("variant") != "script":
-            return data
-        filled = {**SCRIPT_VARIANT, **data}
-        if isinstance(data.get("surface"), dict):
-            filled["surface"] = {**SCRIPT_VARIANT["surface"], **data["surface"]}
-        return filled
 
 
 class ThesisDetector(ScoreMapDetector[ThesisConfig]):
@@ -59,10 +41,8 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
 
     @property
     def default_threshold(self) -> float | None:
-        """Threshold k that the thesis states: 1.2 for the script, 1 of the cloud's own; None for the text."""
-        if self.settings.scale == "highest_before":
-            return 1.0
-        return SCRIPT_THRESHOLD if self.settings.variant == "script" else None
+        """Threshold k that the thesis states: 1 of the cloud's own highest residual, none of other scales."""
+        return 1.0 if self.settings.scale == "highest_before" else None
 
     def analyse(self, cloud: Cloud) -> Evidence:
         """Score |residual| / scale in the crop. Raises UserError where it determines no surface."""
@@ -75,16 +55,16 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
         residual = z - fitted
         floor = rounding_floor(cloud, mask)
         deviation = self._stated_deviation(cloud, mask)
-        off, raw = residual if deviation is None else residual / deviation, self.settings.scale == "raw_z_std"
-        # MATLAB's std divides by n - 1
-        spread = (
-            sigma_of(off) if self.settings.scale == "mad" else float(np.std(z if raw else off, ddof=min(1, len(z) - 1)))
-        )
+        off, kind = residual if deviation is None else residual / deviation, self.settings.scale
+        if kind == "mad":
+            spread = sigma_of(off)
+        elif kind == "highest_before":
+            spread = max(0.0, -float(off.min()))
+        else:  # MATLAB's std divides by n - 1
+            spread = float(np.std(z if kind == "raw_z_std" else off, ddof=min(1, len(z) - 1)))
         typical = 1.0 if deviation is None else median_of(deviation)
-        spread = max(0.0, -float(off.min())) if self.settings.scale == "highest_before" else spread
         scale = max(spread, floor) if deviation is None else np.maximum(spread * deviation, floor)
         notes = {"surface": surface.note, "points": len(z), "spread_m": spread * typical, "floor_m": floor}
-        notes |= {"surface_iterations": surface.iterations, "surface_converged": surface.converged}
         score, residual_m, z_m = (on_grid(each, mask) for each in (np.abs(residual) / scale, residual, fitted))
         return Evidence(score, residual_m, z_m, float(np.median(scale)), notes)
 

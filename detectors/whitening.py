@@ -1,8 +1,5 @@
-"""The bank of matched filters' templates, and the noise that they are whitened by.
-
-Pictures are residuals in deviations of the local noise. Correlations are taken on grids that are wider than the picture
-by the longest lag, so that nothing wraps around.
-"""
+"""The bank of matched filters' templates, and the noise that they are whitened by. Pictures are residuals in deviations
+of the local noise, on grids wider by the longest lag, so that nothing wraps around."""
 
 from __future__ import annotations
 
@@ -25,8 +22,7 @@ DENT_RADII_PX = (5.0, 6.5, 8.0, 10.0, 12.0, 14.5, 17.5)
 SLOT_PX, SLOTS_DEG = (20.0, 2.0), tuple(22.5 * k for k in range(8))
 """Length and width of slots, and the angle of each to the rows."""
 WINDOWS_PX = (1, 3, 5)
-"""Sides of the square over which cameras average, continuous-wave cameras their phasors: 3 before a Kinect v2, 5 before
-an Azure Kinect. Without it the lens alone blurs."""
+"""Sides of the square over which cameras average: 3 before a Kinect v2, 5 before an Azure Kinect, 1: the lens blurs."""
 LENS_BLUR_PX = 0.6
 LONGEST_LAG_PX = 28
 """Lag at which the covariance has faded (Parzen's window)."""
@@ -40,8 +36,7 @@ SIDES_PX = (0, 1, 2, 3, 5, 8, 12, 18)
 GRID = 96
 """Side of the grid that holds the widest template and the reach of its whitened edge."""
 CONVERGED, MOST_ITERATIONS, FADED = 0.01, 40, 0.1
-"""Relative residual at which C^-1 r counts as solved, a bound on the steps there, and the weight of 0 in what the
-preconditioner fills unknown pixels with."""
+"""Relative residual at which C^-1 r is solved, most steps, and the weight of 0 in what fills unknown pixels."""
 
 
 def grid_of(shape: tuple[int, ...]) -> tuple[int, ...]:
@@ -86,11 +81,7 @@ def _centred(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def inverse_times(
-    values: np.ndarray,
-    known: np.ndarray,
-    power: np.ndarray,
-    shape: tuple[int, ...],
-    start: np.ndarray | None = None,
+    values: np.ndarray, known: np.ndarray, power: np.ndarray, shape: tuple[int, ...], start: np.ndarray | None = None
 ) -> np.ndarray:
     """Return C^-1 r (r, c) over the known pixels, 0 elsewhere, for the covariance with this power spectrum, by
     conjugate gradients that start from ``start`` (r, c) or the preconditioner. That is the stationary inverse of r with
@@ -168,8 +159,7 @@ def response(spectrum_of: np.ndarray, template: np.ndarray, shape: tuple[int, ..
 
 
 def halved(picture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the spectrum of a picture's samples in the middles of 2 x 2 pixels, without its higher frequencies, of the
-    picture (r, c) on a grid."""
+    """Return the spectrum of a picture's samples in the middles of 2 x 2 pixels, without higher frequencies."""
     return packed(_low(scipy.fft.rfft2(picture, shape)) * _middles(shape))
 
 
@@ -187,9 +177,8 @@ def _low(spectrum_of: np.ndarray) -> np.ndarray:
 
 
 class Template(NamedTuple):
-    """A damage's picture on a square of an odd number of pixels, its centre ``halves`` (down, right) of half a pixel
-    off the middle; the radius of a disc as large; whether it is a slot; whether its scores change so slowly that every
-    second pixel tells them."""
+    """A damage's picture on a square of odd side, its centre ``halves`` (down, right) of half a pixel off the middle;
+    the radius of a disc as large; whether it is a slot; whether every second pixel tells its scores."""
 
     image: np.ndarray
     radius_px: float
@@ -201,8 +190,7 @@ class Template(NamedTuple):
 class Worth(NamedTuple):
     """The whitened energy of a template, and the sides (along columns, along rows), in pixels of its scores' picture,
     of the rectangle over which it spreads as widely; ``raised``: by how much the square of a score exceeds that of the
-    template with the most independent places where maxima are as rare, halved so that the many wide templates together
-    do not make all false calls."""
+    template with the most independent places where maxima are as rare, halved for the many wide templates."""
 
     energy: float
     sides: tuple[int, int]

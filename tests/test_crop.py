@@ -52,17 +52,6 @@ def test_the_default_box_is_the_thesis() -> None:
     np.testing.assert_array_equal(crop(cloud, BoxCrop()), expected)
 
 
-def test_keep_fraction_multiplies_the_extremes_like_the_script() -> None:
-    cloud, _ = board_before_wall()
-    whole = crop(cloud, BoxCrop())
-    x, y = cloud.points_m[..., 0], cloud.points_m[..., 1]
-    kept = whole.copy()
-    for v in (x, y):
-        kept &= (v < 0.75 * v[whole].max()) & (v > 0.75 * v[whole].min())
-    np.testing.assert_array_equal(crop(cloud, BoxCrop(keep_fraction=0.75)), kept)
-    assert 0.5 < kept.sum() / whole.sum() < 0.6
-
-
 def test_polygon_takes_pixel_centres_inside_in_sensor_coordinates() -> None:
     region = Region(20, 60, 30, 90)
     cloud = cloud_of(np.full(region.shape, 0.8), region)
@@ -93,7 +82,7 @@ def test_the_wall_can_be_asked_for_and_is_taken_without_the_board() -> None:
     choice = choice_of(cloud, AutoCrop(target=2, inset_px=0))
     first, second = choice.candidates
     assert choice.taken == 2 and not choice.warnings
-    assert first.distance_m == pytest.approx(0.7, abs=0.01) and second.distance_m == pytest.approx(1.2, abs=0.001)
+    assert first.depths_m[1] == pytest.approx(0.7, abs=0.01) and second.depths_m[1] == pytest.approx(1.2, abs=0.001)
     # 130 x 90 pixels of 2.8 mm, and 200 x 150 of 4.8 mm
     assert first.extent_m == pytest.approx((0.364, 0.252), abs=0.01)
     assert second.extent_m == pytest.approx((0.96, 0.72), abs=0.01)

@@ -88,7 +88,7 @@ def test_three_views_become_one_cloud_and_the_hole_is_in_its_place(
     out = tmp_path / "new" / "out"
     assert detect.main([*views, "--register", "marks", "--out", str(out), *SHARP]) == 0
     said = capsys.readouterr().out
-    assert "marks: 5 of 5 to be relied on" in said and "merged: 3 views" in said and "loops: 1 of three views" in said
+    assert "marks: 5 of 5 to be relied on" in said and "merged: 3 views" in said
     pictures = [f"targets-{number}.png" for number in (1, 2, 3)]
     assert sorted(path.name for path in out.iterdir()) == sorted((*FILES, *pictures))
     assert said.count("target 1 of 1: ") == 3
@@ -100,7 +100,6 @@ def test_three_views_become_one_cloud_and_the_hole_is_in_its_place(
         # corners lie farther out than the target's mean point: four times the prediction is beyond any chance
         assert wrong_mm < 4 * np.hypot(row["predicted_in_plane_mm"], row["predicted_across_mm"]) < 1.0
         assert 0 < row["held_out_mark_mm"] < 1.0 and row["pairs"] == 5
-    assert told["loops"][0]["views"][:3] == ["view_0", "view_1", "view_2"] and told["loops"][0]["translation_mm"] < 1.0
     (found,) = findings_of(out)
     place_mm = np.array([found[f"{axis}_mm"] for axis in "xyz"])
     in_first_mm = 1e3 * transform_points(np.array(told["T_reference_cloud"]), 1e-3 * place_mm)

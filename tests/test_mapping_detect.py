@@ -62,7 +62,7 @@ def test_use_variance_off_and_a_cloud_without_variance_score_alike() -> None:
 
 
 def test_scripts_scale_of_raw_z_knows_no_variance() -> None:
-    script = ThesisDetector(ThesisConfig.from_data({"crop": {"kind": "none"}, "variant": "script"}))
+    script = ThesisDetector(ThesisConfig.from_data({"crop": {"kind": "none"}, "scale": "raw_z_std"}))
     sigma = np.full((60, 80), 0.2 * MM)
     sigma[:30] = 0.1 * MM
     np.testing.assert_array_equal(script.analyse(flat_map(sigma)).score, script.analyse(flat_map(sigma, False)).score)

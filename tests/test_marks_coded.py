@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from detectors.average import AverageConfig, average
 from detectors.crop import AutoCrop, crop
 from detectors.marks.find import find_marks
-from detectors.marks.mark import CodedMarks, ColourMarks
+from detectors.marks.mark import CodedMarks, ColourMarks, RedMarks
 from detectors.recordings.opening import open_capture
 from harness.vocabulary.geometry import invert, transform_points
 from harness.vocabulary.seeds import random_stream
@@ -97,9 +97,12 @@ def test_tags_that_are_cut_or_lack_range_are_in_doubt():
     assert (doubts[11], doubts[19]) == ("", "")
 
 
-def test_a_cloud_without_a_grid_has_no_codes():
+def test_marks_need_a_pixel_grid():
     cloud = replace(marked_cloud(board_pose(), tags(PLACES)), organised=False)
-    assert "no pixel grid" in find_marks(cloud, cloud.valid, CodedMarks()).problem
+    for config in (CodedMarks(), ColourMarks()):
+        assert "no pixel grid" in find_marks(cloud, cloud.valid, config).problem
+    of_red = find_marks(cloud, cloud.valid, RedMarks(deviations=0.1))
+    assert "need a pixel grid" in of_red.problem and of_red.points.size
 
 
 def test_a_dictionary_that_opencv_lacks_is_refused_with_those_it_has():

@@ -212,26 +212,6 @@ def test_no_colour_and_no_target_are_said():
     assert "25 pixels of the target" in find_marks(cloud, few, RedMarks()).problem
 
 
-def test_a_cloud_without_a_grid_gives_the_same_marks():
-    T = board_pose()
-    cloud = marked_cloud(T, strips(), rng=random_stream(10, "no grid"))
-    assert cloud.rgb is not None
-    order = random_stream(10, "shuffle").permutation(cloud.valid.size)
-    loose = replace(
-        cloud,
-        points_m=cloud.points_m.reshape(1, -1, 3)[:, order],
-        rgb=cloud.rgb.reshape(1, -1, 3)[:, order],
-        **{name: getattr(cloud, name).reshape(1, -1)[:, order] for name in ("reason", "count", "variance_m2")},
-        organised=False,
-    )
-    marks = find_marks(loose, everywhere(loose), ColourMarks())
-    assert len(marks.trusted) == 4
-    on_grid = find_marks(cloud, everywhere(cloud), ColourMarks())
-    np.testing.assert_allclose(on_board_m(marks, T), on_board_m(on_grid, T), atol=0.1e-3)
-    spread = [np.sqrt(np.trace(np.mean([m.covariance_m2 for m in s.trusted], axis=0))) for s in (marks, on_grid)]
-    assert spread[0] == pytest.approx(spread[1], rel=0.5)
-
-
 def test_the_same_cloud_gives_the_same_bits():
     cloud = marked_cloud(board_pose(), strips(wood=WOOD), rng=random_stream(11, "twice"), samples=2)
     first, second = (find_marks(cloud, everywhere(cloud), ColourMarks()) for _ in range(2))

@@ -143,15 +143,6 @@ def test_a_file_beside_the_pictures_states_the_unit(tmp_path: Path, key: str, va
     assert np.nanmedian(recording.first_frame().z_m) == pytest.approx(0.9, rel=0.02)
 
 
-def test_text_in_the_picture_states_the_unit(tmp_path: Path) -> None:
-    from PIL import Image, PngImagePlugin
-
-    text = PngImagePlugin.PngInfo()
-    text.add_text("depth_scale", "0.00025")
-    Image.fromarray(noisy(0.9, 2.5e-4).astype(np.uint16)).save(tmp_path / "1.png", pnginfo=text)
-    assert open_capture([tmp_path], lens=plane.LENS).unit_text == "depth unit 0.25 mm, from 1.png"
-
-
 # ---- named cameras and lenses of other sizes -------------------------------------------------------------------------
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from detectors.marks.mark import MarkSet
 from detectors.registration.by_points import register_by_icp, stages_m
-from detectors.registration.registered import Registration, predicted_error_m
+from detectors.registration.registered import predicted_error_m
 from detectors.registration.settings import IcpRegistration
 from detectors.views import PreparedView, View
 from harness.vocabulary.geometry import Cloud, Region, transform_points
@@ -33,35 +33,17 @@ def wavy_view(T_camera_object: np.ndarray, guess: np.ndarray | None, seed: int, 
     return PreparedView(View("wavy", cloud, guess), cloud.valid, MarkSet((), np.empty(0, int)))
 
 
-def wavy_error(seed: int, estimation: str, noise_m: float) -> tuple[np.ndarray, Registration]:
-    """Error (w, t) about the registration's centre, and the registration, from a guess that is wrong as usual."""
+def test_a_shaped_target_is_found_from_a_usual_guess():
+    """Points lie 4 mm apart, which pulls at the result."""
     T = usual_error()
-    reference = wavy_view(pose(), np.eye(4), 2 * seed, noise_m)
-    view = wavy_view(pose(5, -8), pose() @ np.linalg.inv(pose(5, -8)) @ T, 2 * seed + 1, noise_m)
-    config = IcpRegistration.from_data({"points": "target", "estimation": estimation})
-    found = register_by_icp(reference, view, config)
+    reference = wavy_view(pose(), np.eye(4), 0, 2e-4)
+    view = wavy_view(pose(5, -8), pose() @ np.linalg.inv(pose(5, -8)) @ T, 1, 2e-4)
+    found = register_by_icp(reference, view, IcpRegistration(points="target"))
     wrong = found.T_reference_view @ np.linalg.inv(pose() @ np.linalg.inv(pose(5, -8)))
     moved = transform_points(wrong, found.centre_m) - found.centre_m
-    return np.concatenate([Rotation.from_matrix(wrong[:3, :3]).as_rotvec(), moved]), found
-
-
-@pytest.mark.parametrize(("estimation", "within_m"), [("point_to_point", 1.5e-3), ("point_to_plane", 3e-4)])
-def test_a_shaped_target_is_found_from_a_usual_guess(estimation, within_m):
-    """Points 4 mm apart: point to plane sees through the sampling, point to point is pulled by it."""
-    error, found = wavy_error(0, estimation, 2e-4)
-    assert np.linalg.norm(error[3:]) < within_m and np.linalg.norm(error[:3]) * 0.1 < within_m
+    turn = Rotation.from_matrix(wrong[:3, :3]).magnitude()
+    assert np.linalg.norm(moved) < 1.5e-3 and turn * 0.1 < 1.5e-3
     assert not found.failure and found.converged and found.pairs > 2400
-
-
-@pytest.mark.slow
-def test_the_covariance_of_point_to_plane_is_that_of_repeats():
-    """10 repeats: the mean of d'C^-1 d is 6 for a true covariance, known to 6 sqrt(2/60) = 1.1; a factor of two holds
-    it by three of those on both sides."""
-    distances = []
-    for seed in range(10):
-        error, found = wavy_error(seed, "point_to_plane", 1e-3)
-        distances.append(error @ np.linalg.solve(found.covariance, error))
-    assert 3 < np.mean(distances) < 12
 
 
 def test_flat_marks_come_as_near_as_point_to_point_can():
@@ -74,14 +56,6 @@ def test_flat_marks_come_as_near_as_point_to_point_can():
     assert 0.05e-3 < predicted[0] < 2 * PITCH_M and 1e-6 < predicted[1] < 0.2 * PITCH_M
 
 
-def test_flat_marks_slide_from_point_to_plane_and_it_is_said():
-    reference, view = views(POSES, guess_error=usual_error(), noise_m=3e-4)
-    found = register_by_icp(reference.prepared, view.prepared, IcpRegistration(estimation="point_to_plane"))
-    assert target_error_m(found, reference, view)[1] < 0.3 * PITCH_M
-    predicted, _ = predicted_error_m(found, reference.prepared.points_m[::50], reference.T_camera_board[:3, 2])
-    assert "not determined" in found.failure or predicted > 5 * PITCH_M
-
-
 def test_the_same_views_give_the_same_bits():
     reference, view = views(POSES, guess_error=usual_error(), noise_m=3e-4)
     first, second = (register_by_icp(reference.prepared, view.prepared, IcpRegistration()) for _ in range(2))
@@ -91,11 +65,10 @@ def test_the_same_views_give_the_same_bits():
 
 def test_without_a_guess_it_starts_at_the_reference_and_says_so():
     reference = wavy_view(pose(), np.eye(4), 0, 0.0)
-    blind = wavy_view(pose(2, 3, 0, (0.004, 0.0, 0.0)), None, 1, 0.0)
-    config = IcpRegistration(points="target", estimation="point_to_plane")
-    found = register_by_icp(reference, blind, config)
+    blind = wavy_view(pose(2, 3, 0, (0.004, 0.0, 0.0)), None, 0, 0.0)
+    found = register_by_icp(reference, blind, IcpRegistration(points="target"))
     assert "no guess" in found.notes[0]
-    np.testing.assert_allclose(found.T_reference_view @ pose(2, 3, 0, (0.004, 0.0, 0.0)), pose(), atol=3e-4)
+    np.testing.assert_allclose(found.T_reference_view @ pose(2, 3, 0, (0.004, 0.0, 0.0)), pose(), atol=1e-6)
 
 
 def test_too_few_fiducial_points_are_a_failure_in_words():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from board_views import TAPES_M, board_view, pose, target_error_m, usual_error, views
 
-from detectors.registration.register import judge, loop_errors, register
+from detectors.registration.register import judge, register
 from detectors.registration.registered import (
     Registration,
     displacement_jacobian,
@@ -229,31 +229,6 @@ def test_odometry_needs_a_lens_and_nominal_a_guess():
         register([made[0], changed(made[1], lens=None)], PlainRegistration(method="odometry"))
     with pytest.raises(UserError, match="needs the nominal pose of every view"):
         register([made[0], replace_guess(made[1], None)], PlainRegistration(method="nominal"))
-
-
-# ------------------------------------------------------------ loops
-
-
-def test_loops_close_to_what_a_registration_is_wrong_by():
-    made = prepared(views([*POSES, pose(-2, -5, 4)], guess_error=usual_error(), noise_m=NOISE_M))
-    loops = loop_errors(made, PlainRegistration(method="marks"))
-    assert [loop.views for loop in loops[:2]] == [("view 0", "view 1", "view 2"), ("view 0", "view 1", "view 3")]
-    assert len(loops) == 4 and not any(loop.failure for loop in loops)
-    assert max(loop.translation_m for loop in loops) < PITCH_M
-    assert len(loop_errors(made, PlainRegistration(method="marks"), most=2)) == 2
-    assert loop_errors(made[:2], PlainRegistration(method="marks")) == ()
-
-
-def test_a_loop_says_which_step_failed():
-    made = prepared(views(POSES, noise_m=NOISE_M))
-    hidden = board_view(POSES[1], None, tapes_m=TAPES_M[:1]).prepared
-    (loop,) = loop_errors([made[0], hidden, made[2]], PlainRegistration(method="marks"))
-    assert loop.failure.startswith("view to view 0: ") and np.isnan(loop.translation_m)
-
-
-def test_loops_of_a_method_without_pairs_are_refused():
-    with pytest.raises(UserError, match="loops cannot be closed with joint"):
-        loop_errors(prepared(views(POSES)), PlainRegistration(method="joint"))
 
 
 # ------------------------------------------------------------ the yardstick

@@ -65,7 +65,6 @@ def test_lar_is_the_exact_least_absolute_solution(n: int) -> None:
     bounds = [(None, None)] * p + [(0, None)] * (2 * n)
     exact = linprog(cost, A_eq=equalities, b_eq=z, bounds=bounds, method="highs")
     surface = fit(x, y, z, method="lar")
-    assert surface.converged
     assert np.abs(z - surface.evaluate(x, y)).sum() <= exact.fun * (1 + 2e-6)
     # 0.3 mm of noise; the standard error of an L1 fit is 1.25 sigma sqrt(p / n), at the corners three times that
     assert difference_m(surface, a @ exact.x[:p], x, y) < 0.15 * 3e-4 * np.sqrt(10 / n)
@@ -91,7 +90,6 @@ def test_bisquare_is_the_fixed_point_of_matlabs_iteration(n: int) -> None:
     z[: n // 20] += 0.02
     surface = fit(x, y, z, method="bisquare")
     standard_error = 3e-4 * np.sqrt(10 / n)
-    assert surface.converged
     assert difference_m(surface, matlab_bisquare(x, y, z), x, y) < 0.05 * standard_error
 
 

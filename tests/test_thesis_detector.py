@@ -83,25 +83,18 @@ def test_pixels_outside_the_crop_or_without_range_have_no_score() -> None:
 
 def test_the_script_is_least_squares_without_cross_terms_and_the_std_of_raw_z() -> None:
     cloud = board(HOLES)
-    detector = ThesisDetector(ThesisConfig.from_data({"variant": "script"}))
+    surface = {"method": "least_squares", "drop_cross_terms": True}
+    detector = ThesisDetector(ThesisConfig.from_data({"surface": surface, "scale": "raw_z_std"}))
     x, y, z = cloud.points_m.reshape(-1, 3).T
     a = np.stack([np.ones_like(x), x, y, x**2, y**2, x**3, y**3], axis=1)
     residual = z - a @ np.linalg.lstsq(a, z, rcond=None)[0]
     evidence = detector.analyse(cloud)
     np.testing.assert_allclose(evidence.residual_m.ravel(), residual, atol=1e-10)
     assert evidence.scale_m == pytest.approx(np.std(z, ddof=1), rel=1e-12)
-    assert detector.default_threshold == 1.2 and ThesisDetector(ThesisConfig()).default_threshold is None
+    assert detector.default_threshold is None
     above = np.flatnonzero(np.abs(residual) > 0.2 * np.std(z, ddof=1))
     pixels = np.concatenate([d.pixels for d in detector.find(cloud, evidence, 0.2)])
     np.testing.assert_array_equal(np.sort(pixels), above)
-
-
-def test_settings_beside_the_script_still_count() -> None:
-    config = ThesisConfig.from_data({"variant": "script", "surface": {"degree": 2}, "scale": "residual_std"})
-    assert config.surface.degree == 2 and config.surface.drop_cross_terms and config.scale == "residual_std"
-    assert config.surface.method == "least_squares"
-    assert ThesisConfig.from_data(config.to_data()) == config
-    assert ThesisConfig().surface.method == "lar" and not ThesisConfig().surface.drop_cross_terms
 
 
 @settings(max_examples=12, deadline=None)

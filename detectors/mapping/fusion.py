@@ -6,14 +6,14 @@ the bottom of a wide hole, or before the surface, is displaced in a view that is
 
 View i measures a cell's height as h + e_i + f(p_i) + g_i: e_i is the noise that the sensor's law and the registration's
 covariance explain; f the camera's fixed pattern, which belongs to the *pixel* p_i that looks at the cell; g_i what is
-fixed for a view and cell alone. Half the mean square difference of two views, as a function of how far apart p_i and
-p_j lie on the sensor, is noise + var g + var f (1 - exp(-(|p_i - p_j| / length)^exponent)), a variogram with nugget and
-sill (Matheron 1963; Cressie 1993), fitted here to medians, because at damage views see different parts of it. Views
-that look through the same pixels share f, and no number of them averages it out.
+fixed for a view and cell alone. Half the mean square difference of two views is noise + var g + var f (1 - exp(-(|p_i -
+p_j| / length)^exponent)), a variogram with nugget and sill (Matheron 1963; Cressie 1993), fitted here to medians,
+because at damage views see different parts of it. Views that look through the same pixels share f.
 
 Not modelled: errors that all views share in all pixels, or registrations to one reference; a pattern that is not the
 same all over the sensor; changes of the blur. Where views are no farther apart than the pattern is long, its sill is an
-extrapolation."""
+extrapolation.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from itertools import combinations, product
 
 import numpy as np
 
+from detectors.average import pixel_medians
 from detectors.mapping import placing
 from detectors.noise import rounding_left_m2
 from detectors.surface import SurfaceConfig, fit_surface
@@ -47,8 +48,7 @@ GATE_SIGMAS = 5.0
 class BetweenViews:
     """``own_m2``: variance of what is fixed for a view and cell alone; ``pattern_m2``: of the fixed pattern, with
     covariance exp(-(distance / ``length_px``)^``exponent``) between pixels. ``noise_share``: part of the variance that
-    the sensor's law states that is noise; below 1 only where the law was read off a single frame, whose surface shows
-    noise and pattern together."""
+    the sensor's law states that is noise; below 1 only where the law was read off a single frame."""
 
     own_m2: float = 0.0
     pattern_m2: float = 0.0
@@ -62,8 +62,7 @@ def between_views(
 ) -> BetweenViews:
     """Estimate it from heights (k, h, w), NaN where a view has none, with variances that the ``sensor`` and ``other``
     (lens, registration) explain, and the direction ``looks_px`` (k, h, w, 2) in which each view sees each cell, in
-    pixels. ``repeated``: the sensor's variances come from repeated frames. All zero with one view or too little
-    overlap."""
+    pixels. ``repeated``: the sensor's variances come from repeated frames. All zero with too little overlap."""
     several = np.flatnonzero(np.isfinite(heights).sum(axis=0).ravel() >= 2)
     some = several[:: max(1, len(several) // CELLS)]
     values = (heights, sensor, other, looks_px)
@@ -91,8 +90,7 @@ def _law(
     first: np.ndarray, unit: np.ndarray, distance: np.ndarray, known: np.ndarray, may_vanish: bool
 ) -> tuple[float, float, float, float]:
     """(factor of ``first``, sill, length, exponent), all (c,) in standard errors: of nothing at all (where it
-    ``may_vanish``), ``first`` alone, and both terms that with the least chi square plus Schwarz's penalty, without
-    which a chance slope of the variogram would pass for a pattern."""
+    ``may_vanish``), ``first`` alone, and both terms that with the least chi square plus Schwarz's penalty."""
     from scipy.optimize import nnls
 
     penalty = float(np.log(max(len(distance), 2)))
@@ -112,9 +110,8 @@ def _law(
 class SurfaceMap:
     """Values of each cell (h, w): ``height_m``: mean deviation from the fitted surface along z, positive behind, NaN
     where no view counts; ``variance_m2``: of an intact surface's height, by sensor, lens and registration, and by what
-    views disagree about beyond (``between``); ``temporal_m2``: the part of it that more frames would lessen.
-    ``seen_by`` (k, h, w) bool: views that count; ``shares`` (k, h, w): their weights, which sum to 1. ``rejected``:
-    single observations that were outliers."""
+    views disagree about beyond; ``temporal_m2``: the part of it that more frames would lessen. ``seen_by`` (k, h, w)
+    bool: views that count; ``shares`` (k, h, w): their weights, which sum to 1. ``rejected``: number of outliers."""
 
     cell_m: float
     height_m: np.ndarray
@@ -130,9 +127,8 @@ def combine(
     heights: np.ndarray, sensor: np.ndarray, other: np.ndarray, looks_px: np.ndarray, repeated: bool, cell_m: float
 ) -> SurfaceMap:
     """Combine the views' heights (k, h, w); arguments as of `between_views`. The weight of a view is the inverse of its
-    own variance, fixed errors included; the variance of the mean takes the covariance of views into account whose
-    pixels lie near one another. (The best weights under that covariance can be negative, which a hole seen by some
-    views only does not forgive.)"""
+    own variance (the best weights under the covariance can be negative, which a hole seen by some views only does not
+    forgive); the variance of the mean takes the covariance of views into account."""
     between = between_views(heights, sensor, other, looks_px, repeated)
     temporal = between.noise_share * sensor
     own = temporal + other + between.own_m2
@@ -157,29 +153,19 @@ def combine(
 
 def _outliers(heights: np.ndarray, variances: np.ndarray) -> np.ndarray:
     """(k, h, w) bool: observations more than `GATE_SIGMAS` deviations (their own, or the robust spread of the views, if
-    that is larger) from the median of at least three views, where they cannot be damage. That is: as far before the
-    fitted surface, where damage would have been in the others' way; or behind, but alone among its own neighbours, as a
-    flying pixel is and nothing that has passed a camera's filter. A hole stays that few views see into, and its wall
-    that few views see."""
-    middle = _middle(heights)
+    that is larger) from the median of at least three views, where they cannot be damage: as far before the fitted
+    surface, where damage would have been in the others' way; or behind, but alone among its own neighbours, as a flying
+    pixel is."""
+    middle = pixel_medians(heights)
     deviation = heights - middle
-    limit = GATE_SIGMAS * np.maximum(1.4826 * _middle(np.abs(deviation)), np.sqrt(variances))
+    limit = GATE_SIGMAS * np.maximum(1.4826 * pixel_medians(np.abs(deviation)), np.sqrt(variances))
     several = np.isfinite(heights).sum(axis=0) >= 3
     rejected: np.ndarray = several & (deviation < -limit) & (heights < -limit)
     k, row, column = np.nonzero(several & (deviation > limit))
     padded = np.pad(heights, ((0, 0), (1, 1), (1, 1)), constant_values=np.nan)
     near = np.stack([padded[k, row + down, column + right] for down in range(3) for right in range(3)])
-    rejected[k, row, column] = near[4] - _middle(near) > limit[k, row, column]
+    rejected[k, row, column] = near[4] - pixel_medians(near) > limit[k, row, column]
     return rejected
-
-
-def _middle(values: np.ndarray) -> np.ndarray:
-    """Return the median of the known values along the first axis; NaN where there is none."""
-    ordered = np.sort(values, axis=0)
-    count = np.isfinite(values).sum(axis=0)
-    places = np.maximum(count - 1, 0) // 2, count // 2
-    low, high = (np.take_along_axis(ordered, place[None], axis=0)[0] for place in places)
-    return 0.5 * (low + high)
 
 
 LATERAL_PX = 0.1
@@ -197,8 +183,8 @@ def fuse(
 ) -> tuple[Cloud, np.ndarray, SurfaceMap, tuple[str, ...]]:
     """Return the map as an organised cloud, its frame in the first view's (4, 4), what else is known, and notes. The
     cloud's ``variance_m2`` over ``count`` is the temporal part of the variance, ``mean_variance_m2`` all of it, which
-    one view does not know of itself (then None). Rounding is in it, so there is no rounding step left. Raises UserError
-    where the points do not determine a surface or the map would have too many cells."""
+    one view does not know of itself (then None). Rounding is in it. Raises UserError where the points do not determine
+    a surface or the map would have too many cells."""
     T_reference_map = placing.T_reference_map_of(views[0])
     surface = placing.common_surface(views, T_reference_map)
     placed = [placing.place(view, T_reference_map, surface) for view in views]
@@ -328,13 +314,11 @@ def _notes(views: Sequence[placing.ChosenView], found: SurfaceMap) -> tuple[str,
 
 def depth_noise(cloud: Cloud, inside: np.ndarray, deviation_m: np.ndarray) -> tuple[np.ndarray, bool]:
     """Return the variance (h, w) of the average's z, NaN where the cloud has no point, and True if it comes from the
-    sample variances of repeated frames inside the target. The law is v = k q + c with q = 1 / amplitude^2 (phase noise
-    of a correlation camera falls as 1 / amplitude: Lange and Seitz 2001), or the range to the fourth where a tenth of
-    the points has no amplitude.
-    A sample variance of ten frames is off by a factor of two; as a weight it would favour pixels quiet by chance.
-    ``deviation_m`` (h, w): z less the view's own smooth surface; where there is one frame only, its squares stand in
-    for the variances, so the fixed pattern counts as noise. Not modelled: noise that frames share (slow drift),
-    multipath, and the fixed pattern."""
+    sample variances of repeated frames inside the target. The law is v = k q + c with q = 1 / amplitude^2 (phase noise:
+    Lange and Seitz 2001), or the range to the fourth where a tenth of the points has no amplitude; a pixel's own sample
+    variance would favour pixels quiet by chance. ``deviation_m`` (h, w): z less the view's own smooth surface, whose
+    squares stand in for the variances of a single frame. Not modelled: noise that frames share, multipath, the
+    pattern."""
     from scipy.optimize import nnls
     from scipy.stats import chi2
 

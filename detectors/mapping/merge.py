@@ -41,9 +41,9 @@ BLOCK, BLOCKS_AT_FIRST = 8, 4096
 
 def integrate(views: Sequence[ChosenView], voxel_m: float | None) -> tuple[Cloud, tuple[str, ...]]:
     """Return an unorganised cloud in the first view's frame, the field's zero crossings, sorted by x, y, z; and notes.
-    A crossing knows neither the number of its samples nor their variance: ``count`` is 1, ``variance_m2`` of all points
-    the median variance of one frame's z over the views' targets, for the floor that rounding sets. Raises UserError
-    where the field holds no surface, or the targets do not determine a smooth one."""
+    ``count`` is 1, ``variance_m2`` of all points the median variance of one frame's z over the views' targets, for the
+    floor that rounding sets. Raises UserError where the field holds no surface, or the targets determine no smooth
+    one."""
     clouds = [view.cloud for view in views]
     z = clouds[0].points_m[views[0].inside][:, 2]
     pitch = float(np.median(z)) * views[0].slope_step
@@ -66,16 +66,13 @@ def integrate(views: Sequence[ChosenView], voxel_m: float | None) -> tuple[Cloud
         rgb=None if rgb is None else np.round(255.0 * np.clip(rgb[order], 0.0, 1.0)).astype(np.uint8)[None],
         left_out=tuple(left for cloud in clouds for left in cloud.left_out),
     )
-    note = (
-        f"voxels of {1e3 * voxel:.2f} mm, cut off at {1e3 * voxel * TRUNCATION_VOXELS:.1f} mm;"
-        f" {len(points) - n} points on walls steeper than {WALL_DEG:.0f} degrees are left out"
-    )
-    return merged, (note,)
+    note = f"voxels of {1e3 * voxel:.2f} mm, cut off at {1e3 * voxel * TRUNCATION_VOXELS:.1f} mm;"
+    return merged, (f"{note} {len(points) - n} points on walls steeper than {WALL_DEG:.0f} degrees are left out",)
 
 
 def _undistorted(view: ChosenView) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-    """The view on a pinhole's grid of slopes x/z, y/z: depth (h, w, 1) float32, 0 where there is none, colour (h, w, 3)
-    0..1 if it has any, and the camera matrix."""
+    """Depth (h, w, 1) float32, 0 where there is none, on a pinhole's grid; colour (h, w, 3) 0..1 if any; camera
+    matrix."""
     cloud, inside = view.cloud, view.inside
     with np.errstate(invalid="ignore"):
         slopes = cloud.points_m[..., :2] / cloud.points_m[..., 2:]
@@ -114,10 +111,8 @@ def _crossings(views: Sequence[ChosenView], voxel: float) -> tuple[np.ndarray, n
             found = field.extract_point_cloud(0.5)
         except RuntimeError as error:
             # Open3D cannot make a cloud of no points
-            raise UserError(
-                f"a volume with voxels of {1e3 * voxel:.3g} mm holds no surface of the target",
-                fix="choose smaller voxels, check the crop, or merge in another way",
-            ) from error
+            what = f"a volume with voxels of {1e3 * voxel:.3g} mm holds no surface of the target"
+            raise UserError(what, fix="choose smaller voxels, check the crop, or merge in another way") from error
         points, normals = (found.point[name].numpy().astype(np.float64) for name in ("positions", "normals"))
         return points, normals, found.point.colors.numpy().copy() if coloured else None
 
@@ -142,9 +137,8 @@ MAX_BOXES = 1 << 21
 
 @dataclass(frozen=True)
 class Merged:
-    """One cloud of several views. ``T_reference_cloud`` (4, 4): its frame to the first view's camera frame, the
-    identity where it is that frame. ``views_used``: names of those that went in. ``seconds``: of merging.
-    ``surface_map``: what a fused map knows beside its cloud; None of the others."""
+    """One cloud of several views. ``T_reference_cloud`` (4, 4): its frame to the first view's camera frame.
+    ``views_used``: names of those that went in. ``surface_map``: what a fused map knows beside its cloud."""
 
     cloud: Cloud
     T_reference_cloud: np.ndarray
@@ -163,9 +157,8 @@ class Mapped:
     merged: Merged
 
     def view_of_points(self) -> np.ndarray:
-        """Return (n,) for each point of the merged cloud the index of its view in ``merged.views_used``, `SEVERAL` for
-        several or unknown: of a map as it knows, else by the nearest point, several where another view has one within
-        twice that."""
+        """Return (n,) for each point of the merged cloud the index of its view in ``merged.views_used``, or `SEVERAL`:
+        of a map as it knows, else by the nearest point, several where another view has one within twice that."""
         from scipy.spatial import cKDTree
 
         merged = self.merged
@@ -209,11 +202,9 @@ def merge(views: Sequence[PreparedView], registrations: Sequence[Registration], 
         else:
             chosen.append(view)
     if not chosen:
-        raise UserError(
-            f"no view is left to merge: {'; '.join(left_out)}",
-            legal="at least one view that is registered and holds points of the target",
-            fix="mend the views or their crop, or choose another way to register",
-        )
+        legal = "at least one view that is registered and holds points of the target"
+        fix = "mend the views or their crop, or choose another way to register"
+        raise UserError(f"no view is left to merge: {'; '.join(left_out)}", legal=legal, fix=fix)
     T_reference_cloud, surface_map, notes = np.eye(4), None, tuple[str, ...]()
     if isinstance(config, GridMerge):
         cloud = _on_grid(chosen, config.step_mm * MM)
@@ -230,11 +221,10 @@ def _on_grid(views: Sequence[ChosenView], step_m: float) -> Cloud:
     """The thesis' merge (MATLAB's pcmerge) as an unorganised cloud in the first view's frame: boxes in the order of x,
     then y, then z; then the rest. Raises UserError where there are more boxes along an axis than can be numbered. The
     overlap of the clouds' axis-parallel bounding boxes is divided into boxes from its lowest corner; each box with
-    points becomes their plain mean, in place and in colour; points beyond the overlap stay as they are, and colour is
-    dropped where one cloud has none. Of more than two clouds all go into one grid, over the union of the pairwise
-    overlaps, where pcmerge called in turn would weight a late cloud more. ``count`` is the number of samples of all
-    points of a box and ``variance_m2`` their mean variance (of one frame's z in its own camera). ``n_frames`` is that
-    of the view with the fewest: most points are still those of one view."""
+    points becomes their plain mean, in place and in colour; points beyond the overlap stay. Of more than two clouds all
+    go into one grid, over the union of the pairwise overlaps, where pcmerge called in turn would weight a late cloud
+    more. ``count``: samples of all points of a box; ``variance_m2``: their mean variance; ``n_frames``: the least of
+    all views."""
     limits = [(view.points_reference_m.min(axis=0), view.points_reference_m.max(axis=0)) for view in views]
     # x, y, z, red, green, blue, amplitude, samples, samples times variance, number of points
     columns = np.concatenate([_columns(view) for view in views])
@@ -246,11 +236,9 @@ def _on_grid(views: Sequence[ChosenView], step_m: float) -> Cloud:
         corner = np.min([low for low, high in overlaps if (low <= high).all()], axis=0)
         boxes = np.floor((points[shared] - corner) / step_m)
         if boxes.max() >= MAX_BOXES:
-            raise UserError(
-                f"{np.ptp(points[shared], axis=0).max():.3g} m of points hold too many boxes of {step_m * 1e3:.3g} mm",
-                legal=f"up to {MAX_BOXES} boxes along an axis",
-                fix="crop the views to the target, or raise merge.step_mm",
-            )
+            what = f"{np.ptp(points[shared], axis=0).max():.3g} m hold too many boxes of {step_m * 1e3:.3g} mm"
+            fix = "crop the views to the target, or raise merge.step_mm"
+            raise UserError(what, legal=f"up to {MAX_BOXES} boxes along an axis", fix=fix)
         x, y, z = boxes.astype(np.int64).T
         keys = (x << 42) | (y << 21) | z
         order = np.argsort(keys, kind="stable")

@@ -1,7 +1,8 @@
 """The map's frame and cells, and views placed in it: where each ray meets the target's surface, how far off it ends.
 
-Samples are resampled to a grid in triangles of neighbours, which leaves no gaps and no beats between two grids of
-nearly equal pitch, as binning does; it blurs by a tent whose variance is a sixth of the spacing squared."""
+Samples are resampled to a grid in triangles of neighbours, which leaves no gaps and no beats between two grids; it
+blurs by a tent whose variance is a sixth of the spacing squared.
+"""
 
 from __future__ import annotations
 
@@ -186,7 +187,7 @@ def T_reference_map_of(first: ChosenView) -> np.ndarray:
     """Return the map's frame in the first view's camera frame (4, 4), from the plane through its target by least
     absolute residuals: z away from the viewer along the plane's normal, x as near as can be to the camera's. The origin
     stands before the place where the optical axis meets the plane, as far from it as the camera; where the axis meets
-    no target (too slant, or behind), before the target's middle."""
+    no target, before the target's middle."""
     points = _some(first.cloud.points_m[first.inside], FIT_POINTS)
     x, y = points[:, 0], points[:, 1]
     plane = fit_surface(x, y, points[:, 2], SurfaceConfig(degree=1))
@@ -216,9 +217,9 @@ def common_surface(views: Sequence[ChosenView], T_reference_map: np.ndarray) -> 
 
 def place(view: ChosenView, T_reference_map: np.ndarray, surface: Surface) -> PlacedView:
     """Follow each pixel's ray from its point to the surface. Two steps: what is left is the square of the surface's
-    slope in the map's frame times the deviation (0.3 % of it at 3 degrees). Pixels are measured by medians; without a
-    grid as if the points lay on a square one. A pixel is the parallelogram J of its steps by u and v; its variance
-    along x is (Jxu^2 + Jxv^2) / 12."""
+    slope times the deviation (0.3 % of it at 3 degrees). Pixels are measured by medians; without a grid as if the
+    points lay on a square one. A pixel is the parallelogram J of its steps by u and v, of variance (Jxu^2 + Jxv^2) / 12
+    along x."""
     T_map_view = invert(T_reference_map) @ view.registration.T_reference_view
     inside = view.inside
     points = transform_points(T_map_view, view.cloud.points_m[inside])
@@ -244,18 +245,16 @@ def place(view: ChosenView, T_reference_map: np.ndarray, surface: Surface) -> Pl
 
 
 def grid_over(views: Sequence[PlacedView], cell_m: float | None) -> CellGrid:
-    """Lay cells over all that any view sees, at whole multiples of the cell (none: the first view's pitch). Raises
-    UserError where that would be more than `MAX_CELLS`."""
+    """Lay cells over all that any view sees, at whole multiples of the cell (none: the first view's pitch)."""
     step = cell_m if cell_m is not None else views[0].pitch_m
     low = np.min([np.nanmin(view.places_m, axis=(0, 1)) for view in views], axis=0)
     high = np.max([np.nanmax(view.places_m, axis=(0, 1)) for view in views], axis=0)
     first, last = np.ceil(low / step), np.floor(high / step)
     columns, rows = (np.maximum(last - first, 0) + 1).astype(int)
     if not columns * rows <= MAX_CELLS:
-        raise UserError(
+        what = (
             f"a map of {high[0] - low[0]:.3g} x {high[1] - low[1]:.3g} m with cells of {step * 1e3:.3g} mm would have"
-            f" {columns * rows:.3g} cells",
-            legal=f"up to {MAX_CELLS:.2g} cells",
-            fix="crop the views to the target, or give a larger merge.cell_mm",
         )
+        fix = "crop the views to the target, or give a larger merge.cell_mm"
+        raise UserError(f"{what} {columns * rows:.3g} cells", legal=f"up to {MAX_CELLS:.2g} cells", fix=fix)
     return CellGrid(float(first[0] * step), float(first[1] * step), float(step), (int(rows), int(columns)))

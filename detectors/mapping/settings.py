@@ -38,8 +38,7 @@ AnyMerge = GridMerge | FusedMerge | VolumeMerge
 
 
 class MappingConfig(Config):
-    """Settings of crop, marks, registration and merge of views; ``views``: use the first so many; none means all. Each
-    view is cropped in its own frame."""
+    """Settings of crop (in each view's own frame), marks, registration and merge; ``views``: use the first so many."""
 
     views: int | None = Field(default=None, ge=1, le=1000)
     crop: CropConfig = Field(default_factory=AutoCrop)

@@ -1,10 +1,8 @@
 """Pixels that stand apart from the target's own colour, and their groups: what may be a mark, with its rim.
 
-Colour enters as chromaticity, which uneven light leaves alone and light of another colour shifts. A smooth polynomial
-over the target, fitted robustly, follows the shift; the scatter of what is left (minimum covariance determinant,
-Rousseeuw 1985, from one fixed start) says how far the target's own colour strays; the threshold is extrapolated from
-the scatter's tail to a rate of false pixels. Marks may cover a quarter of the target. Not modelled: shadows with hard
-edges."""
+A smooth polynomial over the target follows light of another colour; the scatter of what is left (minimum covariance
+determinant, Rousseeuw 1985) says how far the target's own colour strays; the threshold is extrapolated from its tail to
+a rate of false pixels. Marks may cover a quarter of the target. Not modelled: shadows with hard edges."""
 
 from __future__ import annotations
 
@@ -14,7 +12,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from detectors.clusters import euclidean_clusters
 from detectors.masks import grown, parts_with, shrunk
 from detectors.noise import sigma_of
 from detectors.surface import SurfaceConfig, fit_surface
@@ -53,9 +50,8 @@ def lightness(rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def stand_out(features: np.ndarray, rounding: np.ndarray, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distance of pixels from the target's own colour (n,): in deviations of its scatter (the contrast), and
-    in units of the threshold, which is wider for dark pixels (the margin). ``features`` (n, p), p 1 or 2; ``rounding``
-    (n,) their variance from the whole counts, which dark pixels have more of: whatever noise the counts have is taken
-    to grow as it does. ``xy`` (n, 2): any smooth co-ordinates."""
+    in units of the threshold (the margin). ``features`` (n, p), p 1 or 2; ``rounding`` (n,): their variance from whole
+    counts, in proportion to which all noise is taken to grow. ``xy`` (n, 2): any smooth co-ordinates."""
     stride = max(1, len(features) // SAMPLE)
     (x, y), (some_x, some_y) = xy.T, xy[::stride].T
     smooth = SurfaceConfig(degree=DEGREE, method="lts")  # marks may cover a quarter, all at one end
@@ -81,14 +77,11 @@ def stand_out(features: np.ndarray, rounding: np.ndarray, xy: np.ndarray) -> tup
 
 
 def above_half(chosen: np.ndarray, contrast: np.ndarray) -> np.ndarray:
-    """Return (h, w) bool: of the ``chosen`` pixels those whose contrast is more than half of the greatest nearby, so
-    that a group ends where its edge is half way, and what a camera smears around it is not taken for more. The greatest
-    is that of a pixel with its eight neighbours, by their median."""
+    """Return (h, w) bool: of the ``chosen`` pixels those whose contrast is more than half of the greatest nearby (of
+    medians of 3 x 3), so that a group ends where its edge is half way."""
     beyond = np.where(chosen, contrast, 0.0).astype(np.float32)
-    side = 2 * NEARBY_PX + 1
-    greatest = cv2.dilate(cv2.medianBlur(beyond, 3), np.ones((side, side), np.uint8))
-    kept: np.ndarray = chosen & (beyond > 0.5 * greatest)
-    return kept
+    greatest = cv2.dilate(cv2.medianBlur(beyond, 3), np.ones((2 * NEARBY_PX + 1,) * 2, np.uint8))
+    return np.asarray(chosen & (beyond > 0.5 * greatest))
 
 
 LEAST_PIXELS, MOST_BLOBS = 9, 200
@@ -104,14 +97,12 @@ ALIKE = 0.35
 """A pixel has a blob's colour where its distance to it is less than this part of that to the surroundings' colour."""
 CUT_SHARE = 0.05
 """Share of the pixels around a blob: so many of its own colour, but off the target, mean that it goes on there."""
-GAP_SPACINGS = 2.2
-"""Steps between points of one mark in a cloud without a grid: neighbours along a diagonal (1.4), and one missing."""
 SHIFTS = 12  # of the lattice along each axis, over which the error of a centroid is averaged
 RECTANGULAR = 0.85
 """Least share of its smallest rectangle that a rectangle's pixels fill; an ellipse's fill 0.79."""
 SIZES, TURNS = 5, np.array([-1.0, 0.0, 1.0]) / 3
-"""Outlines between one whole pixel and the next, a rank-1 lattice over width and height; and turns of each, in pixels
-over its longer side: the thirds of a step."""
+"""Outlines between one whole pixel and the next, over width and height; turns of each, in pixels over its longer
+side."""
 
 
 @dataclass(frozen=True)
@@ -133,8 +124,6 @@ class Blob:
 def find_blobs(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray) -> list[Blob]:
     """Find the connected groups of ``coloured`` (h, w) pixels, the largest first; single missing pixels do not part
     them. Whether a rim's colours are mixtures is a property of the camera, so it is decided for all groups together."""
-    if not cloud.organised:
-        return _in_space(cloud, inside, coloured)
     closed = cv2.morphologyEx(coloured.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     _, labels, boxes, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
     order = 1 + np.argsort(-boxes[1:, cv2.CC_STAT_AREA], kind="stable")[:MOST_BLOBS]
@@ -157,8 +146,8 @@ def find_blobs(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray) -> list[B
 def _window(
     cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, labels: np.ndarray, label: int, box: np.ndarray
 ) -> tuple[np.ndarray, Callable[[bool], Blob | None]]:
-    """The shares (n,) of the way from the surroundings' colour (0) to the group's (1) of the pixels on either side of
-    its border; and what makes a blob of the group once it is known whether rims are mixed."""
+    """Shares (n,) of the way from the surroundings' colour (0) to the group's (1) on either side of its border; and
+    what makes a blob of the group once it is known whether rims are mixed."""
     left, top, width, height, area = (int(value) for value in box)
     margin = max(RING_PX + 2, round(0.5 * np.sqrt(area)))
     row, column = max(top - margin, 0), max(left - margin, 0)
@@ -223,8 +212,8 @@ def _contrast(own: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def _evenly_lit(rgb: np.ndarray, ring: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Colours (h, w, 3) as if the light were everywhere that at the group's middle: each channel over the ring's plane
-    through it. Light that falls off along a group would else weigh its two ends differently."""
+    """Colours (h, w, 3) as if the light were everywhere that at the group's middle: each channel over the plane through
+    the ring's, or light that falls off along a group would weigh its two ends differently."""
     v, u = np.mgrid[0 : rgb.shape[0], 0 : rgb.shape[1]]
     middle_v, middle_u = (float(axis[group].mean()) for axis in (v, u))
     basis = np.stack([np.ones(rgb.shape[:2]), (u - middle_u) / rgb.shape[1], (v - middle_v) / rgb.shape[0]], axis=-1)
@@ -238,37 +227,9 @@ def _eroded(mask: np.ndarray) -> np.ndarray:
     return shrunk(np.pad(mask, 1), 3)[1:-1, 1:-1]
 
 
-def _in_space(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray) -> list[Blob]:
-    """Groups of points without a grid, by their distances; no rim, and no telling whether they are cut."""
-    from scipy.spatial import cKDTree
-
-    found, target = np.flatnonzero(coloured), np.flatnonzero(inside)
-    if len(found) < LEAST_PIXELS:
-        return []
-    assert cloud.rgb is not None
-    points, rgb = cloud.points_m.reshape(-1, 3), cloud.rgb.reshape(-1, 3).astype(float)
-    spacing = float(np.median(cKDTree(points[found]).query(points[found], k=2)[0][:, 1]))
-    labels = euclidean_clusters(points[found], GAP_SPACINGS * spacing, LEAST_PIXELS)
-    sizes = np.bincount(labels[labels >= 0], minlength=1)
-    blobs = []
-    for label in np.argsort(-sizes, kind="stable")[:MOST_BLOBS]:
-        pixels = found[labels == label]
-        away = points[pixels] - points[pixels].mean(axis=0)
-        if len(pixels) < LEAST_PIXELS or (svd := np.linalg.svd(away, full_matrices=False))[1][1] < spacing:
-            continue
-        grid = away @ svd[2][:2].T / spacing
-        reach = 1.5 * np.linalg.norm(away, axis=1).max()
-        near = np.linalg.norm(points[target] - points[pixels].mean(axis=0), axis=1) < reach
-        contrast = _contrast(np.median(rgb[pixels], axis=0), np.median(rgb[target], axis=0))
-        covariance = region_covariance_px2(grid)
-        blobs.append(Blob(pixels, np.ones(len(pixels)), grid, covariance, target[near], contrast))
-    return blobs
-
-
 def centroid_covariance_px2(polygon_px: np.ndarray) -> np.ndarray:
     """Return the covariance (2, 2) of the centroid of the lattice points within convex polygons (..., n, 2), vertices
-    in order, over all shifts of the lattice and all polygons: the lattice's own error, with sharp edges and no
-    noise."""
+    in order, over all shifts of the lattice and all polygons."""
     centred = polygon_px - _area_and_centre(polygon_px)[1][..., None, :]
     shift = (np.stack(np.meshgrid(np.arange(SHIFTS), np.arange(SHIFTS)), axis=-1).reshape(-1, 2) + 0.5) / SHIFTS
     # polygons by shifts, then the lattice's rows, then edges
@@ -286,10 +247,9 @@ def centroid_covariance_px2(polygon_px: np.ndarray) -> np.ndarray:
 
 def region_covariance_px2(pixels: np.ndarray) -> np.ndarray:
     """Return the covariance (2, 2) of the centroid of a region known by its pixel positions (m, 2) alone, which are on
-    no line. Their convex outline stands for the region; where they fill their smallest rectangle that rectangle, whose
-    long sides tell the slope of the short ones, where few steps are seen. How its size falls between whole pixels is
-    unknown, and decides whether the errors of opposite edges add or cancel, and its slope is known to part of a step;
-    so the covariance is the mean over outlines up to a pixel larger and turned by up to that."""
+    no line. Their convex outline stands for it, or their smallest rectangle where they fill that. Its size and slope
+    are known to part of a pixel, and decide whether the errors of opposite edges add or cancel: the covariance is the
+    mean over outlines up to a pixel larger and turned by up to that."""
     hull = cv2.convexHull(pixels.astype(np.float32))
     box_middle, size, angle = cv2.minAreaRect(hull)
     # the outermost centres lie half a pixel within the region

@@ -1,15 +1,14 @@
 """The marks of one view: coloured spots or codes (OpenCV's) that are found, judged, and put in doubt.
 
-The slope of a mark's plane is fitted to the mark and its surroundings together, over which depth noise averages, the
-offset to the mark alone, so that a mark that is thick, or that the camera ranges differently, is placed where it is
-measured. The centroid is that of the pixels' rays cut by this plane, weighted by the surface that they cover and by
-their colour. Spots behind the surface are holes through which another colour is seen; marks of one colour are alike.
-Not modelled: a surface or tag that bends within the mark; a lens whose distortion is more than quadratic over one tag.
+The slope of a mark's plane is fitted to the mark and its surroundings, the offset to the mark alone, which may be thick
+or ranged differently. The centroid is that of the pixels' rays cut by this plane, weighted by the surface that they
+cover and by their colour. Spots behind the surface are holes. Not modelled: a surface or tag that bends within the
+mark; a lens whose distortion is more than quadratic over one tag.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -56,9 +55,9 @@ class Patch:
         return np.asarray(points_m * scale[:, None])
 
     def range_covariance_m2(self, centre_m: np.ndarray, cloud: Cloud, pixels: np.ndarray) -> np.ndarray:
-        """Return the covariance (3, 3) of a centre (3,) on the plane by the mean z of its pixels (n,). Its deviation is
-        what is left about the plane, or the averaged frames' noise if that is more, `CORRELATED_PIXELS` sharing one
-        value; and no less than the maker of a map states."""
+        """Return the covariance (3, 3) of a centre (3,) on the plane by the mean z of its pixels (n,): by what is left
+        about the plane, the averaged frames' noise, or what a map states, whichever is most; `CORRELATED_PIXELS` share
+        one value."""
         frames = cloud.variance_m2.ravel()[pixels] / np.maximum(cloud.count.ravel()[pixels], 1)
         known = frames[np.isfinite(frames)]
         variance = max(self.sigma_m**2, float(known.mean()) if len(known) else 0.0)
@@ -73,10 +72,9 @@ class Patch:
 
 @dataclass(frozen=True)
 class Spot:
-    """The place of a blob: ``centre_m`` (3,) with ``covariance_m2`` (3, 3), ``area_m2``, ``pitch_m`` between pixels
-    there, and ``behind_m``: how far its mean lies behind its surroundings, with the standard deviation
-    ``behind_sigma_m``. ``sizes_m`` (3,): length and breadth of the rectangle with its second moments, and the mean
-    breadth over the length, which gaps lessen."""
+    """The place of a blob: ``centre_m`` (3,) with ``covariance_m2`` (3, 3), ``area_m2``, ``pitch_m`` between pixels,
+    and ``behind_m``: how far it lies behind its surroundings, with its standard deviation. ``sizes_m`` (3,): sides of
+    the rectangle with its second moments, and the mean breadth over the length, which gaps lessen."""
 
     blob: Blob
     centre_m: np.ndarray
@@ -95,8 +93,7 @@ class Spot:
 
 
 def fit_patch(points_m: np.ndarray) -> Patch | None:
-    """Fit the plane of most of some points (n, 3) by least absolute residuals. None where they are too few or on a
-    line. Up to a third of them may lie off it."""
+    """Fit the plane of at least two thirds of points (n, 3). None where they are too few or on a line."""
     x, y, z = points_m[:: max(1, len(points_m) // PATCH_POINTS)].T
     try:
         plane = fit_surface(x, y, z, SurfaceConfig(degree=1))
@@ -145,9 +142,6 @@ HALF_STEPS = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
 
 def coded_marks(cloud: Cloud, inside: np.ndarray, dictionary: str) -> MarkSet:
     """Find the tags of a cv2.aruco ``dictionary`` on the target, each with its code; two of one code are in doubt."""
-    none = np.zeros(0, dtype=np.int64)
-    if not cloud.organised:
-        return MarkSet((), none, problem="codes are read from a picture, and this cloud has no pixel grid")
     assert cloud.rgb is not None
     grey = cv2.cvtColor(np.ascontiguousarray(cloud.rgb), cv2.COLOR_RGB2GRAY)
     parameters = cv2.aruco.DetectorParameters()
@@ -161,7 +155,7 @@ def coded_marks(cloud: Cloud, inside: np.ndarray, dictionary: str) -> MarkSet:
     each = [_coded_mark(cloud, inside, code, corners, codes.count(code) > 1) for code, corners in tags]
     marks = tuple(mark for mark in each if mark is not None)
     off = len(each) - len(marks)
-    pixels = np.unique(np.concatenate([none, *(mark.pixels for mark in marks)]))
+    pixels = _pixels_of(marks)
     notes = (f"{off} tags lie off the target, or have no range",) if off else ()
     return MarkSet(marks, pixels, problem_of(marks, f"searched for tags of {dictionary}"), notes)
 
@@ -228,6 +222,8 @@ def find_marks(cloud: Cloud, inside: np.ndarray, config: RedMarks | ColourMarks 
         return replace(none, problem="the capture has no colour, by which marks are found")
     if int(inside.sum()) < LEAST_TARGET:
         return replace(none, problem=f"{int(inside.sum())} pixels of the target, too few to know its colour")
+    if not cloud.organised and not isinstance(config, RedMarks):
+        return replace(none, problem="marks are found in a picture, and this cloud has no pixel grid")
     if isinstance(config, CodedMarks):
         return coded_marks(cloud, inside, config.dictionary)
     if isinstance(config, RedMarks):
@@ -239,6 +235,8 @@ def find_marks(cloud: Cloud, inside: np.ndarray, config: RedMarks | ColourMarks 
         coloured[inside] = red > limit
         missing = f"no pixel's red exceeds {limit:.0f}, the target's mean {mean:.0f} and {config.deviations:g} standard"
         missing += f" deviations of {spread:.0f}"
+        if not cloud.organised:
+            return MarkSet((), np.flatnonzero(coloured), "marks need a pixel grid, which this cloud has not")
         return _marks(cloud, inside, coloured, "" if coloured.any() else missing)
     # by lightness where chromaticity gives too few marks or hardly any contrast, if that does better: black and white
     # have the light's own chromaticity, and black hardly any
@@ -258,13 +256,16 @@ def _standing_out(
     assert cloud.rgb is not None
     contrast, margin = np.zeros(inside.shape), np.zeros(inside.shape)
     contrast[inside], margin[inside] = stand_out(*feature(cloud.rgb[inside]), cloud.points_m[inside][:, :2])
-    coloured = above_half(margin > 1.0, contrast) if cloud.organised else margin > 1.0
+    coloured = above_half(margin > 1.0, contrast)
     found = _marks(cloud, inside, coloured, "no other spots stand apart from the target's colour")
-    # a hole through which another colour shows is no fiducial
-    own = np.unique(np.concatenate([np.zeros(0, np.int64), *(mark.pixels for mark in found.marks)]))
     pixels = [mark.pixels for mark in found.trusted]
     median = float(np.median(margin.ravel()[np.concatenate(pixels)])) if pixels else 0.0
-    return replace(found, points=own), median
+    # a hole through which another colour shows is no fiducial
+    return replace(found, points=_pixels_of(found.marks)), median
+
+
+def _pixels_of(marks: Sequence[Mark]) -> np.ndarray:
+    return np.unique(np.concatenate([np.zeros(0, np.int64), *(mark.pixels for mark in marks)]))
 
 
 def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str) -> MarkSet:
@@ -304,12 +305,11 @@ def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str)
             doubt = f"no {LEAST_MARKS} marks have its colour, as they have another"
         marks += [replace(mark, doubt=mark.doubt or doubt) for mark in found]
     marks.sort(key=lambda mark: int(mark.pixels[0]))
-    notes = []
-    if holes := len(spots) - len(marks):
-        notes.append(f"{holes} spots of another colour lie behind the surface: taken for holes, not for marks")
-    if not cloud.organised:
-        notes.append("a cloud without a pixel grid does not tell whether a mark is cut")
-    return MarkSet(tuple(marks), np.flatnonzero(coloured), problem_of(marks, missing), tuple(notes))
+    holes = len(spots) - len(marks)
+    notes = (
+        (f"{holes} spots of another colour lie behind the surface: taken for holes, not for marks",) if holes else ()
+    )
+    return MarkSet(tuple(marks), np.flatnonzero(coloured), problem_of(marks, missing), notes)
 
 
 def _mark(spot: Spot, usual_m: np.ndarray | None, n_target: int) -> Mark:

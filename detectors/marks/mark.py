@@ -15,8 +15,7 @@ from harness.vocabulary.geometry import MM
 LEAST_MARKS = 3
 OFF_LINE_SIGMAS, OFF_LINE_SHARE = 5.0, 0.02
 """Marks lie on a line where their root mean square distance from it is less than so many standard deviations of one
-mark's place, or less than this part of that along it: the turn about the line would be wrong by a fifth of a radian, or
-each millimetre that a view is wrong at a mark would become 50 mm."""
+mark's place, or this part of that along it, where each millimetre of error at a mark would become 50 mm."""
 
 
 class RedMarks(Config):
@@ -27,8 +26,8 @@ class RedMarks(Config):
 
 
 class ColourMarks(Config):
-    """Pixels whose chromaticity stands apart from the target's own, whatever the colour, in uneven light too;
-    where that gives no three marks (black or white tape), pixels whose lightness does."""
+    """Pixels whose chromaticity stands apart from the target's own; where that gives no three marks, whose lightness
+    does."""
 
     kind: Literal["colour"] = "colour"
 
@@ -56,11 +55,9 @@ MarksConfig = Annotated[RedMarks | ColourMarks | CodedMarks, Field(discriminator
 @dataclass(frozen=True)
 class Mark:
     """One mark in one view, camera frame, metres. ``centre_m`` (3,): its centroid on the surface. ``covariance_m2`` (3,
-    3): of that centroid; systematic errors that all pixels of the mark share (a range offset, a distortion of the lens)
-    are not in it. ``normal`` (3,): unit normal of the surface there, towards the camera. ``pixels`` (n,): flat indices
-    into the cloud's grid. ``area_m2``: on the surface. ``code``: of a coded mark its identity, None of a piece of tape.
-    ``doubt``: why it should not be relied on (cut by the crop's edge, no range in parts of it, a shape unlike the
-    others); empty for none."""
+    3): of that centroid, without errors that all pixels of the mark share (a range offset, a distortion of the lens).
+    ``normal`` (3,): of the surface there, towards the camera. ``pixels`` (n,): flat indices into the cloud's grid.
+    ``area_m2``: on the surface. ``code``: None of a piece of tape. ``doubt``: why it should not be relied on."""
 
     centre_m: np.ndarray
     covariance_m2: np.ndarray
@@ -74,8 +71,7 @@ class Mark:
 @dataclass(frozen=True)
 class MarkSet:
     """All marks of one view. ``points`` (n,): flat indices of every pixel of the fiducial colour within the crop, the
-    thesis' fiducial cloud, marks or not. ``problem``: why no registration can rest on these marks (too few, on a line),
-    with what is missing; empty where one can. ``notes``: what else a user should know."""
+    thesis' fiducial cloud. ``problem``: why no registration can rest on these marks, with what is missing."""
 
     marks: tuple[Mark, ...]
     points: np.ndarray
@@ -106,7 +102,7 @@ def off_line_problem(marks: Sequence[Mark]) -> str:
     error = float(np.sqrt(np.mean([np.linalg.eigvalsh(mark.covariance_m2)[-1] for mark in marks])))
     if sizes[1] >= max(OFF_LINE_SIGMAS * error, OFF_LINE_SHARE * sizes[0]):
         return ""
+    off = f"{sizes[1] / MM:.1f} mm off it"
     return (
-        f"the {len(marks)} marks lie on a line, {sizes[1] / MM:.1f} mm off it, which leaves the turn about it open;"
-        " a mark beside the line is missing"
+        f"the {len(marks)} marks lie on a line, {off}, which leaves the turn about it open: add a mark beside the line"
     )

@@ -1,14 +1,14 @@
 """Matches of the marks of two views, by code or by the distances between marks; and the transform between them.
 
-Search over pairs, as in the interpretation trees of Grimson and Lozano-Perez (1987), without the tree. Two marks and
-their normals fix a placement; so each ordered pair of marks of the larger set that is as far apart as a pair of the
-smaller set is a hypothesis, and each further mark counts for it whose distances to both fit. Pairs of the smaller set
-are tried of which any solution holds one: more than half of the smaller set must agree. The normals face the camera on
-both sides, so a mirror image is no solution.
+Two marks and their normals fix a placement (Grimson and Lozano-Perez 1987, without the tree): each ordered pair of
+marks of the larger set that is as far apart as a pair of the smaller set is a hypothesis, and each further mark counts
+for it whose distances to both fit. More than half of the smaller set must agree. The normals face the camera on both
+sides, so a mirror image is no solution.
 
 Kabsch's closed form (1976; Umeyama 1991 for the sign) starts the rigid transform; Gauss-Newton on the full covariances
-gives the most probable one, without scale, and its information matrix the covariance. Not modelled: marks that are seen
-twice, or moved between the views; errors that the points of one set share."""
+gives the most probable one, and its covariance. Not modelled: marks that are seen twice, or moved between the views;
+errors that the points of one set share.
+"""
 
 from __future__ import annotations
 
@@ -43,9 +43,8 @@ class Placement:
 
 
 def kabsch(from_m: np.ndarray, to_m: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return least-squares rigid transforms (..., 4, 4) of points (..., n, 3) onto (..., n, 3), with ``weights`` (...,
-    n) of 0 or more. The rotations are proper. Points on a line leave the turn about it undetermined, and any is
-    given."""
+    """Return least-squares rigid transforms (..., 4, 4), proper, of points (..., n, 3) onto (..., n, 3), with
+    ``weights`` (..., n) of 0 or more. Points on a line leave the turn about it undetermined, and any is given."""
     share = (weights / weights.sum(axis=-1, keepdims=True))[..., None]
     from_centre, to_centre = (share * from_m).sum(axis=-2), (share * to_m).sum(axis=-2)
     spread = np.swapaxes(share * (from_m - from_centre[..., None, :]), -1, -2) @ (to_m - to_centre[..., None, :])
@@ -88,8 +87,7 @@ def place(
 
 
 SHARED_M = 1.0 * MM
-"""Standard deviation per axis of what the pixels of a mark share and two views do not (wiggling, the lens's
-calibration), which is in no mark's covariance."""
+"""Standard deviation per axis of what the pixels of a mark share and two views do not, which is in no covariance."""
 DISTANCE_SIGMAS = 4.0
 """A distance between two marks may differ by so many standard deviations: a true pair is lost once in 16,000."""
 FIT_CHI2 = 21.1
@@ -99,8 +97,7 @@ GUESS_SIGMA_M = 50 * MM
 PAIR_WORTH = 3.0
 """Logarithm of the odds that a mark of one view is found in the other: 20 to 1."""
 CLEAR_ODDS, FEWER = 4.5, 3
-"""Logarithm of the odds, 90 to 1, at which one placement is taken before another; and how many pairs fewer than the
-best it may have, since the guess may prefer it."""
+"""Logarithm of the odds, 90 to 1, at which one placement is taken before another; and fewer pairs that it may have."""
 NO_PAIRS = np.zeros((0, 2), dtype=np.int64)
 
 
@@ -115,8 +112,8 @@ class Pairing:
 
 
 def pair_marks(reference: Sequence[Mark], view: Sequence[Mark], T_reference_view_guess: np.ndarray | None) -> Pairing:
-    """Match the marks of two views; the guess is used only to choose between placements that fit. The placement is
-    chosen that the number of its pairs, their fit and the guess favour, if clearly."""
+    """Match the marks of two views. The placement is chosen that the number of its pairs, their fit and the guess
+    favour."""
     counts = f"{len(reference)} marks in the reference and {len(view)} in the view"
     if min(len(reference), len(view)) < LEAST_MARKS:
         return Pairing(NO_PAIRS, f"{counts}, {LEAST_MARKS} needed in each")
@@ -127,11 +124,8 @@ def pair_marks(reference: Sequence[Mark], view: Sequence[Mark], T_reference_view
     solutions = _solutions(theirs, ours) if swapped else _solutions(ours, theirs)
     if not solutions:
         least = max(LEAST_MARKS, min(len(reference), len(view)) // 2 + 1)
-        return Pairing(
-            NO_PAIRS,
-            f"the distances between the marks fit nowhere: of {counts} no {least} lie alike; other targets, or other"
-            " things taken for marks",
-        )
+        what = f"the distances between the marks fit nowhere: of {counts} no {least} lie alike"
+        return Pairing(NO_PAIRS, f"{what}; other targets, or other things taken for marks")
     away = np.zeros(len(solutions))
     if T_reference_view_guess is not None:
         placed = [transform_points(T if swapped else invert(T), theirs.places) for _, T, _ in solutions]
@@ -190,13 +184,12 @@ class _Side:
 
 
 Solution = tuple[tuple[int, ...], np.ndarray, float]
-"""The mark in the larger set of each in the smaller, -1 for none; (4, 4) larger from smaller; and the mean square
-of the pairs' distances, in units of their worst variance."""
+"""The mark in the larger set of each in the smaller, or -1; (4, 4) larger from smaller; the pairs' mean square distance
+over their worst variance."""
 
 
 def _solutions(few: _Side, many: _Side) -> list[Solution]:
-    """All placements that bring more than half of the smaller set's marks together and at most `FEWER` less than the
-    best, which comes first."""
+    """Placements that bring more than half of the smaller set's marks together, at most `FEWER` less than the best."""
     n = len(few.places)
     least = max(LEAST_MARKS, n // 2 + 1)
     # pairs of which every set of more than half of the marks holds one: disjoint ones, the longest first, and of an odd

@@ -1,11 +1,10 @@
 """Captures in files of arrays: which array holds the distances, and the meaning of its axes. Height maps and bare
 numbers too.
 
-The libraries that read them believe what a file states: they run within `files.limited_memory`. Arrays of objects are
-refused: they would need pickle. A height map's pixels lie a stated pitch apart, and it is a cloud in parallel
-projection: x and y count from its middle, and z, which points away from the viewer, is `DISTANCE_M` at the median
-height. Without a stated unit, micrometres, millimetres or metres are taken, whichever gives the relief a plausible part
-of the extent.
+The libraries that read them run within `files.limited_memory`. Arrays of objects, which would need pickle, are refused.
+A height map's pixels lie a stated pitch apart, and it is a cloud in parallel projection: x and y count from its middle,
+and z, which points away from the viewer, is `DISTANCE_M` at the median height. Without a stated unit, micrometres,
+millimetres or metres are taken, whichever gives the relief a plausible part of the extent.
 """
 
 from __future__ import annotations
@@ -84,8 +83,7 @@ def load_mat(path: Path) -> dict[str, np.ndarray]:
 
 
 def load_picture(path: Path) -> dict[str, np.ndarray]:
-    """Return the pages of a TIFF, or a PFM, of numbers; of three channels in floating point x, y, z. Raises UserError
-    where it is broken, or a colour picture."""
+    """Return a TIFF's pages, or a PFM, of numbers or x, y, z. Raises UserError for broken files and pictures."""
     import cv2
 
     level = cv2.utils.logging.getLogLevel()
@@ -142,11 +140,8 @@ class RawLoader:
         kind, size = np.dtype(self.kind), path.stat().st_size - self.offset
         frame = self.width * self.height * self.step
         if size < frame:
-            raise UserError(
-                f"{path}: has {size} bytes from byte {self.offset} on, but a frame of {self.width} x {self.height}"
-                f" numbers in steps of {self.step} bytes needs {frame}",
-                legal=LEGAL_RAW,
-            )
+            needs = f"a frame of {self.width} x {self.height} numbers in steps of {self.step} bytes needs {frame}"
+            raise UserError(f"{path}: has {size} bytes from byte {self.offset} on, but {needs}", legal=LEGAL_RAW)
         content = np.memmap(path, np.uint8, "r", self.offset, (size // frame * frame,))
         strides = (frame, self.width * self.step, self.step)
         return {"": np.ndarray((size // frame, self.height, self.width), kind, content, strides=strides)}
@@ -160,12 +155,10 @@ class RawLoader:
             raise UserError(f"{path}: {what}: the layout is another", legal=LEGAL_RAW, fix=raw_layout_of(path).fix)
         left_over = (path.stat().st_size - self.offset) % (self.width * self.height * self.step)
         if len(frames) > 1 and (left_over or not changed < SAME_SCENE):
-            raise UserError(
-                f"{path}: {len(frames)} planes and {left_over} bytes more; the median pixel differs by"
-                f" {100 * changed:.3g} % between the first and the last plane: depth beside brightness and confidence?",
-                legal="frames of one scene, or one plane",
-                fix="choose the plane with the depth: --array :0",
-            )
+            what = f"{path}: {len(frames)} planes and {left_over} bytes more; the median pixel differs by"
+            what += f" {100 * changed:.3g} % between the first and the last: depth beside brightness and confidence?"
+            fix = "choose the plane with the depth: --array :0"
+            raise UserError(what, legal="frames of one scene, or one plane", fix=fix)
 
 
 def raw_layout_of(path: Path) -> UserError:
@@ -283,12 +276,9 @@ def _named_array(
     if not key:
         found = [key for key in arrays if key.lower() in usual] or list(arrays)
         if len(found) != 1:
-            choice = f"choose by --array NAME, for instance --array {found[0]} (of a height map with --pitch)"
-            raise UserError(
-                f"{name}: no array, or several arrays, that could be the depth (it holds {held})",
-                legal="one array named " + ", ".join(usual) + "; " + LEGAL_AXES,
-                fix=choice if found else None,
-            )
+            what = f"{name}: no array, or several arrays, that could be the depth (it holds {held})"
+            fix = f"choose one, for instance --array {found[0]} (of a height map with --pitch)" if found else None
+            raise UserError(what, legal=f"one array named {', '.join(usual)}; {LEGAL_AXES}", fix=fix)
         (key,) = found
     if key not in arrays:
         raise UserError(f"{name}: holds no array {key}", legal=held, fix=f"--array {next(iter(arrays), '')}")
@@ -340,10 +330,8 @@ def _open_height_map(path: Path, load: ArraysLoader, asked: Asked) -> Recording:
     plausible = (UNITS_M[u] for u in ("mm", "m", "um") if RELIEF[0] <= relief * UNITS_M[u] / side_m < RELIEF[1])
     scale_m = next(plausible, None) if asked.scale_m is None else asked.scale_m
     if scale_m is None:
-        raise UserError(
-            f"{name}: nothing tells the unit of its heights: they span {relief:.4g} over {1e3 * side_m:.4g} mm",
-            fix="state it: --unit mm, --unit m or --unit um",
-        )
+        what = f"{name}: nothing tells the unit of its heights: they span {relief:.4g} over {1e3 * side_m:.4g} mm"
+        raise UserError(what, fix="state it: --unit mm, --unit m or --unit um")
     is_down = name.rpartition(" ")[2].partition(":")[0].lower() in DOWN_NAMES
     direction = "grow away from the viewer, as its name says" if is_down else "grow towards the viewer: holes are low"
     return Recording(
@@ -383,11 +371,9 @@ def _map_in(path: Path, load: ArraysLoader, array: str | None) -> tuple[str, np.
     name, values = _named_array(str(path), load(path), (*HEIGHT_NAMES, *DOWN_NAMES), array)
     values = values[0] if values.ndim == 3 and values.shape[0] == 1 else values
     if values.ndim == 3:
-        raise UserError(
-            f"{name}: {values.shape[0]} maps of {values.shape[2]} x {values.shape[1]} pixels",
-            legal="one map: different maps are not averaged",
-            fix=f"choose one by its number: --array {(array or '').partition(':')[0]}:0",
-        )
+        what = f"{name}: {values.shape[0]} maps of {values.shape[2]} x {values.shape[1]} pixels"
+        fix = f"choose one by its number: --array {(array or '').partition(':')[0]}:0"
+        raise UserError(what, legal="one map: different maps are not averaged", fix=fix)
     if values.ndim != 2 or min(values.shape) < 2:
         legal = "(h, w), or (n, h, w) with --array NAME:NUMBER"
         raise UserError(f"{name}: axes {values.shape} are no height map's", legal=legal)

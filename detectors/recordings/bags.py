@@ -1,8 +1,8 @@
 """ROS bags (ROS 2: folder, .db3, .mcap; ROS 1: .bag) with depth images or sensor_msgs/PointCloud2 as captures.
 
 ``rosbags`` unpacks chunks whole: it runs within `files.limited_memory`. A depth image needs the CameraInfo that its
-driver publishes beside it. Where a bag of clouds holds a CameraInfo whose rays pass through the cloud's points, z and
-that lens are used: a pixel's ray is then the same in all frames, not rounded anew in each.
+driver publishes beside it. Where rays of a CameraInfo pass through a cloud's points, z and that lens are used: a
+pixel's ray is then the same in all frames.
 """
 
 from __future__ import annotations
@@ -118,11 +118,8 @@ def find_bag(path: Path) -> Bag:
     metadata = path / METADATA
     if not metadata.is_file():
         held = sorted(inside.name for inside in path.iterdir() if _holds_messages(inside))
-        raise UserError(
-            f"{path}: has no {METADATA} (the recorder writes it when it stops), but {', '.join(held)}",
-            legal=LEGAL_BAG,
-            fix="name that file itself, or run: ros2 bag reindex",
-        )
+        what = f"{path}: has no {METADATA} (the recorder writes it when it stops), but {', '.join(held)}"
+        raise UserError(what, legal=LEGAL_BAG, fix="name that file itself, or run: ros2 bag reindex")
     fix = "copy it again, name the .db3 or .mcap itself, or run: ros2 bag reindex"
     with damage_told(f"{metadata}: is no description of a ROS 2 bag, or is cut off", LEGAL_BAG, fix):
         told = read_yaml(metadata).data["rosbag2_bagfile_information"]
@@ -244,11 +241,8 @@ def _chosen_topic(bag: Bag, asked: Asked) -> tuple[str, str]:
         others = f"; depth images: {', '.join(images)}; --topic chooses"
         return usual[0], f"the clouds on {usual[0]} are read{others}" if images else ""
     if not both:
-        raise UserError(
-            f"{path}: no topic with {CLOUD_TYPE} or depth images; its topics: {held}",
-            legal=kinds,
-            fix="record the camera's depth with its lens: ros2 bag record /depth/image_raw /depth/camera_info",
-        )
+        fix = "record the camera's depth with its lens: ros2 bag record /depth/image_raw /depth/camera_info"
+        raise UserError(f"{path}: no topic with {CLOUD_TYPE} or depth images; its topics: {held}", legal=kinds, fix=fix)
     own = next((topic for topic in images if _infos_of(bag, topic)), "")
     found = f"{len(clouds)} topics hold clouds" if clouds else f"{len(images)} topics hold depth images"
     fix = f"choose one, for instance --topic {own or (images or clouds)[0]}"
@@ -289,11 +283,9 @@ def _lens_of_images(bag: Bag, topic: str, shape: tuple[int, ...]) -> Lens:
             return lens
         why.append(f"{info} {lens}")
     told = "; ".join(why) or f"no CameraInfo lies beside {topic} (the bag's: {', '.join(every) or 'none'})"
-    raise UserError(
-        f"{bag.path}: {told}: nothing says which lens took these depth images, and without it they are no points",
-        legal=LEGAL_LENS,
-        fix=f"pass --intrinsics FILE{', or the rectified topic by --topic' if why else ''}",
-    )
+    what = f"{bag.path}: {told}: nothing says which lens took these depth images, and without it they are no points"
+    fix = f"pass --intrinsics FILE{', or the rectified topic by --topic' if why else ''}"
+    raise UserError(what, legal=LEGAL_LENS, fix=fix)
 
 
 def lens_of_info(message: Any, shape: tuple[int, ...], is_rectified: bool = False) -> Lens | str:

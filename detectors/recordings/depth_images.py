@@ -1,9 +1,8 @@
 """Folders and lists of 16-bit depth PNGs: Open3D's recorder, Azure SDK exports, TUM RGB-D, or bare pictures.
 
 What decides the layout: a sub-folder ``depth`` (with ``color`` or ``rgb`` beside it), names that hold "depth", names
-that are numbers, else every 16-bit grey PNG. A ``depth.txt`` beside marks TUM RGB-D (5000 to the metre, colour matched
-by time stamp). A picture's kind is told by its first bytes, and Pillow reads its header: OpenCV would take a TIFF
-called ``.png``, and decode a header of 30,000 x 30,000 pixels into gigabytes.
+that are numbers, else every 16-bit grey PNG. A ``depth.txt`` beside marks TUM RGB-D. A picture's kind is told by its
+first bytes, and Pillow reads its header: OpenCV would decode a header of 30,000 x 30,000 pixels into gigabytes.
 """
 
 from __future__ import annotations
@@ -50,23 +49,14 @@ def decoded(name: str, content: bytes, flags: int) -> np.ndarray:
     return picture
 
 
-def png_texts(content: bytes) -> dict[str, str]:
-    """Return the names and values that a PNG holds as text before its picture; none of what is no PNG."""
-    try:
-        return {str(key): str(value) for key, value in _header("", content).info.items()}
-    except UserError:
-        return {}
-
-
 def refuse_broken_png(name: str, content: bytes) -> None:
     """Raise UserError where a PNG is cut off or a checksum fails: the decoder may fill a cut picture up with zeros."""
     try:
         _header(name, content).verify()
     except (SyntaxError, OSError, ValueError) as error:
         what = "damaged" if "broken" in str(error) or "checksum" in str(error) else "truncated"
-        raise UserError(
-            f"{name}: is {what} ({error}; {len(content)} bytes)", legal="a whole PNG", fix="copy or export it again"
-        ) from error
+        what, fix = f"{name}: is {what} ({error}; {len(content)} bytes)", "copy or export it again"
+        raise UserError(what, legal="a whole PNG", fix=fix) from error
 
 
 def _header(name: str, content: bytes) -> ImageFile.ImageFile:
@@ -162,8 +152,7 @@ def depth_files(folder: Path) -> tuple[Path, ...]:
 
 
 def depth_named(paths: Sequence[Path], others: Sequence[Path]) -> tuple[Path, ...]:
-    """Return the files whose names hold "depth", else ``others`` without those of other pictures (`NOT_DEPTH`), in the
-    order of the numbers in their names."""
+    """Return the files whose names hold "depth", else ``others`` but `NOT_DEPTH`, in the order of their numbers."""
     chosen = [path for path in paths if "depth" in path.stem.lower()]
     chosen = chosen or [path for path in others if not NOT_DEPTH.search(path.stem)]
 
@@ -197,11 +186,8 @@ def _depth_size(path: Path) -> tuple[int, int]:
     width, height, bits, kind = png_kind(path)
     if (bits, kind) != (16, 0):
         channels = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}.get(kind, f"type {kind}")
-        raise UserError(
-            f"{path}: {bits} bits a channel, {channels}: a picture or a mask, not a depth image",
-            legal=LEGAL_PNG,
-            fix="export the depth itself; a preview scaled to 0..255 has lost it",
-        )
+        what = f"{path}: {bits} bits a channel, {channels}: a picture or a mask, not a depth image"
+        raise UserError(what, legal=LEGAL_PNG, fix="export the depth itself; a preview scaled to 0..255 has lost it")
     return width, height
 
 

@@ -1,9 +1,8 @@
 """Recordings of cameras by their own programs: Azure Kinects (.mkv), iPhones and iPads (Stray Scanner, Record3D).
 
 k4arecorder writes tracks titled COLOR, DEPTH and IR (16-bit big-endian grey, depth in millimetres, 0 = none) and
-attaches the factory calibration. Colour is sampled at each depth point's place in the colour picture. Phones store
-ARKit's depth, a confidence 0 to 2 of each pixel (0 is no return), the lens of the colour camera, and poses, by which
-the program warns of movement.
+attaches the factory calibration. Phones store ARKit's depth, a confidence 0 to 2 of each pixel (0 is no return), the
+lens of the colour camera, and poses, by which the program warns of movement.
 """
 
 from __future__ import annotations
@@ -227,11 +226,11 @@ def _motion_warnings(
     blur_px = lens.fx * (turned + moved_m / median_m)
     if blur_px <= BLUR_PX:
         return ()
-    return (
+    moved = (
         f"the camera moved by {1e3 * moved_m:.3g} mm and {np.degrees(turned):.2g} degrees during the {len(places_m)}"
-        f" frames ({source}), up to {blur_px:.2g} pixels on the target, so their average is blurred: --max-frames 1"
-        " takes the first frame alone",
     )
+    blur = f"up to {blur_px:.2g} pixels on the target, so their average is blurred"
+    return (f"{moved} frames ({source}), {blur}: --max-frames 1 takes the first frame alone",)
 
 
 def is_stray(folder: Path) -> bool:

@@ -49,9 +49,8 @@ def refuse_narrow(name: str, dtype: np.dtype) -> None:
 def frame_of(
     name: str, stored: np.ndarray, scale_m: float, rgb: np.ndarray | None = None, amplitude: np.ndarray | None = None
 ) -> Frame:
-    """Make a frame of stored depth (h, w) or points (h, w, 3) in units of ``scale_m`` metres. A distance of 0 and
-    `no_return_codes` mean no return. Depth that is negative throughout is turned. Raises UserError where most points,
-    not all, lie behind the camera."""
+    """Make a frame of stored depth (h, w) or points (h, w, 3) in units of ``scale_m`` metres. 0 and `no_return_codes`
+    mean no return. Depth that is negative throughout is turned. Raises UserError where most, not all, is negative."""
     stored_z = stored[..., 2] if stored.ndim == 3 else stored
     reason = np.zeros(stored_z.shape, np.uint8)
     reason[stored_z == 0] = Reason.NO_RETURN
@@ -66,10 +65,8 @@ def frame_of(
     behind = (stored_z < 0) & valid
     turned = valid.any() and behind.sum() > TURNED_SHARE * valid.sum()
     if turned:
-        notes.append(
-            f"z is negative in {100 * behind.sum() / valid.sum():.3g} % of the points: turned by half a turn about x"
-            " (y up and z back became y down and z forward)"
-        )
+        share = f"z is negative in {100 * behind.sum() / valid.sum():.3g} % of the points"
+        notes.append(f"{share}: turned by half a turn about x (y up and z back became y down and z forward)")
         behind = ~behind & valid
     elif behind.sum() > 0.5 * valid.sum():
         what = f"{name}: most points lie behind the camera (z below 0), but not all"
@@ -140,10 +137,9 @@ NEAR_M = (0.8, 1.8)
 NEAR_LIMIT_M, FAR_FLOOR = 0.15, 0.05
 """Any distance above the first keeps at least the second as its part of the commonest distance's weight."""
 SURE, LIKELY, SHOWN = 0.98, 0.75, 0.003
-"""Probabilities: above the first only the unit is told, below the second the user is asked, the third hides a
-reading."""
+"""Probabilities: above the first a unit is told, below the second asked for; the third hides a reading."""
 MILLIMETRE_SIZES = {
-    **{(640, 576): 4.5, (320, 288): 6.0, (512, 512): 3.5, (1024, 1024): 3.0, (512, 424): 8.0, (256, 192): 8.0},
+    **{(640, 576): 4.5, (320, 288): 6.0, (512, 512): 3.5, (1024, 1024): 3.0, (512, 424): 8.0, (256, 192): 8.0}
 }  # image sizes of cameras that all store 1 mm and the median distance in metres that they can reach
 QUARTER_SIZES = {(1024, 768): 20.0, (640, 480): 2.0, (1280, 720): 2.0, (1920, 1080): 2.0}
 """Image sizes of cameras with 0.25 mm (L515, Helios; colour that the L515 is aligned to), and the weight that adds."""
@@ -212,10 +208,9 @@ def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int,
     best = ranked[0]
     if chances[best] < LIKELY:
         what = "several units are plausible" if shown else "no usual unit is plausible"
-        raise UserError(
-            f"{name}: nothing states the unit of its depth, and {what} (median stored number {median:.5g})",
-            fix=f"pass the unit; median distance in each: {', '.join(shown)}" if shown else f"--unit: {LEGAL_UNITS}",
-        )
+        what = f"{name}: nothing states the unit of its depth, and {what} (median stored number {median:.5g})"
+        fix = f"pass the unit; median distance in each: {', '.join(shown)}" if shown else f"--unit: {LEGAL_UNITS}"
+        raise UserError(what, fix=fix)
     scale_m, usual = metres_per_unit(best), f"what is usual for {'integers' if integers else 'floating-point numbers'}"
     if math.isclose(scale_m, usual_m):
         if chances[best] >= SURE:
@@ -223,10 +218,8 @@ def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int,
     else:
         usual = f"the data: with {usual}, {1e3 * usual_m:g} mm, the median distance would be {median * usual_m:.4g} m"
     others = f"; others are possible: {', '.join(shown[1:])}" if len(shown) > 1 else ""
-    warning = (
-        f"nothing states the depth unit; {1e3 * scale_m:.4g} mm is taken, which puts the median at"
-        f" {median * scale_m:.3g} m{others}; state it with --unit {best}"
-    )
+    taken = f"{1e3 * scale_m:.4g} mm is taken, which puts the median at {median * scale_m:.3g} m{others}"
+    warning = f"nothing states the depth unit; {taken}; state it with --unit {best}"
     return Unit(scale_m, usual, warning)
 
 
@@ -249,8 +242,6 @@ def refuse_implausible(frame: Frame, scale_m: float) -> None:
         return
     in_each = {unit: median_m / scale_m * metres for unit, metres in UNITS_M.items()}
     fitting = [f"--unit {unit} (then {m:.3g} m)" for unit, m in in_each.items() if NEAREST_M <= m <= FARTHEST_M]
-    raise UserError(
-        f"{frame.name}: the median distance would be {median_m:.4g} m, which speaks for a wrong unit",
-        legal=f"a median between {NEAREST_M:g} m and {FARTHEST_M:g} m",
-        fix="pass " + " or ".join(fitting) if fitting else f"state the unit with --unit: {LEGAL_UNITS}",
-    )
+    what = f"{frame.name}: the median distance would be {median_m:.4g} m, which speaks for a wrong unit"
+    fix = "pass " + " or ".join(fitting) if fitting else f"state the unit with --unit: {LEGAL_UNITS}"
+    raise UserError(what, legal=f"a median between {NEAREST_M:g} m and {FARTHEST_M:g} m", fix=fix)

@@ -114,12 +114,7 @@ FOUND_BESIDE = (
     *("rtabmap_calib", "scene_camera", "depth_intrinsics", "intrinsic_depth", "transforms"),
 )  # stems of the files that are taken for the lens of the frames beside or below them
 BARE_MATRICES = (
-    "intrinsics.txt",
-    "intrinsic.txt",
-    "camera-intrinsics.txt",
-    "intrinsic_depth.txt",
-    "K.txt",
-    "cam_K.txt",
+    *("intrinsics.txt", "intrinsic.txt", "camera-intrinsics.txt", "intrinsic_depth.txt", "K.txt", "cam_K.txt"),
 )
 """Names of text files likewise: other text beside frames is mostly something else."""
 SPELLINGS = {
@@ -130,8 +125,7 @@ MATRICES = ("intrinsic_matrix", "camera_matrix", "cam_K", "K", "k")
 SIZES = (("width", "height"), ("image_width", "image_height"), ("width_px", "height_px"), ("w", "h"))
 COEFFICIENTS = ("distortion", "distortion_coefficients", "D", "d", "coeffs", "dist_coeffs")
 MODELS = ("distortion_model", "model", "camera_model")
-"""Keys by which programs name focal lengths and centre, the matrix (the first one's column by column), the image's
-size, the distortion and its model."""
+"""Keys by which programs name focal lengths and centre, the matrix (the first's by columns), size, and distortion."""
 NUMBER, MAX_MATRIX_TEXT = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", 2000
 NESTED = 3  # levels of mappings in a file in which a lens is looked for
 DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -150,7 +144,7 @@ def lens_for(
 ) -> tuple[Lens, tuple[Path, ...]]:
     """Return the lens of depth images and the files that state it: --intrinsics, the named camera's, the capture's
     ``own``, or the first file named like a lens in the folders ``beside``. Raises UserError where nobody states a lens
-    (``hint`` ends its advice), or the one stated is of other images."""
+    (``hint`` ends its advice), or that of other images."""
     lens, file = asked.lens, asked.intrinsics
     if lens is None and file is None:
         lens = own()
@@ -160,23 +154,17 @@ def lens_for(
     if file is not None:
         lens = read_lens(file, width, height)
     if lens is None:
-        raise UserError(
-            f"{name}: nothing says which lens took these depth images, and without it they are no points",
-            legal=LEGAL_LENS,
-            fix="pass --intrinsics FILE, or the name of a camera whose nominal lens is good enough" + hint,
-        )
-    files = (file,) if file else ()
+        what = f"{name}: nothing says which lens took these depth images, and without it they are no points"
+        fix = f"pass --intrinsics FILE, or the name of a camera whose nominal lens is good enough{hint}"
+        raise UserError(what, legal=LEGAL_LENS, fix=fix)
     modes = (lens, *lens.others) if isinstance(lens, OtherLens) else (lens,)
     for mode in modes:
         if (mode.width, mode.height) == (width, height):
-            return mode, files
-    known = [f"{mode.mode} {mode.width} x {mode.height}" for mode in modes[1:] if isinstance(mode, OtherLens)]
-    raise UserError(
-        f"{name}: depth images of {width} x {height} pixels, but the lens is of {lens.width} x {lens.height}",
-        legal=f"the modes of this camera: {', '.join(known)}" if known else None,
-        fix="pass --intrinsics FILE with the lens of these images"
-        + (" (of the colour camera, where the depth was aligned to it)" if known else ""),
-    )
+            return mode, (file,) if file else ()
+    known = ", ".join(f"{each.mode} {each.width} x {each.height}" for each in modes[1:] if isinstance(each, OtherLens))
+    what = f"{name}: depth images of {width} x {height} pixels, but the lens is of {lens.width} x {lens.height}"
+    fix = "pass --intrinsics FILE with the lens of these images (of the colour camera, if the depth was aligned to it)"
+    raise UserError(what, legal=f"the modes of this camera: {known}" if known else None, fix=fix)
 
 
 def read_lens(path: Path, width: int, height: int) -> Lens:
@@ -194,9 +182,9 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
     if not isinstance(across, int) or not isinstance(down, int):
         raise UserError(f"{path}: the lens' width and height are no whole numbers", legal=LEGAL_LENS)
     if across * height != down * width:
+        what = f"{path}: is for images of {across} x {down} pixels, but the depth images have {width} x {height}"
         raise UserError(
-            f"{path}: is for images of {across} x {down} pixels, but the depth images have {width} x {height}",
-            fix="give the lens of the depth images themselves (or of the colour camera that they are aligned to)",
+            what, fix="give the lens of the depth images (or of the colour camera that they are aligned to)"
         )
     fx, fy, cx, cy = _focal_and_centre(path, data)
     side = across / width
@@ -210,16 +198,13 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
     distortion = _distortion(path, data)
     if (across, down) == (width, height):
         return Lens(width, height, fx, fy, cx, cy, distortion)
-    warning = (
-        f"{path.name} is the lens of images of {across} x {down} pixels; it is scaled to {width} x {height},"
-        " which is right unless the smaller image is cut out of the larger"
-    )
+    warning = f"{path.name} is the lens of images of {across} x {down} pixels; it is scaled to {width} x {height},"
+    warning += " which is right unless the smaller image is cut out of the larger"
     return OtherLens(width, height, fx, fy, cx, cy, distortion, warning=warning)
 
 
 def parsed_lens(path: Path) -> dict[str, Any]:
-    """Return the file's mapping; of a bare matrix, or of bare fx fy cx cy, its numbers by name. Raises UserError on
-    what is no JSON or YAML, and on a key given twice."""
+    """Return the file's mapping; of bare numbers, these by name. Raises UserError on what is no JSON or YAML."""
     if not path.exists():
         raise UserError(f"{path}: no such file", legal=LEGAL_LENS)
     with damage_told(f"{path}: cannot be read", LEGAL_LENS, "give another file"):
@@ -242,10 +227,8 @@ def parsed_lens(path: Path) -> dict[str, Any]:
         except json.JSONDecodeError as error:
             raise UserError(f"{path}:{error.lineno}:{error.colno}: {error.msg}", legal=LEGAL_LENS) from error
         except DeclarationError as error:
-            first = error.problems[0]
-            raise UserError(
-                f"{first.place.head if first.place else path}: {first.message}", legal=LEGAL_LENS
-            ) from error
+            first, at = error.problems[0], error.problems[0].place
+            raise UserError(f"{at.head if at else path}: {first.message}", legal=LEGAL_LENS) from error
     if not isinstance(data, dict):
         raise UserError(f"{path}: holds no names with values", legal=LEGAL_LENS)
     return data

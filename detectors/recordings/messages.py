@@ -123,8 +123,6 @@ def frame_of_message(name: str, message: Any, scale_m: float) -> Frame:
         if packed is not None:  # 0x00RRGGBB
             bits = points[packed].astype(np.uint32)
             rgb = np.stack([bits >> 16 & 255, bits >> 8 & 255, bits & 255], axis=-1).astype(np.uint8)
-        elif all(key in have and have[key][0] == np.uint8 for key in "rgb"):
-            rgb = np.stack([points[key] for key in "rgb"], axis=-1)
         amplitude = next((points[field].astype(np.float32) for field in AMPLITUDE_FIELDS if field in have), None)
         frame = frame_of(name, stored, scale_m, rgb, amplitude)
     # NaN is these messages' code for "no return" (REP 118), which other files write as 0

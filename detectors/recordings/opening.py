@@ -13,19 +13,12 @@ import numpy as np
 from detectors.recordings.arrays import LOADERS, open_array_list, open_arrays, raw_layout_of
 from detectors.recordings.bags import BAG_SUFFIXES, ROS1_SUFFIX, is_bag, open_bag
 from detectors.recordings.clouds import CLOUDS, POINT_LISTS, open_clouds
-from detectors.recordings.depth_images import (
-    depth_named,
-    open_depth_folder,
-    open_depth_list,
-    png_kind,
-    png_texts,
-)
+from detectors.recordings.depth_images import depth_named, open_depth_folder, open_depth_list, png_kind
 from detectors.recordings.devices import is_stray, open_mkv, open_r3d, open_stray
 from detectors.recordings.distances import UNITS_M, Unit, decided_unit, metres_per_unit, scale_in
 from detectors.recordings.intrinsics import mappings, parsed_lens
 from detectors.recordings.recording import Asked, Recording, damage_told
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.files import PICTURE_BYTES, bounded_bytes
 from harness.vocabulary.geometry import OtherLens
 
 LEGAL_FORMATS = (
@@ -97,8 +90,6 @@ def _unit_not_stated(recording: Recording) -> Unit:
 def _statements_beside(files: Sequence[Path]) -> Iterator[tuple[Path, dict[str, Any]]]:
     """Yield the names and values in the JSON and YAML files in and above the folder of a capture's first file."""
     folders = dict.fromkeys((files[0].parent, files[0].parent.parent) if files else ())
-    if files and files[0].suffix.lower() == ".png":
-        yield files[0], png_texts(bounded_bytes(files[0], PICTURE_BYTES))
     for folder in folders:
         beside = (path for end in ("json", "yaml", "yml") for path in sorted(folder.glob(f"*.{end}")))
         for path in islice(beside, 20):

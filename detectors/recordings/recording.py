@@ -40,8 +40,7 @@ class Asked:
     """The user's statements about a capture. ``scale_m``: metres in one stored unit, None for the format's usual one.
     ``intrinsics``: a file with the depth pixels' lens, which counts before one that comes with the frames; ``lens``:
     the same as a value. ``frames`` selects frames by number. ``topic`` of a ROS bag. ``array``: NAME or NAME:NUMBER in
-    a file of arrays. ``pitch``: distance between the pixels of a height map (``0.5mm``). ``raw``: layout of bare
-    numbers."""
+    a file of arrays. ``pitch`` of a height map's pixels (``0.5mm``). ``raw``: layout of bare numbers."""
 
     scale_m: float | None = None
     intrinsics: Path | None = None
@@ -59,8 +58,8 @@ class Recording:
 
     ``read`` yields the frames in order; each call starts again. ``shape``: (height, width). ``files``: all whose
     content can change a number. ``scale_m``: metres in one stored unit, and ``unit_from`` who says so: "" where the
-    data shall decide. ``notes``: what the user should know about how the files were understood. ``warnings``: full
-    sentences on what makes the distances doubtful; every program shows them first. ``selection`` picks frames.
+    data shall decide. ``notes``: how the files were understood. ``warnings``: full sentences on what makes the
+    distances doubtful; every program shows them first. ``selection`` picks frames.
     """
 
     name: str

@@ -3,17 +3,17 @@
 Where it is judged whether the views belong together, `SHARED_M` allows for what range or lens are wrong by in one view
 alone. The covariance holds the noise, widened where the marks disagree by more than chance allows (Birge's ratio).
 
-The joint adjustment is one of bundles (Triggs et al., 2000) with one smooth surface in place of many points: in the
-plane the marks decide, across it the surface. Unknown are the poses of all views but the first, the surface z(x, y) (a
-cubic), the marks' places on it, and each view's own smooth error across it:
+The joint adjustment is one of bundles (Triggs et al., 2000) with one smooth surface in place of many points. Unknown
+are the poses of all views but the first, the surface z(x, y) (a cubic), the marks' places on it, and each view's own
+smooth error across it:
 
 z(T_v p) - S(x, y) - b_v(x, y) = noise for some 2000 target points p of each view v, and P (T_v c - M) = noise for each
 mark c of each view that is one of the reference's, in the surface's frame. Noise across is that of the sampling, with
 one independent value in 25 pixels; Tukey's weights keep holes out. b_v is what all pixels of a view share smoothly
-(wiggling, multipath): the ten terms of a cubic, with one prior deviation. A level or a tilt of it cannot be told from
-the pose's; the scatter of the seven other terms between views gives the deviation (by expectation maximisation), so
-that the poses' covariance holds the three. Where a camera's level wanders by more than its curvature, that is too
-little. Not modelled: errors of a view within the plane; a surface that no cubic follows; gross errors of marks."""
+(wiggling, multipath): a cubic, whose level and tilts cannot be told from the pose's; the scatter of the seven other
+terms between views gives their common deviation (by expectation maximisation), so that the covariance holds the three.
+Not modelled: errors of a view within the plane; a surface that no cubic follows; gross errors of marks.
+"""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ REFUSE_BELOW = 1e-4
 
 
 def register_by_marks(reference: PreparedView, view: PreparedView) -> registered.Registration:
-    """Return the pose of a view relative to the reference, from their trusted marks. ``overlap`` stays NaN. Never
-    raises for the content of the views: too few marks, marks on a line, marks that fit nowhere, in several ways, or
-    badly, are its ``failure``; the transform is then the best known, or else the guess, or else the identity."""
+    """Return the pose of a view relative to the reference, from their trusted marks; ``overlap`` stays NaN. Too few
+    marks, marks on a line, marks that fit nowhere, in several ways, or badly, are its ``failure``; the transform is
+    then the best known, or else the guess, or else the identity."""
     from scipy.special import gammaincc
 
     guess = registered.guess_of(reference, view)
@@ -53,10 +53,8 @@ def register_by_marks(reference: PreparedView, view: PreparedView) -> registered
     freedom = 3 * len(ours) - 6
     residual = float(np.sqrt((placement.residuals_m**2).sum(axis=1).mean()))
     if not problem and gammaincc(freedom / 2, _placed(ours, theirs, SHARED_M).chi2 / 2) < REFUSE_BELOW:
-        problem = (
-            f"the marks do not fit: {residual / MM:.1f} mm left over {len(ours)} marks, more than noise and"
-            f" {SHARED_M / MM:.0f} mm of each view's own error explain; other targets, or a mark that moved"
-        )
+        problem = f"the marks do not fit: {residual / MM:.1f} mm left over {len(ours)} marks, more than noise and"
+        problem += f" {SHARED_M / MM:.0f} mm of each view's own error explain; other targets, or a mark that moved"
     covariance = placement.covariance
     if gammaincc(freedom / 2, placement.chi2 / 2) < WIDEN_BELOW:
         ratio = float(np.sqrt(placement.chi2 / freedom))
@@ -78,8 +76,8 @@ def register_by_marks(reference: PreparedView, view: PreparedView) -> registered
 
 
 def held_out_error_m(reference: PreparedView, view: PreparedView) -> float | None:
-    """Return the root mean square distance between each matched mark and where the registration by the others puts it,
-    metres; None where fewer than four marks match, or where leaving one out leaves the rest on a line."""
+    """Return the root mean square distance (m) of each matched mark from where the registration by the others puts it;
+    None where fewer than four marks match, or where leaving one out leaves the rest on a line."""
     ours, theirs, problem, _ = _matched(reference, view)
     if problem or len(ours) < 4:
         return None
@@ -126,9 +124,8 @@ POSE_TERMS = 3
 
 @dataclass(frozen=True)
 class ViewData:
-    """One view's part: thinned target points (n, 3) and marks in its camera frame, and of each mark its index among the
-    reference's. ``noise_m``: of one point across the surface. ``sigma_m``: the same, so inflated that the points count
-    as if they were independent."""
+    """One view's part: thinned target points (n, 3) and marks in its camera frame, each with its index among the
+    reference's. ``noise_m``: of a point across the surface; ``sigma_m``: inflated as if points were independent."""
 
     points_m: np.ndarray
     marks: tuple[tuple[Mark, int], ...]
@@ -138,10 +135,10 @@ class ViewData:
 
 @dataclass(frozen=True)
 class JointState:
-    """Estimates of the unknowns: ``T`` (v, 4, 4) from the views to the surface's frame; ``surface`` (10,) and ``own``
-    (v, 10) coefficients, metres; ``marks_m`` (m, 2) places in the plane. ``shared_m``: prior deviation of each term of
-    ``own``. ``half_m`` (2,) scales x and y to -1..1. Vectors of all unknowns hold the poses of views 1.., the surface,
-    the marks, and the own errors of views 0.., in this order."""
+    """Estimates: ``T`` (v, 4, 4) from the views to the surface's frame; ``surface`` (10,) and ``own`` (v, 10)
+    coefficients, metres; ``marks_m`` (m, 2) places in the plane. ``shared_m``: prior deviation of each term of ``own``.
+    ``half_m`` (2,) scales x and y to -1..1. Vectors of all unknowns hold the poses of views 1.., surface, marks,
+    own."""
 
     T: np.ndarray
     surface: np.ndarray
@@ -214,9 +211,8 @@ class JointState:
 
 
 def register_jointly(views: Sequence[PreparedView]) -> list[registered.Registration]:
-    """Register views but the first to the first, from all views together. ``covariance`` is each view's marginal,
-    smooth errors of the views included; ``residual_m`` the root mean square across the surface of the points that
-    count. A view whose marks fail keeps that failure and takes no part."""
+    """Register views but the first to the first, from all views together. ``covariance``: each view's marginal;
+    ``residual_m``: across the surface, of the points that count. A view whose marks fail keeps that failure."""
     found = [register_by_marks(views[0], view) for view in views[1:]]
     usable = [i for i, each in enumerate(found) if not each.failure]
     if usable:
@@ -262,8 +258,7 @@ def _adjust(
     T_reference_surface = invert(T_surface_reference)
     both = np.kron(np.eye(2), T_reference_surface[:3, :3])
     note = (
-        f"each view's own smooth error is {state.shared_m / MM:.2f} mm (deviation of each term of a cubic), as the"
-        " views disagree; the covariance holds it"
+        f"each view's own smooth error is {state.shared_m / MM:.2f} mm in each term of a cubic; the covariance holds it"
     )
     adjusted = []
     for v, found in enumerate(by_marks, start=1):
@@ -287,7 +282,6 @@ def _adjust(
 
 
 def _view_data(view: PreparedView, reference: PreparedView) -> ViewData:
-    """The data of a view."""
     points = registered.thinned(view.points_m)
     noise = max(registered.sampling_of(view).noise_m, 1e-9)
     inflation = max(len(points) / registered.independent(int(view.inside.sum())), 1.0)

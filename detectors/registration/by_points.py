@@ -1,17 +1,17 @@
 """Registration of clouds: iterative closest point, rigid coherent point drift, RGB-D odometry.
 
-ICP goes coarse to fine from the guess. Point to point is what MATLAB's `pcregistericp` does by default; here pairs are
+ICP goes coarse to fine from the guess, point to point, as MATLAB's `pcregistericp` does by default; here pairs are
 limited in distance, MATLAB's are not.
 
 Coherent point drift (Myronenko & Song, TPAMI 32:2262, 2010, figure 2), without scale: the moving cloud's points are
-centres of Gaussians of one width, together with a uniform component for outliers; the fixed cloud is drawn from them.
-As MATLAB's `pcregistercpd` with Transform "Rigid": both clouds are set to zero mean, the start is the width of all
-pairs, the iteration stops after so many steps or when the log likelihood changes by no more than a share. The two
-clouds share one unit of length, and the start is the guess, of which only the turn matters.
+centres of Gaussians of one width, with a uniform component for outliers, from which the fixed cloud is drawn. As in
+MATLAB's `pcregistercpd` both clouds are set to zero mean and the start is the width of all pairs; the clouds share one
+unit of length, and of the guess only the turn matters.
 
 Odometry (Open3D's hybrid term; Park, Zhou & Koltun, ICCV 2017) sets each view against the one before it, starting from
-no motion, by colour and depth together; steps are composed to the first view, so that errors add up. Only the target is
-shown to it: on a turntable the room does not move with the target. No loop is closed, no map is kept."""
+no motion, by colour and depth together, so that errors add up. Only the target is shown to it: on a turntable the room
+does not move with the target. No loop is closed, no map is kept.
+"""
 
 from __future__ import annotations
 
@@ -22,12 +22,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from detectors.average import CORRELATED_PIXELS
 from detectors.marks.pairing import kabsch
 from detectors.open3d_library import open3d_on_one_thread
 from detectors.registration import registered
 from detectors.registration.settings import CpdRegistration, IcpRegistration
-from detectors.surface import SurfaceConfig, fit_surface
 from detectors.views import PreparedView
 from harness.vocabulary.geometry import MM, Lens, transform_points
 
@@ -36,15 +34,13 @@ GUESS_ERROR_M, GUESS_ERROR_RAD = 10 * MM, np.deg2rad(3.0)
 FINEST_PITCHES = 3.0
 """Limit of the last stage: a mark's rim is known to a pixel in either view, and noise and shared errors add one."""
 STAGE_ITERATIONS, LEAST_CHANGE = 100, 1e-8
-"""A stage ends after so many iterations, or with a smaller change of the share of points that have a partner and of
-the partners' root mean square distance in metres."""
+"""A stage ends after so many steps, or a smaller change of the share of paired points and of their distance in
+metres."""
 CONVERGED_PITCHES = 0.05
-SLOPE_STEP_M = 1 * MM
 
 
 def register_by_icp(reference: PreparedView, view: PreparedView, config: IcpRegistration) -> registered.Registration:
-    """Return the registration of a view to the reference by ICP of their fiducial clouds or targets. ``covariance``:
-    see `_covariance`."""
+    """Return the registration of a view to the reference by ICP of their fiducial clouds or targets."""
     from scipy.spatial import cKDTree
 
     fixed, moving, start, notes, few = registered.clouds_of(reference, view, config.points)
@@ -52,17 +48,16 @@ def register_by_icp(reference: PreparedView, view: PreparedView, config: IcpRegi
         return registered.failed(view, "icp", start, few, *notes)
     sampling = registered.sampling_of(view)
     tree = cKDTree(fixed)
-    local, real = _normals(reference, fixed) if config.estimation == "point_to_plane" else (None, None)
     T, moved, iterations, step_m = np.eye(4) if start is None else start, moving, 0, np.inf
     for limit_m in stages_m(sampling.pitch_m, sampling.extent_m):
         last = np.full(2, np.inf)
         for _ in range(STAGE_ITERATIONS):
             moved = transform_points(T, moving)
-            apart, paired, _ = _pairs(tree, local, moved, limit_m)
+            apart, paired = _pairs(tree, moved, limit_m)
             if paired.sum() < 3:
                 failure = f"no pairs: {paired.sum()} points lie within {limit_m / MM:.1f} mm of the reference's"
                 return registered.failed(view, "icp", start, failure, *notes)
-            change = _step(moved[paired], apart[paired], to_plane=local is not None)
+            change = kabsch(moved[paired], (moved - apart)[paired], np.ones(paired.sum()))
             T, step_m = change @ T, registered.moved_m(change, moved)
             iterations += 1
             now = np.array([paired.mean(), np.sqrt(np.mean(apart[paired] ** 2))])
@@ -72,8 +67,8 @@ def register_by_icp(reference: PreparedView, view: PreparedView, config: IcpRegi
     left, _, right = np.linalg.svd(T[:3, :3])
     T[:3, :3] = left @ right
     moved = transform_points(T, moving)
-    apart, paired, _ = _pairs(tree, local, moved, limit_m)
-    covariance = _covariance(tree, real, moved, limit_m, sampling.pitch_m)
+    apart, paired = _pairs(tree, moved, limit_m)
+    covariance = _covariance(tree, moved, limit_m, sampling.pitch_m)
     return registered.Registration(
         view=view.view.name,
         method="icp",
@@ -99,52 +94,26 @@ def stages_m(pitch_m: float, extent_m: float) -> tuple[float, ...]:
     return tuple(limits)
 
 
-def _pairs(
-    tree: Any, normals: np.ndarray | None, moved_m: np.ndarray, limit_m: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vectors (n, 3) to the partners that the method minimises, along the partners' ``normals`` if there are any (zero
-    without a partner), the mask (n,) of points that have a partner, and the partners' indices (n,)."""
+def _pairs(tree: Any, moved_m: np.ndarray, limit_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Vectors (n, 3) to the partners, zero without a partner, and the mask (n,) of points that have one."""
     distances, nearest = tree.query(moved_m, distance_upper_bound=limit_m)
     paired = np.isfinite(distances)
-    nearest = np.where(paired, nearest, 0)
-    apart = np.where(paired[:, None], moved_m - tree.data[nearest], 0.0)
-    if normals is not None:
-        apart = np.einsum("ni,ni->n", apart, normals[nearest])[:, None] * normals[nearest]
-    return apart, paired, nearest
+    return np.where(paired[:, None], moved_m - tree.data[np.where(paired, nearest, 0)], 0.0), paired
 
 
-def _step(moved_m: np.ndarray, apart_m: np.ndarray, to_plane: bool) -> np.ndarray:
-    """(4, 4) motion that brings points (n, 3) to their partners."""
-    if not to_plane:
-        return kabsch(moved_m, moved_m - apart_m, np.ones(len(moved_m)))
-    size = np.linalg.norm(apart_m, axis=1)
-    some = size > 0
-    centre = moved_m.mean(axis=0)
-    normals = apart_m[some] / size[some, None]
-    rows = np.einsum("ni,nij->nj", normals, registered.displacement_jacobian(moved_m[some], centre))
-    return registered.moved_by(np.linalg.lstsq(rows, -size[some], rcond=1e-6)[0], centre)
-
-
-def _covariance(
-    tree: Any, normals: np.ndarray | None, moved_m: np.ndarray, limit_m: float, pitch_m: float
-) -> np.ndarray:
-    """(6, 6) covariance of the pose, as `Registration` means it, about the moved points' centroid: H^-1 S H^-1. Point
-    to point: H is the cost's curvature with pairs found anew, by differences over one pitch (Bengtsson & Baerveldt,
-    Robotics and Autonomous Systems 44:29, 2003), because with pairs held fixed the inside of a flat mark would seem to
-    resist sliding. Point to plane: H is the closed form with pairs held fixed (Censi, ICRA 2007). S is the scatter of
-    the gradients, summed within cubes of 5 pixels whose errors are common. Not in it: that the iteration may stop at
-    one of many near minima. NaN where a motion costs nothing."""
+def _covariance(tree: Any, moved_m: np.ndarray, limit_m: float, pitch_m: float) -> np.ndarray:
+    """(6, 6) covariance of the pose, as `Registration` means it, about the moved points' centroid: H^-1 S H^-1. H is
+    the cost's curvature with pairs found anew, by differences over one pitch (Bengtsson & Baerveldt, Robotics and
+    Autonomous Systems 44:29, 2003), because with pairs held fixed the inside of a flat mark would seem to resist
+    sliding. S is the scatter of the gradients, summed within cubes of 5 pixels whose errors are common. Not in it: that
+    the iteration may stop at one of many near minima. NaN where a motion costs nothing."""
     arm = moved_m - moved_m.mean(axis=0)
     jacobian = registered.displacement_jacobian(arm, np.zeros(3))
-    apart, paired, nearest = _pairs(tree, normals, moved_m, limit_m)
-    scores = np.einsum("nij,ni->nj", jacobian, apart)
-    if normals is not None:
-        rows = np.einsum("ni,nij->nj", normals[nearest[paired]], jacobian[paired])
-        return registered.clustered_sandwich(rows.T @ rows, scores - scores.mean(axis=0), moved_m, pitch_m)
+    scores = np.einsum("nij,ni->nj", jacobian, _pairs(tree, moved_m, limit_m)[0])
 
     def half_cost(motion: np.ndarray) -> float:
         # a point without a partner counts as if it were at the limit
-        off, has, _ = _pairs(tree, None, moved_m + jacobian @ motion, limit_m)
+        off, has = _pairs(tree, moved_m + jacobian @ motion, limit_m)
         return float(np.sum(off**2) + limit_m**2 * np.sum(~has)) / 2
 
     # a step moves the points by a pitch, root mean square; a turn about an axis moves points by their distance from it
@@ -161,28 +130,6 @@ def _covariance(
     return registered.clustered_sandwich(curvature, scores - scores.mean(axis=0), moved_m, pitch_m)
 
 
-def _normals(reference: PreparedView, fixed_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Normals (n, 3) of the reference's target at its points: of the 25 nearest points, with their noise, as ICP uses
-    them; and what holds the pose, of the robust cubic through the target, and the local one only where it departs from
-    that by more than noise makes any of them depart (one cloud in a thousand). A noisy normal seems to hold a flat mark
-    in its plane, where nothing does."""
-    from scipy.spatial import cKDTree
-
-    target, (px, py, _) = reference.points_m, fixed_m.T
-    x, y, z = target.T
-    surface = fit_surface(x, y, z, SurfaceConfig(method="bisquare", degree=3 if len(target) >= 100 else 1))
-    smooth = -surface.gradients(px, py, SLOPE_STEP_M)
-    smooth /= np.linalg.norm(smooth, axis=1, keepdims=True)
-    count = min(CORRELATED_PIXELS, len(target))
-    local = registered.local_normals(target[cKDTree(target).query(fixed_m, k=count)[1]].reshape(len(fixed_m), count, 3))
-    local *= np.where(np.einsum("ni,ni->n", local, smooth) < 0, -1.0, 1.0)[:, None]
-    squared = np.sum((local - smooth) ** 2, axis=1)
-    # two axes: a squared length has a median of 2 ln 2 variances and exceeds 2 ln(1 / p) with chance p
-    variance = float(np.median(squared)) / (2 * np.log(2))
-    departs = squared > 2 * np.log(len(fixed_m) / 1e-3) * variance
-    return local, np.where(departs[:, None], local, smooth)
-
-
 LEAST_VARIANCE = 10 * float(np.finfo(np.float64).eps)
 """Variance in squared normalised units at which the clouds coincide (the authors' own criterion)."""
 PAIRS_AT_ONCE = 1 << 20  # pairs of points whose distances are held in memory
@@ -190,9 +137,9 @@ PAIRS_AT_ONCE = 1 << 20  # pairs of points whose distances are held in memory
 
 @dataclass(frozen=True)
 class Drift:
-    """The result of coherent point drift. ``T_fixed_moving`` (4, 4); ``sigma_m`` the Gaussians' width; ``matched`` the
-    expected number of fixed points that are no outliers; ``step_m`` how far the last iteration moved the points, root
-    mean square; ``background`` as `posterior_moments` takes it: a share, without unit."""
+    """The result of coherent point drift. ``T_fixed_moving`` (4, 4); ``sigma_m``: the Gaussians' width; ``matched``:
+    expected number of fixed points that are no outliers; ``step_m``: how far the last iteration moved the points;
+    ``background``: a share, as `posterior_moments` takes it."""
 
     T_fixed_moving: np.ndarray
     sigma_m: float
@@ -206,8 +153,7 @@ class Drift:
 def coherent_point_drift(
     fixed_m: np.ndarray, moving_m: np.ndarray, config: CpdRegistration, T_start: np.ndarray | None = None
 ) -> Drift:
-    """Register points ``moving_m`` (m, 3) to ``fixed_m`` (n, 3), each at least three. ``T_start`` (4, 4): moving to
-    fixed; the identity where not given."""
+    """Register points ``moving_m`` (m, 3) to ``fixed_m`` (n, 3), each at least three, from ``T_start`` (4, 4)."""
     start = np.eye(4) if T_start is None else T_start
     centre = fixed_m.mean(axis=0)
     scale = max(float(np.sqrt(np.sum(np.var(fixed_m, axis=0)))), 1e-12)
@@ -249,8 +195,7 @@ def coherent_point_drift(
 
 def register_by_cpd(reference: PreparedView, view: PreparedView, config: CpdRegistration) -> registered.Registration:
     """Return the registration of a view to the reference by coherent point drift of their fiducial clouds or targets.
-    Few iterations are the rule, so one that stops by their number fails only where its last step still moved the
-    points."""
+    It fails at the limit of iterations only where its last step still moved the points."""
     fixed, moving, start, notes, few = registered.clouds_of(reference, view, config.points)
     if few:
         return registered.failed(view, "cpd", start, few, *notes)
@@ -278,12 +223,11 @@ def register_by_cpd(reference: PreparedView, view: PreparedView, config: CpdRegi
 
 
 def drift_covariance(fixed_m: np.ndarray, moved_m: np.ndarray, drift: Drift, pitch_m: float) -> np.ndarray:
-    """Return the (6, 6) covariance of the pose, as `Registration` means it, about the fixed cloud's centroid. The
-    pixels of a surface are no independent draws, so it is H^-1 S H^-1 with H the observed information (complete
-    information less that which is missing because the correspondence is not known; Louis, JRSS B 44:226, 1982) and S
-    the scatter of the scores, summed within cubes of 5 pixels whose errors are common (Liang & Zeger, Biometrika 73:13,
-    1986). The moving cloud's noise is taken to be as large. Both are taken at a Gaussian width of no less than a pitch,
-    below which the likelihood shows how two grids of pixels beat. NaN where H is not positive definite."""
+    """Return the (6, 6) covariance of the pose, as `Registration` means it, about the fixed cloud's centroid: H^-1 S
+    H^-1 with H the observed information (Louis, JRSS B 44:226, 1982) and S the scatter of the scores, summed within
+    cubes of 5 pixels whose errors are common (Liang & Zeger, Biometrika 73:13, 1986). The moving cloud's noise is taken
+    to be as large. Both are taken at a Gaussian width of no less than a pitch, below which the likelihood shows how two
+    grids of pixels beat. NaN where H is not positive definite."""
     centre = fixed_m.mean(axis=0)
     x = fixed_m - centre
     variance = max(drift.sigma_m, pitch_m) ** 2
@@ -308,10 +252,10 @@ def drift_covariance(fixed_m: np.ndarray, moved_m: np.ndarray, drift: Drift, pit
 def posterior_moments(
     fixed: np.ndarray, moving: np.ndarray, variance: float, background: float
 ) -> tuple[np.ndarray, float]:
-    """Return (n, 4, 4) posterior sums of (y, 1)(y, 1)' over the moving points y (m, 3), where they stand now, for each
-    fixed point (n, 3); and the negative sum of the log likelihood over fixed points, up to the Gaussians' factor.
-    ``background``: the uniform component as in equation 6 of Myronenko & Song: (2 pi variance)^(3/2) w / (1 - w) m / n.
-    The nearest component's weight is divided out, so that nothing underflows at w = 0."""
+    """Return (n, 4, 4) posterior sums of (y, 1)(y, 1)' over the moving points y (m, 3) for each fixed point (n, 3); and
+    the negative sum of the log likelihood over fixed points, up to the Gaussians' factor. ``background``: the uniform
+    component as in equation 6 of Myronenko & Song: (2 pi variance)^(3/2) w / (1 - w) m / n. The nearest component's
+    weight is divided out, so that nothing underflows at w = 0."""
     from scipy.spatial.distance import cdist
 
     places = np.column_stack([moving, np.ones(len(moving))])

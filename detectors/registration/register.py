@@ -2,13 +2,13 @@
 
 Errors that a whole view shares (an offset, wiggling, the lens) show as a distance between registered views that noise
 does not explain. They widen the covariance and are noted; a view is refused only where they would blur the merged map
-by more than `BLUR_M`, or by more than a pixel where pixels are coarser. The limits follow from the sampling."""
+by more than `BLUR_M`, or by more than a pixel where pixels are coarser.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from time import perf_counter
 
 import numpy as np
@@ -27,8 +27,8 @@ FALSE_ALARM_SIGMAS = 3.09
 MEDIAN_SCATTER = 1.65
 """Relative error of a standard deviation from the median, over that from the mean square (1 / sqrt(0.37))."""
 BLUR_M = 2.0 * MM
-"""Distance between registered views beyond which a map of them is blurred too much: with two views each lies 1 mm from
-their mean, which is a time-of-flight camera's noise in a single frame."""
+"""Distance between registered views beyond which a map of them is blurred too much: the noise of a single frame,
+twice."""
 UNDETERMINED_PITCHES = 3.0
 """A predicted error over the target beyond this, and beyond `BLUR_M`, puts every point on a wrong pixel."""
 MAX_JUMP_DEG, MAX_JUMP_M = 30.0, 0.1
@@ -43,11 +43,10 @@ TRIMMED = 0.9
 class Agreement:
     """Agreement of a registered view with the reference target. ``beside`` and ``overlap``: share of the view's target
     points beside which the reference has a point within a pitch along the surface, at any distance across it, and at no
-    more than a pitch (or three sigma of noise) across. ``apart_m``: robust root mean square distance across the
-    surfaces where they lie beside each other. ``marks_m``: root mean square distance of the fiducial points to the
-    nearest of the reference, the farthest tenth left out; NaN where either has fewer than three. ``noise_m`` and
-    ``grids_m``: what noise, and two grids of one pitch, explain of these; ``scatter`` and ``marks_scatter`` the
-    relative errors of the two distances, times `FALSE_ALARM_SIGMAS`."""
+    more than a pitch (or three sigma of noise). ``apart_m``: robust root mean square distance across the surfaces where
+    they lie beside each other. ``marks_m``: that of the fiducial points to the nearest of the reference, the farthest
+    tenth left out; NaN where either has fewer than three. ``noise_m`` and ``grids_m``: what noise, and two grids of one
+    pitch, explain of these; ``scatter`` and ``marks_scatter``: their relative errors, times `FALSE_ALARM_SIGMAS`."""
 
     beside: float
     overlap: float
@@ -94,7 +93,7 @@ def judge(
     registration: registered.Registration, reference: PreparedView, view: PreparedView
 ) -> registered.Registration:
     """Return the registration with its overlap and, where it cannot be trusted, its ``failure`` or, for baselines, a
-    note. A failure that the method itself found stays as it is."""
+    note."""
     T = registration.T_reference_view
     broken = ""
     if not (np.isfinite(T).all() and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-6)):
@@ -109,9 +108,9 @@ def judge(
     if judged.failure:
         return judged
     if not agreement.beside >= registered.MIN_OVERLAP:
+        needed = f"{100 * registered.MIN_OVERLAP:.0f} % needed"
         elsewhere = (
-            f"the views do not overlap: {100 * agreement.beside:.0f} % of this view's target lies beside the"
-            f" reference's ({100 * registered.MIN_OVERLAP:.0f} % needed)"
+            f"the views do not overlap: {100 * agreement.beside:.0f} % of the view lies beside the reference ({needed})"
         )
     else:
         elsewhere = _jump(judged, reference, view)
@@ -122,10 +121,12 @@ def judge(
     undetermined, apart = "", _apart(agreement)
     if error_m > limit_m:
         undetermined = (
-            "not determined: the points let the target slide or turn (they lie on a line, or on a surface that slides"
-            f" in itself); the predicted error over the target is {error_m / MM:.1f} mm, which would blur the map (up"
-            f" to {limit_m / MM:.1f} mm are merged)"
+            "not determined: the points let the target slide or turn (they lie on a line, or the surface slides"
         )
+        undetermined += (
+            f" in itself); the predicted error over the target is {error_m / MM:.1f} mm, which would blur the"
+        )
+        undetermined += f" map (up to {limit_m / MM:.1f} mm are merged)"
     if judged.method in UNJUDGED_AGREEMENT:
         return replace(judged, failure=undetermined, notes=(*judged.notes, *([apart] if apart else [])))
     failure = "; ".join(reason for reason in (undetermined, apart) if reason)
@@ -143,10 +144,9 @@ def _jump(registration: registered.Registration, reference: PreparedView, view: 
     shift = np.linalg.norm(transform_points(registration.T_reference_view, centre) - transform_points(guess, centre))
     if turn <= MAX_JUMP_DEG and shift <= MAX_JUMP_M:
         return ""
-    return (
-        f"stands {turn:.0f} degrees and {shift / MM:.0f} mm from its guess (up to {MAX_JUMP_DEG:.0f} degrees and"
-        f" {MAX_JUMP_M / MM:.0f} mm are credible): marks matched wrongly, another target, or a wrong guess"
-    )
+    credible = f"up to {MAX_JUMP_DEG:.0f} degrees and {MAX_JUMP_M / MM:.0f} mm are credible"
+    stands = f"stands {turn:.0f} degrees and {shift / MM:.0f} mm from its guess ({credible})"
+    return f"{stands}: marks matched wrongly, another target, or a wrong guess"
 
 
 def _apart(agreement: Agreement) -> str:
@@ -162,19 +162,16 @@ def _apart(agreement: Agreement) -> str:
         limit = marks_limit
     else:
         return ""
-    return (
-        f"{said.format(f'{distance / MM:.1f}')}, which would blur the map (up to {limit / MM:.1f} mm are merged): a"
-        " wrong registration, or different targets"
-    )
+    blur = f"which would blur the map (up to {limit / MM:.1f} mm are merged)"
+    return f"{said.format(f'{distance / MM:.1f}')}, {blur}: a wrong registration, or different targets"
 
 
 def _widened(
     registration: registered.Registration, normal: np.ndarray, within: float, across: float, agreement: Agreement
 ) -> registered.Registration:
     """Return the registration with a covariance that includes the errors that a whole view shares, and a note, where
-    the views show such errors. Their mean square is the part of the distances between the views that neither noise nor
-    the covariance explains. It is added to the shift, across the surface and within it. An offset of a whole view does
-    not show: the registration absorbs it."""
+    the views show such errors. Their mean square, what neither noise nor the covariance explains of the distances, is
+    added to the shift, across the surface and within it. An offset of a whole view does not show."""
 
     def beyond_m(measured_m: float, explained_m: float, scatter: float) -> float:
         beyond = measured_m > explained_m * (1 + scatter)
@@ -192,19 +189,14 @@ def _widened(
     parts = [f"{m / MM:.2g} mm {way}" for m, way in ((more_across, "across"), (more_within, "along")) if m]
     note = (
         f"the views disagree by {' and '.join(parts)} the surface beyond what noise explains: an error that each view"
-        " shares (offset, wiggling, lens); the covariance is widened by it"
     )
+    note += " shares (offset, wiggling, lens); the covariance is widened by it"
     return replace(registration, covariance=covariance, notes=(*registration.notes, note))
 
 
-LOOP_POINTS = 500
-"""Number of points of the first view's target over which the error of a loop is averaged."""
-
-
 def register(views: Sequence[PreparedView], config: AnyRegistration) -> tuple[registered.Registration, ...]:
-    """Return one registration for each view; the first is that of the reference. Never raises for the content of the
-    views: a registration that cannot be trusted has a ``failure``. Raises UserError where the method needs something
-    that these views never have (colour, a pixel grid, a guess)."""
+    """Return one registration for each view; the first is that of the reference. A registration that cannot be trusted
+    has a ``failure``. Raises UserError where the method needs what a view lacks (colour, a pixel grid, a guess)."""
     if not views:
         raise UserError("no views to register", legal="one or more views, the first being the reference")
     _check_views(views, config)
@@ -222,7 +214,6 @@ def register(views: Sequence[PreparedView], config: AnyRegistration) -> tuple[re
 
 
 def _check_views(views: Sequence[PreparedView], config: AnyRegistration) -> None:
-    """Raise UserError where the method needs something that a view does not have."""
     by_colour = config.method != "nominal" and getattr(config, "points", "marks") == "marks"
     of_odometry = config.method == "odometry"
     for view in views:
@@ -239,7 +230,7 @@ def _check_views(views: Sequence[PreparedView], config: AnyRegistration) -> None
 
 
 def _pair(reference: PreparedView, view: PreparedView, config: AnyRegistration) -> registered.Registration:
-    """Return the registration of a view to a reference that need not be the first view, not judged yet."""
+    """Return the registration of a view to the reference, not judged yet."""
     started = perf_counter()
     if isinstance(config, IcpRegistration):
         found = register_by_icp(reference, view, config)
@@ -252,45 +243,3 @@ def _pair(reference: PreparedView, view: PreparedView, config: AnyRegistration) 
         guess = registered.guess_of(reference, view)
         found = registered.Registration(view.view.name, "nominal", np.eye(4) if guess is None else guess)
     return replace(found, seconds=perf_counter() - started)
-
-
-@dataclass(frozen=True)
-class LoopError:
-    """The closure error of a loop of three separately registered steps: ``rotation_deg`` of the composed transform, and
-    ``translation_m``, the root mean square displacement of the first view's target by it. NaN where a step failed;
-    ``failure`` names the step."""
-
-    views: tuple[str, str, str]
-    rotation_deg: float
-    translation_m: float
-    failure: str = ""
-
-
-def loop_errors(views: Sequence[PreparedView], config: AnyRegistration, most: int = 40) -> tuple[LoopError, ...]:
-    """Return the closure errors of loops i -> j -> k -> i, at most ``most`` of them, evenly taken from all. Every pair
-    is registered directly, with the guess that those of both views imply. The errors of the three steps add; an error
-    that a view brings equally into both of its registrations is not seen. Empty for fewer than three views. Raises
-    UserError as `register` does, and for methods that do not register pairs."""
-    if config.method in ("nominal", "joint", "odometry"):
-        raise UserError(
-            f"loops cannot be closed with {config.method}: it does not register pairs of views separately",
-            legal="icp, cpd, marks",
-        )
-    _check_views(views, config)
-    loops = list(combinations(range(len(views)), 3))
-    loops = loops[:: max(1, -(-len(loops) // most))]
-    sides = sorted({pair for i, j, k in loops for pair in ((i, j), (j, k), (i, k))})
-    placed = {(i, j): judge(_pair(views[i], views[j], config), views[i], views[j]) for i, j in sides}
-    names = [view.view.name for view in views]
-    errors = []
-    for i, j, k in loops:
-        steps = [((a, b), placed[a, b]) for a, b in ((i, j), (j, k), (i, k))]
-        failures = [f"{names[b]} to {names[a]}: {step.failure}" for (a, b), step in steps if step.failure]
-        turn, shift = float("nan"), float("nan")
-        if not failures:
-            T_ij, T_jk, T_ik = (step.T_reference_view for _, step in steps)
-            closed = T_ij @ T_jk @ invert(T_ik)
-            turn = float(np.rad2deg(np.linalg.norm(closed[:3, :3] - np.eye(3)) / np.sqrt(2)))
-            shift = registered.moved_m(closed, registered.thinned(views[i].points_m, LOOP_POINTS))
-        errors.append(LoopError((names[i], names[j], names[k]), turn, shift, "; ".join(failures)))
-    return tuple(errors)

@@ -21,11 +21,11 @@ SLIDES = "not determined: the points can slide or turn without matching worse, a
 class Registration:
     """The pose of a view relative to the reference view. ``T_reference_view`` (4, 4), rigid, no scale. ``covariance``
     (6, 6) of a small error (w, t): a point p of the reference frame is wrong by w x (p - ``centre_m``) + t, radians and
-    metres; NaN where the method has no estimate. It contains the errors that the method knows: noise of its points, not
-    an error that a whole view shares. ``residual_m``: root mean square of the minimised distances. ``overlap``: share
-    of the view's target points that lie within a pixel's pitch of the reference's target, 0..1. ``failure``: why the
-    view must not be merged; empty where it may. ``pairs``: marks or points that were matched. ``seconds``: time that
-    this registration took (an equal share where all views are registered together)."""
+    metres; NaN where the method has no estimate. It holds the noise of the method's points, not an error that a whole
+    view shares. ``residual_m``: root mean square of the minimised distances. ``overlap``: share of the view's target
+    points that lie within a pixel's pitch of the reference's target. ``failure``: why the view must not be merged;
+    empty where it may. ``pairs``: marks or points that were matched. ``seconds``: time taken (an equal share where
+    views are registered together)."""
 
     view: str
     method: str
@@ -43,7 +43,7 @@ class Registration:
 
 
 def reference_registration(view: str, method: str) -> Registration:
-    """Return the registration of the first view to itself: the identity, known exactly."""
+    """Return the registration of the first view to itself: the identity."""
     return Registration(view, method, np.eye(4), np.zeros((6, 6)), residual_m=0.0, overlap=1.0)
 
 
@@ -85,8 +85,7 @@ def moved_by(motion: np.ndarray, centre_m: np.ndarray) -> np.ndarray:
 
 def predicted_error_m(registration: Registration, points_m: np.ndarray, normal: np.ndarray) -> tuple[float, float]:
     """Return the root mean square target registration error over points (n, 3) of the reference frame that the
-    covariance predicts: in the plane normal to the unit vector ``normal`` (3,), and across it. NaN without a
-    covariance."""
+    covariance predicts, in the plane normal to the unit vector ``normal`` (3,) and across it; or NaN."""
     jacobian = displacement_jacobian(points_m, registration.centre_m)
     spread = (jacobian @ registration.covariance @ np.swapaxes(jacobian, 1, 2)).mean(axis=0)
     across = float(normal @ spread @ normal)
@@ -96,8 +95,7 @@ def predicted_error_m(registration: Registration, points_m: np.ndarray, normal: 
 def clustered_sandwich(curvature: np.ndarray, scores: np.ndarray, points_m: np.ndarray, pitch_m: float) -> np.ndarray:
     """Return the covariance (6, 6) H^-1 S H^-1; S is the sum over cubes of points (n, 3) of the outer square of their
     summed scores (n, 6). ``curvature`` H (6, 6) and ``scores`` belong to the same objective, in any unit. NaN where H
-    is not positive definite to working precision, or where there are too few cubes to see a scatter in six
-    directions."""
+    is not positive definite, or where there are too few cubes."""
     # rotations and shifts compared at the points' own arm, so that definiteness does not depend on units
     arm = max(float(np.sqrt(np.sum(np.var(points_m, axis=0)))), 1e-12)
     unit = np.array([1 / arm] * 3 + [1.0] * 3)
@@ -132,10 +130,9 @@ THINNED_POINTS = 2000
 
 @dataclass(frozen=True)
 class Sampling:
-    """One view's target, camera frame of the view, metres. ``pitch_m``: median distance between neighbouring points,
-    the longer way of the grid. ``noise_m``: standard deviation of one point across the surface, fixed pattern included,
-    smooth errors not. ``centre_m`` (3,), ``normal`` (3,): of the plane through the points, towards the camera.
-    ``extent_m``: half the diagonal of the points' box."""
+    """One view's target, camera frame, metres. ``pitch_m``: median distance between neighbouring points, the longer way
+    of the grid. ``noise_m``: standard deviation of a point across the surface, fixed pattern included. ``centre_m``,
+    ``normal`` (3,): of the plane through the points, towards the camera. ``extent_m``: half the box' diagonal."""
 
     pitch_m: float
     noise_m: float
@@ -178,7 +175,7 @@ def clouds_of(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, tuple[str, ...], str]:
     """Return what registrations of points start from: those of the fiducials or of the whole target, of the reference
     and of the view, each (n, 3) with at most `MAX_POINTS`; the guess (4, 4), a note where there is none, and the reason
-    why they cannot be registered (fewer than three points in either), empty where they can."""
+    why they cannot be registered, empty where they can."""
     fixed, moving = (
         thinned(each.mark_points_m if points == "marks" else each.points_m, MAX_POINTS) for each in (reference, view)
     )
@@ -224,8 +221,7 @@ def _on_grid(cloud: Cloud, inside: np.ndarray) -> tuple[float, float]:
 
 
 def _without_grid(points_m: np.ndarray) -> tuple[float, float]:
-    """Pitch, and noise from the distances of points to the plane through their 25 nearest points, which removes 3 of 25
-    parts of the variance; 0 where there are too few points."""
+    """Pitch, and noise by the distances of points to the plane through their 25 nearest; 0 where there are too few."""
     from scipy.spatial import cKDTree
 
     if len(points_m) < 2:

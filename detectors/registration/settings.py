@@ -10,11 +10,10 @@ from harness.vocabulary.config import Config
 
 
 class IcpRegistration(Config):
-    """Iterative closest point, from the guess."""
+    """Iterative closest point, point to point, from the guess."""
 
     method: Literal["icp"] = "icp"
     points: Literal["marks", "target"] = "marks"
-    estimation: Literal["point_to_point", "point_to_plane"] = "point_to_point"
 
 
 class CpdRegistration(Config):
@@ -29,9 +28,8 @@ class CpdRegistration(Config):
 
 class PlainRegistration(Config):
     """Methods without settings. ``nominal``: the guesses as they are. ``marks``: centroids of marks, matched by their
-    mutual distances, weighted by their covariances. ``joint``: marks and the common surface of all views together, from
-    the marks' registration. ``odometry``: RGB-D odometry from view to view (Open3D), no marks: a SLAM system without
-    loop closure."""
+    mutual distances. ``joint``: marks and the common surface of all views together. ``odometry``: RGB-D odometry from
+    view to view (Open3D), no marks: a SLAM system without loop closure."""
 
     method: Literal["nominal", "marks", "joint", "odometry"]
 

@@ -147,8 +147,6 @@ def _calls(expected: float) -> str:
 
 START_FROM_MARKS = ("icp", "cpd")
 """Methods that need a place to start from; `joint` finds its own, `odometry` goes from view to view."""
-LOOPING = ("marks", "icp", "cpd")
-"""Methods that register any two views to each other by themselves, so that going round a loop can be wrong."""
 
 
 @dataclass(frozen=True)
@@ -303,14 +301,13 @@ def _merged(
         pose = "correct --poses where it is wrong" if has_poses else "state where they stand (--poses)"
         raise UserError(said, fix=f"leave such views out, {pose}, or choose another --register or --marks")
     mapped = Mapped(tuple(prepared), registrations, merge(tuple(prepared), registrations, config.merge))
-    return mapped, _registration_data(config, mapped)
+    return mapped, _registration_data(mapped)
 
 
-def _registration_data(config: MappingConfig, mapped: Mapped) -> dict[str, Any]:
+def _registration_data(mapped: Mapped) -> dict[str, Any]:
     """Return the registrations as plain data (metres in matrices, millimetres elsewhere) with checks that need no
-    truth: marks held out, errors predicted over the reference's target, and loops of three views."""
+    truth: marks held out, and errors predicted over the reference's target."""
     from detectors.registration.by_marks import held_out_error_m
-    from detectors.registration.register import loop_errors
     from detectors.registration.registered import plane_through, predicted_error_m, thinned
 
     reference = mapped.views[0]
@@ -337,7 +334,6 @@ def _registration_data(config: MappingConfig, mapped: Mapped) -> dict[str, Any]:
             "notes": each.notes,
         }
 
-    is_looping = config.registration.method in LOOPING and len(mapped.views) > 2
     return {
         "results_version": RESULTS_VERSION,
         "reference": reference.view.name,
@@ -349,15 +345,6 @@ def _registration_data(config: MappingConfig, mapped: Mapped) -> dict[str, Any]:
         },
         "T_reference_cloud": np.asarray(mapped.merged.T_reference_cloud).tolist(),
         "views": list(map(row, mapped.views, mapped.registrations)),
-        "loops": [
-            {
-                "views": loop.views,
-                "rotation_deg": loop.rotation_deg,
-                "translation_mm": loop.translation_m / MM,
-                "failure": loop.failure,
-            }
-            for loop in (loop_errors(mapped.views, config.registration) if is_looping else ())
-        ],
     }
 
 

@@ -115,7 +115,9 @@ def choice_facts(choice: Choice | None) -> dict[str, Any] | None:
     candidates = [
         {
             "number": n,
-            **{f"{name}_mm": getattr(each, f"{name}_m") / MM for name in ("distance", "nearest", "farthest")},
+            **{
+                f"{name}_mm": m / MM for name, m in zip(("nearest", "distance", "farthest"), each.depths_m, strict=True)
+            },
             "extent_mm": [side / MM for side in each.extent_m],
             "share_of_view": each.share,
             "tilt_deg": each.tilt_deg,
@@ -139,7 +141,7 @@ def pictures(choice: Choice | None, name: str = "targets.png") -> dict[str, Call
 
 
 def print_registrations(data: Mapping[str, Any]) -> None:
-    """Print ``data`` of registrations.json: a table with a view a line, then notes and loops."""
+    """Print ``data`` of registrations.json: a table with a view a line, then notes."""
     columns = {
         "residual mm": ("residual_mm", 3), "overlap": ("overlap", 2), "in plane mm": ("predicted_in_plane_mm", 3),
         "across mm": ("predicted_across_mm", 3), "held out mm": ("held_out_mark_mm", 3), "pairs": ("pairs", 0),
@@ -152,12 +154,6 @@ def print_registrations(data: Mapping[str, Any]) -> None:
     show([Grid.of(("view", "method", *columns), rows, left=0)])
     for row in data["views"]:
         print_notes(f"{row['view']}: {note}" for note in row["notes"])
-    if closed := [loop for loop in data["loops"] if not loop["failure"]]:
-        worst = max(closed, key=lambda loop: loop["translation_mm"])
-        off = f"{worst['translation_mm']:.3g} mm and {worst['rotation_deg']:.3f} degrees from where it began"
-        print(f"loops: {len(closed)} of three views; the worst, {' - '.join(worst['views'])}, ends {off}")
-    broken = [loop for loop in data["loops"] if loop["failure"]]
-    print_notes(f"the loop {' - '.join(loop['views'])} is open: {loop['failure']}" for loop in broken)
 
 
 def threshold_text(threshold: float, evidence: Evidence) -> str:
