@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy import ndimage, optimize, stats
+from scipy import ndimage, optimize, special
 
 from detectors.interface import Detection, Detector, Evidence
 from detectors.masks import grown, holes_filled, parts_with
@@ -94,7 +94,7 @@ def own_threshold(detector: Detector, cloud: Cloud, evidence: Evidence, false_ca
     while True:
         tail, half = Tail.of(falling, floor), len(falling) // 2
         seen = int((falling > tail.threshold(number)).sum())
-        if half < FEWEST_PEAKS or stats.poisson.sf(seen - 1, number) > CONTRADICTED:
+        if half < FEWEST_PEAKS or special.gammainc(seen, number) > CONTRADICTED:
             break
         falling, floor = falling[:half], float(falling[half])
     threshold = max(tail.threshold(number), LEAST)

@@ -51,7 +51,7 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
 
 @pytest.fixture(scope="session")
 def tiny_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished sweep before the thesis' target, with tiny.yaml beside the folder; not to be changed."""
+    """A finished sweep before the thesis' target, by worker processes, with tiny.yaml beside it; not to be changed."""
     from tiny_sweep import TINY, finished
 
     return made_once(tmp_path_factory, "sweep", lambda home: finished(home, TINY)) / "out"
@@ -59,10 +59,10 @@ def tiny_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def study_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished study of random boards, likewise."""
+    """A finished study of random boards, by one process, likewise."""
     from tiny_sweep import STUDY, finished
 
-    return made_once(tmp_path_factory, "study", lambda home: finished(home, STUDY)) / "out"
+    return made_once(tmp_path_factory, "study", lambda home: finished(home, STUDY, "--serial")) / "out"
 
 
 @pytest.fixture(scope="session")

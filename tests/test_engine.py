@@ -122,7 +122,7 @@ def test_a_half_finished_sweep_resumes_to_the_same_numbers(finished, tmp_path):
     assert len(lines) == 4
     journal.write_text(f"{first}\n{lines[2]}\n{lines[1][:100]}")  # the last line is half written
     (folder / "trials.parquet").unlink()
-    done = sweep(finished.parent / "tiny.yaml", half)
+    done = sweep(finished.parent / "tiny.yaml", half, "--serial")
     assert done.returncode == 0, done.stderr
     said = json.loads((folder / "provenance.json").read_text())
     assert said["trials"] == {"done": 3, "resumed": 1, "failed": 0}
@@ -134,7 +134,7 @@ def test_interrupted_sweep_keeps_what_is_finished_and_says_how_to_go_on(finished
     """Ctrl-C after the first finished trial of many: exit 130, the journal whole, the command to resume told."""
     cut = tmp_path / "cut"
     shutil.copytree(finished / ".cache", cut / ".cache")
-    command = sweep_command(finished.parent / "tiny.yaml", cut, "--set", "repeats=400")
+    command = sweep_command(finished.parent / "tiny.yaml", cut, "--set", "repeats=400", "--jobs", "1")
     process = subprocess.Popen(
         command, cwd=ROOT, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
     )
@@ -157,7 +157,7 @@ def test_workers_end_with_a_driver_that_is_killed(finished, tmp_path):
     """SIGKILL to the driver alone, in the middle of its trials: soon no process of the sweep is left."""
     cut = tmp_path / "killed"
     shutil.copytree(finished / ".cache", cut / ".cache")
-    command = sweep_command(finished.parent / "tiny.yaml", cut, "--set", "repeats=400")
+    command = sweep_command(finished.parent / "tiny.yaml", cut, "--set", "repeats=400", "--jobs", "1")
     marked = os.environ | {"TOFPOD_TEST_OF": str(cut)}
     process = subprocess.Popen(command, cwd=ROOT, env=marked, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 900
@@ -226,7 +226,7 @@ def test_missing_file_and_unwritable_folder(finished, tmp_path):
 
 def test_missing_llvm_is_one_message(finished, tmp_path):
     environment = os.environ | {"DRJIT_LIBLLVM_PATH": str(tmp_path / "libLLVM.so")}
-    command = sweep_command(finished.parent / "tiny.yaml", tmp_path / "out")
+    command = sweep_command(finished.parent / "tiny.yaml", tmp_path / "out", "--jobs", "1")
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=environment, timeout=900)
     assert done.returncode == 2
     assert "Traceback" not in done.stderr

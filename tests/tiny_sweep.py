@@ -72,10 +72,10 @@ def sweep(yaml: Path, out: Path, *arguments: str) -> Done:
     return Done(code, told.getvalue(), warned.getvalue())
 
 
-def finished(home: Path, text: str) -> Path:
+def finished(home: Path, text: str, *arguments: str) -> Path:
     """Run an experiment as ``home/tiny.yaml``; returns the folder of results, ``home/out``."""
     (home / "tiny.yaml").write_text(text)
-    done = sweep(home / "tiny.yaml", home / "out")
+    done = sweep(home / "tiny.yaml", home / "out", *arguments)
     assert done.returncode == 0, done.stderr
     (home / "told.txt").write_text(done.stdout)
     return home / "out"

@@ -186,11 +186,11 @@ def _plan(statement: PodStatement) -> tuple[tuple[float, float], Callable[[Figur
 
 def draw_pod(axes: Axes, statement: PodStatement) -> None:
     """Curve, band, data and the sizes read off."""
-    curve, sizes = statement.curve, statement.sizes
+    curve, sizes, (lower, upper) = statement.curve, statement.sizes, statement.band
     confidence = f"{statement.bound.confidence:.0%}".replace("%", " %")
-    axes.fill_between(sizes, statement.lower, statement.upper, color=BLUE, alpha=0.16, lw=0)
-    axes.plot(sizes, statement.lower, color=BLUE, lw=0.9, ls="--", label=f"{confidence} band, {statement.bound.method}")
-    axes.plot(sizes, statement.upper, color=BLUE, lw=0.9, ls="--")
+    axes.fill_between(sizes, lower, upper, color=BLUE, alpha=0.16, lw=0)
+    axes.plot(sizes, lower, color=BLUE, lw=0.9, ls="--", label=f"{confidence} band, {statement.bound.method}")
+    axes.plot(sizes, upper, color=BLUE, lw=0.9, ls="--")
     axes.plot(sizes, curve.pod(sizes), color=BLUE, lw=2.0, label=f"POD, {statement.model}")
     axes.axhline(POD, color=GREY, lw=0.8, ls=":")
     if statement.signal is None:

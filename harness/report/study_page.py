@@ -64,7 +64,7 @@ def draw_overlay(figure: Figure, limits: Sequence[SetUpLimit]) -> None:
         name = plain(fill(names[number], LONGEST_NAME))
         if statement is not None:
             line = STYLES[number // len(COLOURS) % len(STYLES)]
-            axes.fill_between(statement.sizes, statement.lower, statement.upper, color=colour, alpha=0.1, lw=0)
+            axes.fill_between(statement.sizes, *statement.band, color=colour, alpha=0.1, lw=0)
             axes.plot(statement.sizes, statement.curve.pod(statement.sizes), line, color=colour, label=name)
         else:
             axes.plot([], [], color=colour, label=f"{name}: no curve")

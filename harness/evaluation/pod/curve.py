@@ -43,7 +43,8 @@ def logs_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarr
     """ln F, ln(1 - F) and ln f (the density) at the predictor, each of its shape and exact in both tails."""
     t = np.clip(predictor, -LARGEST_PREDICTOR, LARGEST_PREDICTOR)
     if link == "logit":
-        log_hit, log_miss = -np.logaddexp(0.0, -t), -np.logaddexp(0.0, t)
+        tail = np.log1p(np.exp(-np.abs(t)))
+        log_hit, log_miss = np.minimum(t, 0.0) - tail, np.minimum(-t, 0.0) - tail
         return log_hit, log_miss, log_hit + log_miss
     if link == "probit":
         return special.log_ndtr(t), special.log_ndtr(-t), -0.5 * t * t - 0.5 * np.log(2.0 * np.pi)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -62,9 +63,8 @@ class ModelRow:
 class PodStatement:
     """Statement on inspections, as ``read``; sizes are in ``unit``. ``fits``: of hits, the models over which bound and
     band are the widest, that of the curve first; ``signal``: the regression, None of hits; ``models``: all that were
-    tried; ``independent``: the bound had every row been a target of its own, None where it was; ``sizes``, ``lower``,
-    ``upper`` (m,) the band to be drawn; ``numbers``: what else the fit says; ``tests``: (what, p-value, how it
-    reads)."""
+    tried; ``independent``: the bound had every row been a target of its own, None where it was; ``numbers``: what else
+    the fit says; ``tests``: (what, p-value, how it reads)."""
 
     read: Inspections
     kind: str
@@ -74,9 +74,6 @@ class PodStatement:
     models: tuple[ModelRow, ...]
     bound: Bound
     independent: Bound | None
-    sizes: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
     numbers: dict[str, float]
     notes: tuple[str, ...]
     tests: tuple[tuple[str, float, str], ...]
@@ -95,6 +92,18 @@ class PodStatement:
     def a90(self) -> float:
         """Size found 90 % of the time."""
         return self.curve.size_at(POD)
+
+    @cached_property
+    def sizes(self) -> np.ndarray:
+        """Sizes (`DRAWN`,) at which the curve and its band are drawn."""
+        return drawn_sizes(self.read.size, self.curve.log_size, (self.a90, self.bound.value))
+
+    @cached_property
+    def band(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper edges (`DRAWN`,) of the band; made when it is drawn, because it takes long."""
+        if self.signal:
+            return ahat_band(self.signal, self.sizes, CONFIDENCE)
+        return widest_band(self.fits, self.sizes)
 
     @property
     def model(self) -> str:
@@ -175,9 +184,7 @@ def state_hits(
             independent = largest_bound([fit_hit_miss(size, hit, link=of, log_size=log) for of, log in axes])
         tests = floor_ceiling_tests(fit) if tested else ()
         models = [(one, bound(one, POD, CONFIDENCE)) for one in tried]
-        limit = largest_bound(near)
-        sizes = drawn_sizes(size, curve.log_size, (curve.size_at(POD), limit.value))
-        lower, upper = widest_band(near, sizes)
+        limit = max((limit for one, limit in models if one in near), key=lambda limit: limit.value)
 
     if fit.targets < LEAST_TARGETS:
         notes.append(f"{fit.targets} independent targets; MIL-HDBK-1823A asks for at least {LEAST_TARGETS}")
@@ -199,7 +206,7 @@ def state_hits(
     numbers |= {"targets": float(fit.targets), "hits": float(fit.hits)}
     numbers |= false_positives(read)
     what = (read, "hit/miss", unit, near, None, _models(models, near), limit, independent)
-    return PodStatement(*what, sizes, lower, upper, numbers, tuple(notes), tuple(said))
+    return PodStatement(*what, numbers, tuple(notes), tuple(said))
 
 
 def state_signals(
@@ -221,7 +228,6 @@ def state_signals(
         raise UserError(f"{read.path}: the axes asked for need logarithms of values <= 0", fix=fix)
     fit, curve = fits[0], fits[0].curve
     limit = ahat_bound(fit, POD, CONFIDENCE)
-    sizes = drawn_sizes(read.size, fit.log_size, (curve.size_at(POD), limit.value))
     rows = ahat_bound(fit, POD, CONFIDENCE, rows_are_targets=True) if fit.targets < fit.n else None
     (of_mu, common), (_, of_sigma) = curve.covariance.tolist()
     numbers = {"b0": fit.b0, "b1": fit.b1, "tau": fit.tau, "mu": curve.mu, "sigma": curve.sigma}
@@ -233,8 +239,7 @@ def state_signals(
     reads = {True: f"doubtful at {LEVEL:.0%}", False: f"nothing against it at {LEVEL:.0%}"}
     said = [(f"{one.assumption} ({one.test})", one.p_value, reads[one.p_value < LEVEL]) for one in diagnose(fit)]
     what = (read, "signal against size", unit, (), fit, _models(models, (fit,)), limit, rows)
-    band, notes = ahat_band(fit, sizes, CONFIDENCE), (*read.notes, *fit.notes)
-    return PodStatement(*what, sizes, *band, numbers, notes, tuple(said))
+    return PodStatement(*what, numbers, (*read.notes, *fit.notes), tuple(said))
 
 
 def _models(tried: Sequence[tuple[Any, Bound]], near: Sequence[Any]) -> tuple[ModelRow, ...]:
