@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from pydantic import Field, model_validator
 
-from detectors.masks import grown, holes_filled, inset, nearest_pixel
+from detectors.masks import grown, holes_filled, inset, nearest_pixel, notches_filled
 from detectors.smooth_surfaces import Surfaces, raster, smooth_surfaces
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
@@ -37,6 +37,9 @@ SURROUNDED, BORDERING, STEP_PART = 0.7, 0.1, 0.3
 """Part of the outline that borders on what a thing lies on; of neighbours; of a border that must be a step."""
 CUT_OFF = 0.15
 """Part of its outline on the edge of the picture from which on a surface goes on outside of it, as walls and floors."""
+NOTCHES_PX = (8, 16)
+"""Radii of the discs that close the outline's notches: a strip of up to some 8 pixels between a hole and the edge is
+taken for the edge's own blur, and the hole opens to the outside. Wider gaps are the part's own shape."""
 ENCLOSED, MOST_SAMPLES = 0.9, 20_000
 
 
@@ -99,6 +102,12 @@ class Candidate:
             edge = grown(~holes_filled(grown(self.grid.valid, 2)), 3)
         return int(np.count_nonzero(outline & edge)) / max(int(np.count_nonzero(outline)), 1)
 
+    def continues(self, other: Candidate, apart_m: float) -> bool:
+        """Return whether this flat surface and the other lie in one plane, but for ``apart_m`` at nine in ten."""
+        normal, middle = self._plane[1][:, 0], self._some.mean(axis=0)
+        off_m = [np.quantile(np.abs((each._some - middle) @ normal), 0.9) for each in (self, other)]
+        return bool(max(off_m) <= apart_m)
+
     @property
     def _facing(self) -> float:
         return min(abs(float(self._plane[1][2, 0])), 1.0)
@@ -146,7 +155,7 @@ def described_text(candidate: Candidate) -> str:
 
 
 def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...], list[str]]:
-    """Return the candidates, best odds first, and what makes the first doubtful."""
+    """Return the candidates, best odds first, and warnings of taking the first."""
     numbers = range(len(surfaces.own))
     outlines = zip(surfaces.own, surfaces.filled, strict=True)
     described = [Candidate(own, filled, filled, grid) for own, filled in outlines]
@@ -196,8 +205,11 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
     order = sorted(numbers, key=lambda number: (-odds[number], number))
     candidates = []
     for number in order:
-        # without what it encloses and what stands before it as a target of its own; a thing that lies on it stays
+        # with holes whose rim the edge cuts; without what it encloses and what stands before it as a target of its
+        # own; a thing that lies on it stays
         outline = described[number].outline
+        for radius_px in NOTCHES_PX:
+            outline = notches_filled(outline, radius_px)
         for other in numbers:
             border = borders[other].get(number)
             if border and border.is_step and table[other][number][0] >= 0.5 and encloses(number, other):
@@ -209,6 +221,15 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
         for place, probability, why in against
         if probability < DOUBTFUL_BELOW
     ]
+    doubts = [f"it is doubtful which surface is the target: {'; '.join(doubts)}"] if doubts else []
+    further = [
+        str(n) for n, each in enumerate(candidates[1:], start=2) if candidates[0].continues(each, surfaces.contact_m)
+    ]
+    if further:
+        doubts.append(
+            f"target {' and '.join(further)} lies in the plane of target 1 and may be a part of it: it is not judged"
+            " (--target takes it)"
+        )
     return tuple(candidates), doubts
 
 
@@ -356,8 +377,7 @@ def choice_of(cloud: Cloud, config: AutoCrop) -> Choice:
     if not cloud.organised:
         kept, mask = mask, cloud.valid.copy()
         mask[mask] = kept[rows, columns]
-    warnings = (f"it is doubtful which surface is the target: {'; '.join(doubts)}",) if doubts and not wanted else ()
-    return Choice(candidates, taken, mask, grid, warnings)
+    return Choice(candidates, taken, mask, grid, () if wanted else tuple(doubts))
 
 
 def _box(cloud: Cloud, config: BoxCrop) -> np.ndarray:

@@ -24,6 +24,18 @@ def holes_filled(mask: np.ndarray) -> np.ndarray:
     return np.asarray(image[1:-1, 1:-1] != 2)
 
 
+def notches_filled(mask: np.ndarray, radius_px: int) -> np.ndarray:
+    """Return the mask, which encloses its holes, with the notches of its outline: gaps that a closing with a disc of
+    ``radius_px`` closes and that hold a disc of a quarter of it, as a hole does that the edge cuts. The roundings that
+    a closing leaves in right-angled corners hold less (0.17)."""
+    side = 2 * radius_px + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    closed = cv2.morphologyEx(np.pad(mask.astype(np.uint8), side), cv2.MORPH_CLOSE, kernel)[side:-side, side:-side]
+    gaps = holes_filled(closed > 0) & ~mask
+    depths = cv2.distanceTransform(np.pad(gaps, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
+    return mask | parts_with(gaps, depths > 1 + radius_px / 4, connectivity=4)
+
+
 def grown(mask: np.ndarray, pixels: int, shape: int = cv2.MORPH_RECT) -> np.ndarray:
     """Return the mask with all pixels so near to it: in a square, or in OpenCV's ``shape``."""
     kernel = cv2.getStructuringElement(shape, (2 * pixels + 1, 2 * pixels + 1))

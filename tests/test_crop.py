@@ -171,6 +171,31 @@ def test_the_board_is_found_before_a_broken_background_with_its_damage_inside() 
     assert mask[70, 90]
 
 
+def test_a_deep_hole_at_the_edge_stays_in_the_outline() -> None:
+    z = np.full((150, 200), 1.2)
+    board = np.zeros(z.shape, dtype=bool)
+    board[30:120, 40:170] = True
+    z[board] = 0.7
+    v, u = np.mgrid[:150, :200]
+    hole = (u - 100) ** 2 + (v - 41) ** 2 < 100  # its rim is two pixels from the edge
+    z[hole] += 0.03
+    z += 5e-4 * np.random.default_rng(0).standard_normal(z.shape)
+    mask = crop(cloud_of(z), AutoCrop())
+    assert mask[hole & (v > 34)].mean() > 0.95  # the inset takes the opening's rim
+    assert not mask[~board].any()
+
+
+@pytest.mark.parametrize("strip", [True, False])
+def test_a_part_behind_a_strip_is_told(strip: bool) -> None:
+    z = np.full((150, 200), 1.2)
+    z[30:120, 20:180] = 0.7
+    if strip:
+        z[:, 120:128] = 0.4
+    z += 5e-4 * np.random.default_rng(0).standard_normal(z.shape)
+    warnings = choice_of(cloud_of(z), AutoCrop()).warnings
+    assert any("lies in the plane of target 1" in warning for warning in warnings) == strip
+
+
 def test_a_crease_ends_the_surface() -> None:
     u = np.arange(200)
     floor_and_wall = np.broadcast_to(np.where(u < 120, 0.8, 0.8 + 0.006 * (u - 120)), (150, 200)).copy()

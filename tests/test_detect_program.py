@@ -258,6 +258,16 @@ def test_the_crop_decides_what_is_searched(capture: Path, tmp_path: Path, crop: 
     assert len(rows_of(tmp_path / "out" / "findings.csv")) == found
 
 
+@pytest.mark.parametrize(("left_u_px", "is_cut"), [(45, False), (plane.HOLE_U, True)])
+def test_a_finding_that_the_crop_cuts_is_told_first(
+    capture: Path, capsys: pytest.CaptureFixture[str], left_u_px: float, is_cut: bool
+) -> None:
+    corners = f"{left_u_px},2,80,2,80,60,{left_u_px},60"
+    assert detect.main([str(capture), "--crop", f"polygon:{corners}", "--threshold", "8"]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("warning: findings that reach the rim of the judged area (1)") == is_cut
+
+
 def test_settings_reach_the_detector(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     own = ["--detector", "thesis", "--set", "scale=highest_before"]
     assert detect.main([str(capture), *own, "--average", "median"]) == 0

@@ -141,6 +141,25 @@ def with_faint_told(judged: Judged, threshold: float) -> Judged:
     return replace(judged, evidence=evidence)
 
 
+def with_cut_told(judged: Judged) -> Judged:
+    """Add a warning where findings reach the rim of what is judged: the rest of them was not seen."""
+    from detectors.masks import grown, holes_filled
+
+    if not judged.cloud.organised:
+        return judged
+    outside = np.pad(~holes_filled(np.isfinite(judged.evidence.residual_m)), 1, constant_values=True)
+    cut = []
+    for finding, detection in zip(judged.findings, judged.detections, strict=True):
+        own = np.zeros(judged.cloud.valid.size, bool)
+        own[detection.pixels] = True
+        if (grown(np.pad(own.reshape(judged.cloud.valid.shape), 1), 1) & outside).any():
+            cut.append(str(finding.id))
+    if not cut:
+        return judged
+    warning = f"findings that reach the rim of the judged area ({', '.join(cut)}) may be larger than their stated sizes"
+    return replace(judged, evidence=replace(judged.evidence, warnings=(*judged.evidence.warnings, warning)))
+
+
 def _calls(expected: float) -> str:
     return f"{expected:.1f}" if expected >= 0.1 else f"{expected:.1g}" if expected >= 1e-4 else "0"
 
@@ -218,7 +237,7 @@ def inspect(arguments: argparse.Namespace) -> int:
         evidence = replace(evidence, warnings=(*doubted, *evidence.warnings))
     threshold, origin, evidence = threshold_of(arguments, detector, cloud, evidence, silent_threshold)
     result = judged(detector, cloud, evidence, threshold)
-    result = result if mapped else with_faint_told(result, threshold)
+    result = with_cut_told(result if mapped else with_faint_told(result, threshold))
     seen = seen_on(gauge, result) if gauge else None
     found = (mapped, registrations, detector, settings, result, threshold, origin, seen)
     run = Inspection(arguments, recordings, choices, config, *found)
