@@ -51,7 +51,7 @@ Guess = tuple["PodCurve", str, tuple[float, float], float | None]
     "analyse them as real ones would be, and say which a90/95 to expect, how many targets it takes, and which "
     "sizes to make.",
     epilog="example: python -m harness.design --a50 5 --a90 7 --sizes 2 12 --goal 9. Takes about 5 ms a "
-    "simulated study; there are two placements for each number of targets.",
+    "simulated study.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0 (also where no plan shows a limit), 2 on a mistake of the user, 130 after Ctrl-C."""
@@ -71,7 +71,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     # its mistakes come before the simulation's minute; `_check` has asked for the area
     free = plan.hole_free(wanted, board_m2 or 0.0) if wanted is not None else None
     plans = plan.design(curve, sorted(set(options.targets)), sizes, studies=options.studies, seed=1)
-    found = (plans, plan.recommend(plans, options.goal), options.goal, free)
+    found = (plans, *plan.recommend(plans, options.goal), options.goal, free)
     design = StudyDesign(curve, origin, "mm" if options.unit is None else options.unit, sizes, *found)
     show(design_parts(design))
     if options.out is not None:

@@ -66,7 +66,7 @@ def main(options: argparse.Namespace, command: str) -> int:
         raise UserError(f"--targets {options.targets}", legal="10 to 600 holes")
     curve = _curve(options)
     # evenly spread: sizes crowded where the study's curve rises tell nothing where the real curve rises elsewhere
-    (chosen,) = plan.design(curve, [options.targets], (low, high), placements=("uniform",), studies=100, seed=SEED)
+    (chosen,) = plan.design(curve, [options.targets], (low, high), studies=100, seed=SEED)
     if not low < (wrong_mm := PRIOR_SIZE * curve.size_at(0.9)) < high:
         were = f"were the curve's a90 too small by a factor of {PRIOR_SIZE:g}, it would be {wrong_mm:.3g} mm"
         print(f"warning: {were}, and no hole of {low:g} to {high:g} mm would show it: choose other --diameters")

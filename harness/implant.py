@@ -79,8 +79,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.evaluation.study.result import evaluate_study
     from harness.inspection.arguments import detector_of, opened
     from harness.inspection.run import analysed, refuse_thresholds, threshold_of
-    from harness.report.study_page import study_parts, write_study_report
-    from harness.tables.outputs import PROVENANCE, STUDY
+    from harness.report.study_page import study_html, study_parts
+    from harness.tables.outputs import PROVENANCE, REPORT, STUDY
     from harness.tables.study import study_tables
     from harness.tables.text import show
     from harness.vocabulary.declaration.yaml_source import to_yaml
@@ -142,7 +142,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     write_text(options.out / STUDY.name, record_text(study))
     write_tables(options.out, {table: table.frame(rows) for table, rows in study_tables(result).items()}, provenance)
     write_text(options.out / PROVENANCE.name, json.dumps(provenance, indent=2) + "\n")
-    page = write_study_report(options.out, result, (), provenance, to_yaml(facts), title)
+    page = options.out / REPORT.name
+    write_text(page, study_html(result, (), provenance, to_yaml(facts), title))
     show([*(f"warning: {text}" for text in (COMPARED, *warnings)), *study_parts(result)])
     print(f"report: {page}")
     return 0

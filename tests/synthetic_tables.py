@@ -155,9 +155,7 @@ def example(frames: int = 50, shape: str = "bowl", variant: str = "main", noise_
     residual[:3, :5] = np.nan
     inside = np.ones((height, width), bool)
     inside[:, :2] = False
-    turn = np.linspace(0, 2 * np.pi, 33)[:, None]
-    rims = tuple([h.u_px, h.v_px] + h.radius_px * np.hstack([np.cos(turn), np.sin(turn)]) for h in truth)
-    return ExampleCloud(frames, variant, residual, detected, inside, tuple(truth), z_truth, rims)
+    return ExampleCloud(frames, variant, residual, detected, inside, tuple(truth), z_truth)
 
 
 def provenance() -> dict[str, object]:

@@ -16,14 +16,7 @@ from hypothesis import strategies as st
 from harness.design import FILES, main
 from harness.evaluation.intervals import false_call_rate, threshold_for_rate
 from harness.evaluation.pod.curve import LINKS
-from harness.evaluation.pod.design import (
-    CALLS,
-    StudyPlan,
-    curve_through,
-    design,
-    hole_free,
-    recommend,
-)
+from harness.evaluation.pod.design import StudyPlan, curve_through, design, hole_free, recommend
 from harness.evaluation.study.limit import limit_of
 from harness.evaluation.study.record import record_text
 from harness.vocabulary.errors import UserError
@@ -68,29 +61,18 @@ def test_logit_by_hand() -> None:
 # ---- what is recommended ---------------------------------------------------------------------------------------------
 
 
-def plans(*told: tuple[int, str, float]) -> list[StudyPlan]:
-    """(targets, placement, 90 % quantile)."""
-    first = StudyPlan(60, "uniform", 0.9, 0.95, "likelihood ratio", 20, 7.0, 7.5, 7.0, 8.0, 1.0, np.arange(60.0), ())
-    return [replace(first, targets=n, placement=placed, high=high) for n, placed, high in told]  # type: ignore[arg-type]
+def plans(*told: tuple[int, float]) -> list[StudyPlan]:
+    """(targets, 90 % quantile)."""
+    first = StudyPlan(60, 0.9, 0.95, "likelihood ratio", 20, 7.0, 7.5, 7.0, 8.0, 1.0, np.arange(60.0))
+    return [replace(first, targets=n, high=high) for n, high in told]
 
 
 def test_recommends_the_fewest_that_are_sure_of_the_goal() -> None:
-    known = plans((30, "uniform", 7.9), (60, "uniform", 9.0), (120, "uniform", 8.4), (240, "uniform", 8.0))
-    assert recommend(known).plan is known[1], "without a wish the handbook's minimum"
-    wish = recommend(known, 8.5)
-    assert (wish.plan, wish.enough, wish.reaches) == (known[2], True, True)
-    vain = recommend(known, 7.5)
-    assert (vain.plan, vain.reaches) == (known[3], False), "30 targets are no study, whatever they seem to show"
-    short = recommend(known[:1])
-    assert (short.plan, short.enough, short.reaches) == (known[0], False, None)
-
-
-def test_concentrates_only_where_it_is_worth_it() -> None:
-    close, far = (plans((60, "uniform", 9.0), (60, "concentrated", high)) for high in (8.6, 8.5))
-    assert recommend(close).plan.placement == "uniform"
-    assert recommend(far).plan.placement == "concentrated"
-    endless = plans((60, "uniform", np.inf), (60, "concentrated", np.inf))
-    assert recommend(endless, 8.0).plan.placement == "uniform"
+    known = plans((30, 7.9), (60, 9.0), (120, 8.4), (240, 8.0))
+    assert recommend(known) == (known[1], None), "without a wish the handbook's minimum"
+    assert recommend(known, 8.5) == (known[2], True)
+    assert recommend(known, 7.5) == (known[3], False), "30 targets are no study, whatever they seem to show"
+    assert recommend(known[:1]) == (known[0], None)
 
 
 # ---- hole-free boards ------------------------------------------------------------------------------------------------
@@ -108,10 +90,9 @@ def test_the_fewest_boards_are_what_the_rule_of_thresholds_takes(rate: float, ar
 
 def test_areas_bound_the_rate_exactly() -> None:
     found = hole_free(1.0, 0.25, 0.9)
-    assert found.areas_m2[0] == pytest.approx(-np.log(0.1)), "exp(-area) = 0.1"
-    for calls, area in zip(CALLS, found.areas_m2, strict=True):
-        assert false_call_rate(calls, area, 0.9).upper_per_m2 == pytest.approx(1.0, rel=1e-9)
-    assert [found.boards(area) for area in (0.25, 0.26, 3.0)] == [1, 2, 12]
+    assert found.silent_m2 == pytest.approx(-np.log(0.1)), "exp(-area) = 0.1"
+    assert false_call_rate(0, found.silent_m2, 0.9).upper_per_m2 == pytest.approx(1.0, rel=1e-9)
+    assert found.silent_boards == 10
 
 
 # ---- the program -----------------------------------------------------------------------------------------------------
@@ -120,17 +101,14 @@ def test_areas_bound_the_rate_exactly() -> None:
 def test_what_it_says(capsys: pytest.CaptureFixture[str]) -> None:
     said = answered(capsys, *TOLD, *FEW, "--goal", "11")
     expected = design(GUESS, (30, 60), (2.0, 12.0), studies=20, seed=1)
-    assert [(one["targets"], one["placement"]) for one in said["plans"]] == [
-        (number, placed) for number in (30, 60) for placed in ("uniform", "concentrated")
-    ]
+    assert [one["targets"] for one in said["plans"]] == [30, 60]
     assert [one["bound"] for one in said["plans"]] == [plan.bound for plan in expected]
     assert [one["sizes"] for one in said["plans"]] == [plan.sizes.tolist() for plan in expected]
-    chosen = recommend(expected, 11.0)
-    assert [one["recommended"] for one in said["plans"]] == [plan is chosen.plan for plan in expected]
+    chosen, _ = recommend(expected, 11.0)
+    assert [one["recommended"] for one in said["plans"]] == [plan is chosen for plan in expected]
     assert said["recommendation"].startswith("Make 60 targets")
     assert said["unflawed_sites"] == 180
     assert (said["guess"]["a50"], said["guess"]["a90"]) == pytest.approx((5.0, 7.0))
-    assert any("60 independent targets" in note and "40 where signals" in note for note in said["notes"])
 
 
 def test_a_goal_out_of_reach_says_what_it_would_take(capsys: pytest.CaptureFixture[str]) -> None:
@@ -164,10 +142,10 @@ def test_files_are_repeatable_and_whole(tmp_path: Path, capsys: pytest.CaptureFi
     assert first[1].startswith(b"\x89PNG")
     page, other = (one[2].decode() for one in (first, second))
     assert page.replace(str(tmp_path / "a"), str(tmp_path / "b")) == other
-    assert page.count("<details") == 4
+    assert page.count("<details") == 2
     assert "Make 60 targets" in page and "http" not in page.replace("http://www.w3.org", "")
     data = json.loads(first[0])
-    assert " ".join(f"{size:.4g}" for size in data["plans"][2]["sizes"]) in page
+    assert " ".join(f"{size:.4g}" for size in data["plans"][1]["sizes"]) in page
 
 
 def test_no_limit_at_all_is_said_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -246,7 +246,7 @@ def test_the_oracle_scores_one_everywhere(finished, tmp_path, monkeypatch):
     assert record.set_ups[0].unflawed.calls.sum() == 0
     assert tables.findings["score"].eq(1).all()
     assert len(tables.findings) == len(tables.holes)
-    assert one.roc[0].area == 1.0
+    assert one.roc.area == 1.0
     assert one.pixels is not None
     assert one.pixels.pro == 1.0
 

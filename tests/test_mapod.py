@@ -12,7 +12,7 @@ from synthetic_study import SetUp, Study, study_record
 
 from harness import pod
 from harness.evaluation.pod.curve import PodCurve
-from harness.evaluation.pod.design import curve_through, place_sizes
+from harness.evaluation.pod.design import curve_through, even_sizes
 from harness.evaluation.pod.inspections import Inspections
 from harness.evaluation.pod.statement import state_hits
 from harness.evaluation.pod.transfer import Mapod, Transfer
@@ -70,12 +70,13 @@ def test_the_limit_covers_the_truth_whatever_the_camera(k: float, w: float, leas
     """Share of campaigns of 30 holes whose quoted limit is no less than the true a90; 0.95 is what it says, and 120
     campaigns know it to 0.02."""
     curve, truth = simulated(), wrong_by(simulated(), k, w)
-    size = place_sizes(curve, 30, (2.0, 12.0), "uniform")
+    size = even_sizes(30, (2.0, 12.0))
     random, covered, shorter = np.random.default_rng(5), [], []
     for _ in range(120):
         hit = (random.random(30) < truth.pod(size)).astype(float)
         read = Inspections(Path("campaign"), "size", "hit", size, hit, None, np.arange(30))
-        found = Mapod.of("one", replace(statement_of(curve), curve=curve), "", read)
+        stated = statement_of(curve)
+        found = Mapod.of("one", replace(stated, fits=(replace(stated.fits[0], curve=curve),)), "", read)
         covered.append(found.a90_95 >= truth.size_at(0.9))
         if found.measured is not None:
             shorter.append(found.steps[-1].a90_95 / found.measured.bound.value)
@@ -93,7 +94,7 @@ def statement_of(curve: PodCurve):
 def test_the_program_corrects_a_study(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     record = study_record(Study((SetUp(a50_mm=5.0, width_mm=0.8),), boards=30))
     (tmp_path / "study.json").write_text(record_text(record))
-    truth, size = curve_through(6.0, 7.6), place_sizes(curve_through(5.0, 7.0), 24, (2.0, 12.0), "uniform")
+    truth, size = curve_through(6.0, 7.6), even_sizes(24, (2.0, 12.0))
     hit = np.random.default_rng(2).random(24) < truth.pod(size)
     rows = [f"{a:.3f},{'hit' if h else 'miss'},{'AB'[n % 2]}" for n, (a, h) in enumerate(zip(size, hit, strict=True))]
     table = tmp_path / "real.csv"

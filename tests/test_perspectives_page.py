@@ -67,8 +67,7 @@ def test_every_section_is_there_and_nothing_comes_from_outside(page):
         "Failures",
         "Provenance",
     ]
-    for name in ("tre", "merged"):
-        assert f'<figure id="{name}">' in page
+    assert '<figure id="tre">' in page
     assert "No data for this figure" not in page
     assert "<script src" not in page and page.count("<script>") == 1  # the page's own: contents, sorting
     assert not re.findall(r'(?:src|href)="(?:https?:)?//(?!www\.w3\.org)', page)
@@ -105,13 +104,6 @@ def test_a_variation_stands_beside_its_set_up_though_its_frames_differ(page):
     row = text_of(row[: row.index("</tbody>")])
     assert ">≠<" in row
     assert "5 of 11 <small>7–11" in row
-
-
-def test_without_pictures_the_page_says_so(small):
-    bare = perspectives_html(small, [], About(provenance(), YAML, "T"))
-    assert text_of(bare).count("No data for this figure were kept") == 1
-    for name in ("merged",):
-        assert f'<figure id="{name}">' not in bare
 
 
 def test_nothing_finished_is_said(found):

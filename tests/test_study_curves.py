@@ -12,7 +12,7 @@ from scipy import special, stats
 from synthetic_study import PIXEL_GRID, RADIUS_MM, THRESHOLD, SetUp, Study, Tables, study_record, study_tables
 
 from harness.evaluation.intervals import false_call_rate
-from harness.evaluation.study.curves import chance_hits, free_response, pixel_curves, roc_curves
+from harness.evaluation.study.curves import chance_hits, free_response, pixel_curves, roc_curve
 from harness.evaluation.study.limit import SetUpLimit, limit_of, surface_of
 from harness.evaluation.study.record import SetUpRecord
 from harness.evaluation.study.result import FRAMES, axis_lines, difference
@@ -49,11 +49,8 @@ class TestChance:
 
     def test_findings_that_count_for_damage_are_no_chance(self):
         tables = two_boards([("damaged", 1, 0.0, 0.0, "b")])
-        rate = false_call_rate(0, 100.0)
-        found = chance_hits(tables.holes, tables.sites, tables.runs, tables.findings, 5.0, rate)
+        found = chance_hits(tables.holes, tables.sites, tables.runs, tables.findings, 5.0)
         assert found.probability == 0
-        # none seen is no certainty: Poisson's upper bound of 0 calls, 2.9957 / 100 m2, on a circle of 5 mm
-        assert found.interval.high == pytest.approx(2.9957 / 100 * np.pi * 0.005**2, rel=1e-4)
 
     def test_the_radius_is_included(self):
         tables = two_boards([("hole_free", 9, 0.0, 5.0, "")])
@@ -64,52 +61,39 @@ class TestChance:
         rate = false_call_rate(int(LOUD * 7.5), 7.5)
         found = chance_hits(loud.holes, loud.sites, loud.runs, loud.findings, RADIUS_MM, rate)
         expected = -np.expm1(-LOUD * np.pi * (RADIUS_MM / 1000) ** 2)
-        assert found.expected == pytest.approx(expected, rel=1e-12) and found.expected_upper > expected
-        assert found.interval.low < expected < found.interval.high
+        assert found.expected == pytest.approx(expected, rel=1e-12)
+        assert found.probability == pytest.approx(expected, rel=0.3)
         assert found.laid == 240 * 59
         assert found.sites == 240 and found.sites_interval.low < expected < found.sites_interval.high
         assert found.of_sites == loud.sites["detected"].mean()
-
-    def test_pod_by_sight_alone(self, loud):
-        found = chance_hits(loud.holes, loud.sites, loud.runs, loud.findings, RADIUS_MM)
-        blind = dataclasses.replace(found, probability=0.2)
-        assert blind.without(0.6) == pytest.approx(0.5) and blind.without(0.1) == 0 and blind.without(1.0) == 1
-        assert np.isnan(found.expected)
 
     def test_repeats_of_a_site_are_shares_of_it(self):
         tables = two_boards([])
         sites = pd.DataFrame({"board": [9, 9, 8], "hole": "a", "repeat": [0, 1, 0], "detected": [True, False, False]})
         found = chance_hits(tables.holes, sites, tables.runs, tables.findings, 5.0)
-        assert (found.found, found.sites, found.of_sites) == (0.5, 2, 0.25)
+        assert (found.sites, found.of_sites) == (2, 0.25)
 
 
 class TestRoc:
     def test_area_is_that_of_the_rank_test(self, loud):
-        curve = roc_curves(loud.holes, loud.sites, THRESHOLD, 6.0, 8.0)[0]
+        curve = roc_curve(loud.holes, loud.sites, THRESHOLD)
         positive, negative = loud.holes["signal"].to_numpy(), loud.sites["signal"].to_numpy()
         ranks = stats.mannwhitneyu(positive, negative).statistic / (len(positive) * len(negative))
         assert curve.area == pytest.approx(ranks, rel=1e-12)
         assert np.trapezoid(curve.true, curve.false) == pytest.approx(ranks, rel=1e-9)
-        assert curve.area_interval.low < curve.area < curve.area_interval.high
         assert curve.at == ((negative > THRESHOLD).mean(), (positive > THRESHOLD).mean())
 
     def test_ties_and_unjudged_places_by_hand(self):
         """Signals 2, 1, none against 1, none: won 2 + 1.5 + 0.5 of 6."""
         holes = pd.DataFrame({"board": [0, 1, 1], "true_diameter_mm": 5.0, "signal": [2.0, 1.0, np.nan]})
         sites = pd.DataFrame({"board": [8, 9], "signal": [1.0, np.nan]})
-        curve = roc_curves(holes, sites, 0.5, np.nan, np.nan)[0]
+        curve = roc_curve(holes, sites, 0.5)
         assert curve.area == pytest.approx(4 / 6)
         assert curve.at == (0.5, pytest.approx(2 / 3))
         assert (curve.false[0], curve.true[0], curve.false[-1], curve.true[-1]) == (0, 0, 1, 1)
 
-    def test_classes_part_the_damages(self, loud):
-        curves = roc_curves(loud.holes, loud.sites, THRESHOLD, 6.0, 8.0)
-        assert [one.name for one in curves] == ["all sizes", "below a50", "a50 to a90", "a90 and above"]
-        assert sum(one.damages for one in curves[1:]) == curves[0].damages == 240
-        assert curves[1].area < curves[2].area < curves[3].area
-
     def test_none_without_sites(self, loud):
-        assert roc_curves(loud.holes, loud.sites.iloc[:0], THRESHOLD, 6.0, 8.0) == ()
+        assert roc_curve(loud.holes, loud.sites.iloc[:0], THRESHOLD) is None
 
 
 class TestFreeResponse:
@@ -158,12 +142,11 @@ class TestFreeResponse:
 
 class TestPixels:
     def test_equal_normal_scores(self, loud):
-        """Face N(0, 1), damage N(2, 1): AUROC = Phi(2 / sqrt 2), overlap = Phi(2 - z) where the face's rate is f."""
+        """Face N(0, 1), damage N(2, 1): overlap = Phi(2 - z) where the face's rate is f."""
         curves = pixel_curves(loud.pixels)
-        assert curves.auroc == pytest.approx(stats.norm.cdf(np.sqrt(2)), abs=5e-4)
         rate = np.linspace(1e-9, 0.3, 200_001)
         assert curves.pro == pytest.approx(np.trapezoid(stats.norm.sf(stats.norm.isf(rate) - 2), rate) / 0.3, abs=1e-3)
-        assert curves.why == "" and curves.pro_interval.known
+        assert curves.why == ""
 
     def test_by_hand(self):
         """Two damages of 1 and 9 pixels: at a rate of 0.1 the small one is covered, the large one not; then both."""
@@ -172,9 +155,6 @@ class TestPixels:
         curves = pixel_curves(pixels)
         # overlap: 0 -> 0.5 over 0.1, then 0.5 -> 1 over 0.4, cut at 0.3 where it is 0.75
         assert curves.pro == pytest.approx((0.1 * 0.25 + 0.2 * 0.625) / 0.3)
-        # share of damaged pixels: 0.1 at 0.1, 1 at 0.5
-        assert curves.auroc == pytest.approx(0.1 * 0.05 + 0.4 * 0.55 + 0.5)
-        assert not curves.pro_interval.known
 
     def test_thresholds_that_end_early_give_no_overlap_score(self, loud):
         above = [counts[PIXEL_GRID > 1.0] for counts in loud.pixels["above"]]
@@ -190,26 +170,6 @@ class TestSurface:
     def study(self, **changes: float) -> Study:
         return Study((SetUp(**changes),), depths_mm=(2.0, 10.0), hole_free_boards=0)
 
-    @pytest.mark.slow
-    def test_a_known_plane_is_found(self):
-        """Hits drawn 15 times from logit = -18 + 9 ln a + 3 ln d on 30 boards: percentiles of so few boards hold the
-        truth in some 87 % of studies, so fewer than 11 of 15 in 4 % of such tests."""
-        record = study_record(Study(boards=30, depths_mm=(2.0, 10.0), hole_free_boards=0)).set_ups[0]
-        seen, true = record.inspected, np.array([-18.0, 9.0, 3.0])
-        predictor = true[0] + true[1] * np.log(seen.diameter_mm) + true[2] * np.log(seen.depth_mm)
-        slopes, sizes = [], []
-        for seed in range(15):
-            hit = np.random.default_rng(seed).random(len(predictor)) < special.expit(predictor)
-            again = dataclasses.replace(record, inspected=dataclasses.replace(seen, hit=hit))
-            surface, why = surface_of(again, draws=100)
-            assert why == ""
-            middle = len(surface.depth_mm) // 2
-            a90 = np.exp((special.logit(0.9) - true[0] - true[2] * np.log(surface.depth_mm[middle])) / true[1])
-            slopes.append(surface.depth_slope_interval.low < 1 / 3 < surface.depth_slope_interval.high)
-            sizes.append(surface.a90_low_mm[middle] < a90 < surface.a90_high_mm[middle])
-            assert surface.pod(surface.a90_mm, surface.depth_mm) == pytest.approx(0.9, abs=1e-9)
-        assert sum(slopes) >= 11 and sum(sizes) >= 11
-
     def test_agrees_with_statsmodels(self):
         sm = pytest.importorskip("statsmodels.api")
         seen = (record := study_record(self.study(mm_per_depth_mm=0.4)).set_ups[0]).inspected
@@ -219,10 +179,6 @@ class TestSurface:
         fit = sm.GLM(seen.hit.astype(float), np.column_stack(columns), family=sm.families.Binomial(link)).fit()
         assert surface.b[:3] == pytest.approx(fit.params, rel=1e-5) and surface.b[3] == 0
         assert surface.deviance == pytest.approx(fit.deviance, rel=1e-9)
-
-    def test_depth_that_does_not_matter_has_no_slope(self):
-        surface, _ = surface_of(study_record(self.study()).set_ups[0])
-        assert surface.depth_slope_interval.low < 0 < surface.depth_slope_interval.high
 
     def drawn(self, predictor: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> SetUpRecord:
         """Hits of chance expit(predictor(ln a, ln d)) on the study's damage."""
@@ -244,10 +200,9 @@ class TestSurface:
         assert surface.b == pytest.approx(fit.params, rel=1e-4)
         assert surface.deviance == pytest.approx(fit.deviance, rel=1e-9)
 
-    def test_contours_in_both_directions_are_of_one_surface(self):
-        """POD is 90 % on both, and the depths fall as the diameter grows."""
+    def test_on_the_contour_the_pod_is_as_stated(self):
+        """The depths fall as the diameter grows."""
         surface, _ = surface_of(self.drawn(lambda a, d: -8.0 + 1.0 * a + 0.5 * d + 2.5 * a * d), draws=50)
-        assert surface.pod(surface.a90_mm, surface.depth_mm) == pytest.approx(0.9, abs=1e-9)
         reached = np.isfinite(surface.d90_mm)
         assert surface.pod(surface.diameter_mm, surface.d90_mm)[reached] == pytest.approx(0.9, abs=1e-9)
         assert reached.sum() > 15 and np.all(np.diff(surface.d90_mm[reached]) < 0)
@@ -255,7 +210,8 @@ class TestSurface:
 
     @pytest.mark.slow
     def test_the_depth_found_holds_the_truth(self):
-        """Drawn 15 times from logit = -18 + 9 ln a + 3 ln d: as `test_a_known_plane_is_found`, for the depth."""
+        """Drawn 15 times from logit = -18 + 9 ln a + 3 ln d: percentiles of so few boards
+        hold the truth in some 87 % of studies, so fewer than 11 of 15 in 4 % of such tests."""
         record, held = study_record(Study(boards=30, depths_mm=(2.0, 10.0), hole_free_boards=0)).set_ups[0], 0
         seen = record.inspected
         chance = special.expit(-18.0 + 9.0 * np.log(seen.diameter_mm) + 3.0 * np.log(seen.depth_mm))
@@ -274,7 +230,7 @@ class TestSurface:
 
     def test_a_chance_that_falls_with_depth_is_said(self):
         surface, _ = surface_of(self.drawn(lambda a, d: -3.0 + 4.0 * a - 2.0 * d), draws=50)
-        assert surface.note.startswith("POD falls with depth") and surface.depth_slope < 0
+        assert surface.note.startswith("POD falls with depth")
 
     def test_refused_where_depth_does_not_vary(self):
         surface, why = surface_of(study_record(Study(hole_free_boards=0)).set_ups[0])

@@ -79,7 +79,6 @@ def _cloud_examples(group: Group, thresholds: Mapping[str, float]) -> list[Examp
             inside=np.isfinite(judged.evidence.score),
             truth=tuple(marks),
             z_truth_mm=set_up.seen_z_m / MM,
-            outlines_px=tuple(_outline_px(set_up, damage) for damage in set_up.truth),
         )
         examples.append(example)
     return examples

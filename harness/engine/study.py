@@ -120,7 +120,7 @@ def _write_study(
     from harness.engine.pictures import shown_in, study_example
     from harness.evaluation.study.record import record_text
     from harness.evaluation.study.result import evaluate_study
-    from harness.report.study_page import study_parts, write_study_report
+    from harness.report.study_page import study_html, study_parts
     from harness.tables.study import study_tables
 
     failed = failures_by_point(plan, outcome.failures, outcome.thresholds)
@@ -136,7 +136,8 @@ def _write_study(
     outcome.failures += lost
     examples = [study_example(damage, outcome.thresholds) for damage in shown if not lost]
     write_tables(folder, {table: table.frame(rows) for table, rows in study_tables(result).items()}, provenance)
-    write_study_report(folder, result, examples, provenance, resolved_yaml(experiment), title_of(experiment))
+    page = study_html(result, examples, provenance, resolved_yaml(experiment), title_of(experiment))
+    write_text(folder / REPORT.name, page)
     return study_parts(result)
 
 

@@ -105,8 +105,7 @@ class LimitSurface:
 
 
 def surfaces_of(limits: pd.DataFrame) -> list[LimitSurface]:
-    """Return the surfaces of a table of limits (`harness.tables.limits.LIMITS`), by camera, kind and detector. Raises
-    KeyError where the table lacks an axis."""
+    """Return the surfaces of a table of `LIMITS` by camera, kind, detector. Raises KeyError where it lacks an axis."""
     rows = limits.copy()
     damages = [json.loads(text) for text in rows[DAMAGE]]
     rows["kind"] = [damage["kind"] for damage in damages]
@@ -123,9 +122,8 @@ def _surface(camera: str, kind: str, detector: str, rows: pd.DataFrame, axes: Se
     axes = [axis for axis in axes if rows[axis].notna().all()]
     grid = {axis: tuple(float(value) for value in np.unique(rows[axis])) for axis in axes}
     nodes = rows[axes].to_numpy(float)
-    a90, low, high, largest = (
-        rows[name].to_numpy(float) for name in ("a90_mm", "a90_low_mm", "a90_high_mm", "largest_mm")
-    )
+    columns = ("a90_mm", "a90_low_mm", "a90_high_mm", "largest_mm")
+    a90, low, high, largest = (rows[name].to_numpy(float) for name in columns)
     known = np.isfinite(a90) & (a90 <= largest) & ~rows["is_at_most"].to_numpy(bool)
     beyond = (a90 > largest) | (rows["hits"].to_numpy() == 0)
     with np.errstate(all="ignore"):
@@ -156,8 +154,7 @@ def _scaled(places: np.ndarray, grid: Sequence[Sequence[float]]) -> np.ndarray:
 
 
 def _terms(counts: Sequence[int], known: int) -> tuple[tuple[int, ...], ...]:
-    """Products of axes: squares where an axis has three values, then products of two; as many as leave two set-ups
-    more than terms, none where even the plane has too few."""
+    """Products of axes: squares where an axis has three values, then products of two; none for too few set-ups."""
     varied = [axis for axis, count in enumerate(counts) if count > 1]
     plane: list[tuple[int, ...]] = [(), *((axis,) for axis in varied)]
     further: list[tuple[int, ...]] = [(axis, axis) for axis in varied if counts[axis] > 2]

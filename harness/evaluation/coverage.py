@@ -2,8 +2,7 @@
 
 The logarithm of a damage's strength (d' of the ideal observer at a noise of 1 m) is a quadratic of the logarithms of
 its size and of the cosine of the angle of incidence, and linear in that of the range. Over the noise at a place it is
-d'. The detector's hits against d' give the d' that it finds nine times in ten; a patch's limit is the smallest size
-that has it there."""
+d'. A patch's limit is the smallest size with the d' from which the detector finds damage nine times in ten."""
 
 from __future__ import annotations
 
@@ -21,8 +20,7 @@ SIZES = 400
 BEYOND_DEG = 3.0
 """Angle by which a patch may be steeper than every damage that was inspected."""
 LOOSE = 2.0
-"""d' found nine times in ten over d' found half the time, beyond which hits do not follow d': a threshold of 4.6 and
-noise of 1 make 1.28."""
+"""d' found nine times in ten over that found half the time, beyond which hits do not follow d' (noise makes 1.28)."""
 FEWEST = 20
 """Damages without which nothing is learnt."""
 
@@ -42,8 +40,7 @@ class Patches:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Places before a camera, (n,) each: ``deviation_m`` of the noise, infinite where not judged; ``cosine`` of the
-    angle of incidence; ``range_m``."""
+    """Places, (n,): noise ``deviation_m``, infinite where not judged; ``cosine`` of incidence, ``range_m``."""
 
     deviation_m: np.ndarray
     cosine: np.ndarray
@@ -65,9 +62,8 @@ class Damages:
 
 @dataclass(frozen=True, eq=False)
 class Findable:
-    """Law by which damage shows and is found. ``index``: d' found nine times in ten, ``index_50`` half the time;
-    ``scatter``: root mean square of the logarithm of strength about the quadratic of ``coefficients``; ``sizes_mm`` and
-    least cosine, ``steepest``, of the ``damages`` inspected."""
+    """Law by which damage shows and is found. ``index``, ``index_50``: d' found nine times in ten, half the time;
+    ``scatter``: rms of ln strength about the quadratic of ``coefficients``; ``steepest``: least cosine inspected."""
 
     size_of: str
     coefficients: np.ndarray

@@ -118,14 +118,12 @@ def standardised_bias(bias: float, std: float, n: int) -> Interval:
     return Interval(ratio - half, ratio + half)
 
 
-def bootstrap(
-    statistic: Callable[[np.ndarray], np.ndarray], n: int, *, resamples: int = RESAMPLES, seed: int = 0
-) -> Interval:
-    """Percentile bootstrap over ``n`` exchangeable units (repeats, or blocks of pixels); the fixed ``seed`` repeats it.
+def bootstrap(statistic: Callable[[np.ndarray], np.ndarray], n: int, *, resamples: int = RESAMPLES) -> Interval:
+    """Percentile bootstrap over ``n`` exchangeable units (repeats, or blocks of pixels), the same draws every time.
     ``statistic`` maps indices (resamples, n) to values (resamples,); NaN are left out, as in `percentiles`."""
     if n < 2:
         return UNKNOWN
-    indices = np.random.default_rng(seed).integers(0, n, size=(resamples, n))
+    indices = np.random.default_rng(0).integers(0, n, size=(resamples, n))
     return percentiles(np.asarray(statistic(indices), float))
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harness.evaluation.intervals import UNKNOWN, Interval, bootstrap, mean_t, wilson
+from harness.evaluation.intervals import UNKNOWN, Interval, bootstrap, mean_t
 from harness.evaluation.set_ups import compare_set_ups
 from harness.evaluation.summary import HoleState, Measure, found_holes, with_columns
 from harness.tables.trials import ResultTables
@@ -36,9 +36,8 @@ FEWEST_BOTH = 2
 
 @dataclass(frozen=True)
 class MapSetUp:
-    """One set-up or variation. ``views`` is 0 where the axis says "all" and no run was finished; ``registration`` and
-    ``merge`` are empty where no axis tells; ``place``: the other axes' values as text; ``reference``: of a variation
-    the set-up to compare it with, or empty."""
+    """One set-up or variation. ``views``: 0 for "all" without a finished run; ``registration``, ``merge``: empty where
+    no axis tells; ``place``: the other axes' values as text; ``reference``: the set-up of a variation, or ""."""
 
     variant: str
     views: int
@@ -74,9 +73,8 @@ def maps_of(tables: ResultTables) -> list[MapSetUp]:
 
 
 def compare_maps(tables: ResultTables, summary: pd.DataFrame) -> pd.DataFrame:
-    """Rows of `compare_set_ups` for all set-ups and variations that have a map, with the fields of `MapSetUp`, and over
-    the runs on the damaged board: ``views_left_out`` (mean of a run), ``seconds_map`` (median), ``surface_std_mm`` (of
-    the surface noise over runs)."""
+    """Rows of `compare_set_ups` for all that have a map, with the fields of `MapSetUp`; over runs on the damaged board
+    mean ``views_left_out``, median ``seconds_map``, and ``surface_std_mm``: the surface noise's deviation."""
     import pandas as pd
 
     maps = pd.DataFrame([asdict(one) for one in maps_of(tables)])
@@ -322,7 +320,6 @@ PARTS = ("in_plane", "across")
 UNIT = ["frames", "repeat", "role"]
 """One draw of noise and of nominal poses: what intervals resample."""
 MOST_REASONS = 3
-MEDIANS = ("seconds", "iterations", "overlap", "pairs", "marks")
 
 
 def of_map(registrations: pd.DataFrame, method: str, views: int) -> pd.DataFrame:
@@ -341,7 +338,7 @@ def of_map(registrations: pd.DataFrame, method: str, views: int) -> pd.DataFrame
 
 def summarise_registrations(registrations: pd.DataFrame, by: Sequence[str] = ("method", "frames")) -> pd.DataFrame:
     """Make one row per group, in order of appearance: numbers, failures, and the errors of those that did not fail. For
-    both `PARTS` median, 90 %, root mean square, the predicted one (of the covariances) and the ``_ratio`` of actual to
+    both `PARTS` median, root mean square, the predicted one (of the covariances) and the ``_ratio`` of actual to
     predicted (1: honest, above 1: too sure) with a bootstrap over repeats; ``guess_mm``: of the starting guess."""
     import pandas as pd
 
@@ -377,8 +374,7 @@ def per_pair(registrations: pd.DataFrame, column: str) -> pd.Series:
 
 
 def paired_ratio(first: pd.DataFrame, second: pd.DataFrame, column: str) -> tuple[float, float, float, int]:
-    """Geometric mean over pairs of views of second / first of one column's `per_pair`, with its Student interval of the
-    logarithm, and how many pairs there were; NaN below two."""
+    """Geometric mean over pairs of views of second / first by `per_pair`, Student's interval, number; NaN below two."""
     both = per_pair(first, column).to_frame("first").join(per_pair(second, column).rename("second"), how="inner")
     both = both[(both > 0).all(axis=1)]
     if len(both) < 2:
@@ -390,16 +386,13 @@ def paired_ratio(first: pd.DataFrame, second: pd.DataFrame, column: str) -> tupl
 
 def _summary(part: pd.DataFrame) -> dict[str, Any]:
     good, failures = trusted(part), part.loc[part["failure"] != "", "failure"]
-    low, high = wilson(len(failures), len(part))
     order = sorted(failures.value_counts(sort=False).items(), key=lambda item: (-int(item[1]), str(item[0])))
     row: dict[str, Any] = {
-        **{"n": len(part), "failed": len(failures), "failed_share": len(failures) / len(part)},
-        **{"failed_low": float(low), "failed_high": float(high)},
+        **{"n": len(part), "failed": len(failures)},
         "reasons": [f"{reason} ({count})" for reason, count in order[:MOST_REASONS]],
-        "converged_share": float(part["converged"].astype(float).mean()),
         "guess_mm": float(part["guess_tre_mm"].median()),
+        "seconds": float(part["seconds"].astype(float).median()),
     }
-    row |= {name: float(part[name].astype(float).median()) for name in MEDIANS}
     for name in PARTS:
         errors = good[[f"tre_{name}_mm", f"predicted_{name}_mm"]].astype(float)
         errors = errors.where(np.isfinite(errors)).set_axis(["actual", "predicted"], axis="columns")
@@ -411,7 +404,6 @@ def _summary(part: pd.DataFrame) -> dict[str, Any]:
         ends = bootstrap(partial(_ratio, sums), len(sums)) if rms["predicted"] > 0 else UNKNOWN
         row |= {
             f"{name}_median_mm": float(actual.median()),
-            f"{name}_q90_mm": float(actual.quantile(0.9)),
             f"{name}_rms_mm": float(np.sqrt((actual**2).mean())),
             **{f"{name}_predicted_mm": float(rms["predicted"]), f"{name}_ratio": ratio},
             **{f"{name}_ratio_low": ends.low, f"{name}_ratio_high": ends.high},

@@ -7,8 +7,6 @@ from typing import Literal
 
 import numpy as np
 
-RINGS = (0.25, 0.5, 0.75)
-"""Fractions of the hole's radius at which the depth reached is told; each ring is +-0.125 wide."""
 FEWEST_PIXELS = 12
 """Valid pixels inside the outline below which two shapes cannot be told apart: one ring of pixels is the whole hole."""
 FEWEST_VALID = 0.5
@@ -19,9 +17,8 @@ CLEARLY = 0.8
 
 @dataclass(frozen=True)
 class HoleInView:
-    """The truth of one round damage on the cloud's pixel grid. ``u_px``, ``v_px``: column and row of its centre in the
-    cloud's arrays (0, 0 = centre of the first pixel); ``radius_px``: radius of its outline there. ``depth_mm``: depth
-    below the face, NaN or infinite if it has no floor."""
+    """The truth of one round damage on the cloud's pixel grid: centre ``u_px``, ``v_px`` (column, row; 0, 0 = centre of
+    the first pixel), ``radius_px`` of its outline, ``depth_mm`` below the face, NaN or infinite without a floor."""
 
     hole: str
     u_px: float
@@ -35,8 +32,7 @@ class HoleInView:
 class ExampleCloud:
     """One averaged cloud of one variant, on its pixel grid (h, w). ``residual_mm``: distance behind (+) or before (-)
     the fitted surface, NaN where none; ``detected`` bool: pixels of the detector's clusters; ``inside`` bool: of the
-    crop; ``truth``: the holes on it; ``z_truth_mm``: true z along each pixel's central ray, NaN where it meets nothing;
-    ``outlines_px``: rims of ``truth``, (k, 2) columns and rows."""
+    crop; ``truth``: the holes on it; ``z_truth_mm``: true z on each pixel's central ray, NaN where it meets nothing."""
 
     frames: int
     variant: str
@@ -45,14 +41,12 @@ class ExampleCloud:
     inside: np.ndarray
     truth: tuple[HoleInView, ...]
     z_truth_mm: np.ndarray
-    outlines_px: tuple[np.ndarray, ...] = ()
 
 
 @dataclass(frozen=True)
 class HoleShape:
     """Root mean square misfits in mm of shapes scaled in depth to what is inside a hole's outline: a flat floor, and
-    the hemisphere on the same rim. ``true_*``: the same of the true geometry, a control. ``reached``: median depth in
-    the `RINGS` over the true floor's."""
+    the hemisphere on the same rim. ``true_*``: the same of the true geometry, a control."""
 
     hole: str
     pixels: int
@@ -60,7 +54,6 @@ class HoleShape:
     bowl_rms_mm: float
     true_cylinder_rms_mm: float
     true_bowl_rms_mm: float
-    reached: tuple[float, ...]
 
     @property
     def looks(self) -> Literal["bowl", "cylinder", "neither"]:
@@ -103,12 +96,10 @@ def hole_shape(cloud: ExampleCloud, hole: HoleInView) -> HoleShape | None:
         return None
     measured, rho = cloud.residual_mm[valid], radius[valid]
     true_depth = true_residual_mm(cloud, hole)
-    true_floor = _median(true_depth[(radius < 0.5) & np.isfinite(true_depth)])
     known = outline & np.isfinite(true_depth)
-    reached = tuple(_median(measured[np.abs(rho - ring) <= 0.125]) / true_floor for ring in RINGS)
     flat, round_ = (_misfit(measured, shape) for shape in (np.ones_like(rho), bowl(rho)))
     true_flat, true_round = (_misfit(true_depth[known], shape) for shape in (np.ones(known.sum()), bowl(radius[known])))
-    return HoleShape(hole.hole, int(valid.sum()), flat, round_, true_flat, true_round, reached)
+    return HoleShape(hole.hole, int(valid.sum()), flat, round_, true_flat, true_round)
 
 
 def hole_shapes(cloud: ExampleCloud) -> list[HoleShape]:
@@ -127,7 +118,3 @@ def _misfit(depth: np.ndarray, shape: np.ndarray) -> float:
     if depth.size == 0 or not shape.any():
         return float("nan")
     return float(np.sqrt(np.mean((depth - (depth @ shape / (shape @ shape)) * shape) ** 2)))
-
-
-def _median(depth: np.ndarray) -> float:
-    return float(np.median(depth)) if depth.size else float("nan")

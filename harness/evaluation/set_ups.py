@@ -35,8 +35,7 @@ LIMIT_RULE = (
 
 @dataclass(frozen=True)
 class Ladder:
-    """Detections of one set-up at one number of frames. ``diameters_mm`` (h,) of the holes, ascending; ``detected``
-    (repeats, h) bool."""
+    """Detections of one set-up: ``diameters_mm`` (h,) of the holes, ascending; ``detected`` (repeats, h) bool."""
 
     diameters_mm: np.ndarray
     detected: np.ndarray
@@ -54,8 +53,7 @@ class Ladder:
 
     @cached_property
     def half_draws_mm(self) -> np.ndarray:
-        """(`RESAMPLES`,) 50 % sizes of the two-way bootstrap. Ladders of the same holes and repeats are resampled
-        alike, so that differences of draws are paired."""
+        """(`RESAMPLES`,) 50 % sizes of the two-way bootstrap, drawn alike for ladders of the same holes and repeats."""
         rng = np.random.default_rng(0)
         repeats, holes = self.detected.shape
         of_repeats = rng.multinomial(repeats, np.full(repeats, 1 / repeats), RESAMPLES)
@@ -87,8 +85,7 @@ def ladder_of(holes: pd.DataFrame) -> Ladder:
 
 
 def found_limit_mm(summary: pd.DataFrame) -> float:
-    """Find the detection limit by `LIMIT_RULE` in summary rows of one set-up and one number of frames; NaN where even
-    the largest hole is not found."""
+    """Find the limit by `LIMIT_RULE` in summary rows of one set-up and frames; NaN where the largest hole is missed."""
     missed = summary["true_diameter_mm"][summary["status"] != "found"].max()  # NaN where there is none
     return float(summary["true_diameter_mm"][~(summary["true_diameter_mm"] <= missed)].min())
 

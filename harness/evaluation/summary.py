@@ -22,8 +22,6 @@ Measure = Literal["extent", "model"]
 
 MAIN = "main"
 """The variant that the experiment declares; every other one changes a fact that the thesis leaves open."""
-STATES = ("found", "wrong depth", "invalid", "invisible")
-"""States of a hole by its pixels alone, whatever the detector says."""
 FOUND_RULE = (
     "A hole counts as found when the 95 % Wilson interval of its detection rate over the repeats lies above 0.5, "
     "as missed when it lies below, else as undecided."
@@ -43,7 +41,7 @@ def summarise_holes(holes: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFra
     """Make one row per (variant, frames, hole): counts, rates, sizes and positions, each with its interval. ``axes``:
     columns to be carried along. ``status`` is by `FOUND_RULE`; ``extent_`` is the thesis' measure, ``model_`` the
     fit's, whose depth bias is against ``seen_depth_mm`` (behind a through-hole one sees farther);
-    ``model_diameter_covered``: share of fits within 1.96 standard errors; ``share_*`` of trials in each of `STATES`.
+    ``model_diameter_covered``: share of fits within 1.96 standard errors.
     Means are over the detected trials only: a hole detected in few trials shows the sizes of its lucky trials."""
     import pandas as pd
 
@@ -60,8 +58,6 @@ def summarise_holes(holes: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFra
     out = pd.concat([out, _fitted(holes, out)], axis=1)
     out["median_residual_mm"] = groups["median_residual_mm"].mean()
     out["invalid_fraction"] = groups["invalid_fraction"].mean()
-    for state in STATES:
-        out[f"share_{state.replace(' ', '_')}"] = (holes["state"] == state).groupby([holes[c] for c in GROUP]).mean()
     return out.reset_index().sort_values(GROUP, key=_order, kind="stable").reset_index(drop=True)
 
 
@@ -113,7 +109,7 @@ def _measured(groups: Any, truth: pd.DataFrame, measure: Measure) -> pd.DataFram
     out = diameter.agg(measured="count", diameter_mean_mm="mean", diameter_std_mm="std")
     out["bias_mm"] = out["diameter_mean_mm"] - truth["true_diameter_mm"]
     out["bias_low_mm"], out["bias_high_mm"] = intervals.mean_t(out["bias_mm"], out["diameter_std_mm"], out["measured"])
-    out = out.join(offset.agg(offset_mean_mm="mean", offset_std_mm="std", offset_measured="count"))
+    out = out.join(offset.agg(offset_mean_mm="mean", offset_std_mm="std"))
     out["offset_bias_mm"] = out["offset_mean_mm"] - truth["true_offset_mm"]
     out["error_mean_mm"] = groups[f"{measure}_error_mm"].mean()
     return out.add_prefix(f"{measure}_")
@@ -123,10 +119,8 @@ def _fitted(holes: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
     """Depth, which only the model gives, and the standard errors that each fit states, compared with the truth."""
     miss = (holes["model_diameter_mm"] - holes["true_diameter_mm"]).abs() / holes["model_diameter_se_mm"]
     covered = (miss <= 1.96).astype(float).where(miss.notna())
-    told = {
-        "model_diameter_se_mean_mm": ("model_diameter_se_mm", "mean"),
-        "model_diameter_covered": ("covered", "mean"),
-    }
+    told = {"model_diameter_se_mean_mm": ("model_diameter_se_mm", "mean")}
+    told |= {"model_diameter_covered": ("covered", "mean")}
     told |= {f"model_depth_{how}_mm": ("model_depth_mm", how) for how in ("mean", "std")}
     told |= {"model_depth_se_mean_mm": ("model_depth_se_mm", "mean")}
     out = holes.assign(covered=covered).groupby(GROUP, sort=False).agg(**told)
@@ -174,9 +168,8 @@ class FloorFit:
 
 @dataclass(frozen=True)
 class NoiseLaw:
-    """Effect of averaging on each part of the error. ``slope``: exponent of the temporal noise against the number of
-    frames (white noise: -0.5), with its interval. ``systematic_ratio``: systematic error (offset and pattern) of the
-    longest over the shortest average, interval."""
+    """Effect of averaging. ``slope``: exponent of the temporal noise against the number of frames (white noise: -0.5).
+    ``systematic_ratio``: systematic error (offset and pattern) of the longest over the shortest average."""
 
     slope: float
     slope_interval: Interval

@@ -1,8 +1,7 @@
 """The camera file that repeats what captures show: a known camera's model refitted, or an empirical camera.
 
 A refitted model takes the unit's lens, gain, fixed pattern, displaced frames and, where the captures tell it, the gate
-of faint pixels; all else stays the known camera's. The surfaces have one albedo, which is stated and not measured.
-"""
+of faint pixels; all else stays the known camera's. The surfaces have one albedo, which is stated and not measured."""
 
 from __future__ import annotations
 
@@ -72,8 +71,7 @@ def opened_as(camera: str | None, paths: Sequence[Path], intrinsics: str | None,
 
 
 def camera_of_size(lens: Lens) -> str:
-    """Return the one simulated camera with as many pixels; of several the one whose precision is no guess. Raises
-    UserError where there is none, or more than one."""
+    """Return the one simulated camera with as many pixels, guessed ones last. Raises UserError for none, or several."""
     sizes = {name: load_camera(name).nominal_lens for name in camera_names()}
     fitting = [name for name, own in sizes.items() if (own.width, own.height) == (lens.width, lens.height)]
     known = [name for name in fitting if not guessed_precision(load_camera(name))]
@@ -116,18 +114,13 @@ def write_camera(
     the known camera has another image size, and where the file cannot be written."""
     names = ", ".join(capture.name for capture in found.captures)
     source = f"measured by harness.characterise on {names}, {date.today().isoformat()}"
-    facts = [
-        *_of_unit(found, source),
-        *(_refitted(like, found, albedo, source) if like else _empirical(found, albedo, source)),
-    ]
+    own = _refitted(like, found, albedo, source) if like else _empirical(found, albedo, source)
+    facts = [*_of_unit(found, source), *own]
     if like and is_camera_path(like):
         like = os.path.relpath(like, path.parent)  # a path counts from the file that names it
     lines = ["# Tags: O measured on the owner's captures, M assumed.", *(f"# {doubt}" for doubt in found.doubts)]
-    lines += [
-        f"name: {path.stem}",
-        f"title: {json.dumps(title)}",
-        f"like: {json.dumps(like)}" if like else "kind: empirical",
-    ]
+    kind = f"like: {json.dumps(like)}" if like else "kind: empirical"
+    lines += [f"name: {path.stem}", f"title: {json.dumps(title)}", kind]
     for section in dict.fromkeys(fact.section for fact in (*facts, rate)):
         lines += [f"{section}:"] if section else []
         for fact in (*facts, rate):
@@ -182,11 +175,7 @@ def _empirical(found: Characteristics, albedo: float, source: str) -> Iterator[S
         yield Stated(section, "columns", taps_of(both[0]), said)
     yield Stated("dropouts", "amplitude", np.nan_to_num(drops.amplitude, nan=1.0), source)
     yield Stated("dropouts", "share", drops.share, f"of {int(drops.pixels.sum())} pixels on surfaces; {source}")
-    told = (
-        (f"edges are {NOT_TOLD}", "M")
-        if edge is None
-        else (f"{edge.lines} lines of pixels across edges; {source}", "O")
-    )
+    told = (f"{edge.lines} lines of pixels across edges; {source}", "O") if edge else (f"edges are {NOT_TOLD}", "M")
     blurred = edge is not None and edge.flying_px > 0.05
     yield Stated("edge", "gap_px", edge.gap_px if edge else 0.0, *told)
     yield Stated("edge", "blur_px", (edge.gap_px + edge.flying_px) / EDGE_SHARE if edge and blurred else 0.0, *told)
@@ -224,8 +213,7 @@ def _refitted(like: str, found: Characteristics, albedo: float, source: str) -> 
 
 
 def _gain(camera: Any, found: Characteristics, albedo: float) -> tuple[Any, float]:
-    """Return the camera whose simulated surfaces have the captures' temporal noise, and its gain, by secants on the
-    logarithms."""
+    """Return the camera that repeats the captures' temporal noise, and its gain, by secants on the logarithms."""
     wanted, tried = {(one.capture, one.number): one.temporal.value for one in found.surfaces}, []
     gain = start = camera.photons.signal_electrons.value
     for _ in range(STEPS):

@@ -2,8 +2,7 @@
 
 The terms are those of VDI/VDE 2634 part 2 and ISO 10360-13 (optical 3D measuring systems), and of MIL-HDBK-1823A, ASTM
 E2862 and E3023 (probability of detection). Figures are in their manner: neither their artefacts nor their procedures
-were used. Nothing here is an accredited calibration.
-"""
+were used. Nothing here is an accredited calibration."""
 
 from __future__ import annotations
 
@@ -107,8 +106,7 @@ def write_certificate(
     study: StudyRecord | None,
     command: str,
 ) -> None:
-    """Write ``certificate.html`` and ``certificate.json`` into a folder. ``about``: unit, mode, firmware, warm-up and
-    such, in words. Raises UserError where they cannot be written."""
+    """Write ``certificate.html``, ``.json``. ``about``: unit, mode, firmware, warm-up. May raise UserError."""
     rows, limits = list(certified(found, poses)), [limit_of(one) for one in study.set_ups] if study else []
     surfaces = list(of_surfaces(found))
     share = "The camera's figures are measured."

@@ -2,8 +2,7 @@
 
 Flat surfaces are found in each capture; where there is none, every pixel with a steady range counts, and neither angle
 nor fixed pattern nor edges are told. Temporal noise is that of single pixels about their own mean, each frame's
-displacement taken off. Not told: errors that all frames and all pixels share, and noise slower than the capture.
-"""
+displacement taken off. Not told: errors that all frames and all pixels share, and noise slower than the capture."""
 
 from __future__ import annotations
 
@@ -54,8 +53,7 @@ recording was averaged, smoothed or rounded before it was stored."""
 @dataclass(frozen=True)
 class StillCapture:
     """Frames of a static scene: ``z_m`` (n, h, w) float32, NaN where invalid; ``slopes`` (h, w, 2); mean ``amplitude``
-    (h, w), NaN where never above 0, or None; ``step_m`` of the stored z; ``planes`` with their pixels (h, w) bool;
-    ``used`` (h, w) bool: pixels that count."""
+    (h, w), NaN where never above 0, or None; ``step_m`` of stored z; ``planes`` with pixels, ``used`` pixels (h, w)."""
 
     name: str
     lens: Lens
@@ -282,8 +280,7 @@ def correlations(capture: StillCapture) -> np.ndarray:
 
 
 class Dropouts(NamedTuple):
-    """Share of frames in which ``pixels`` of a surface return nothing, by ``amplitude``, NaN where not recorded; (k,)
-    each, of rising amplitude."""
+    """Share of frames without return of ``pixels`` by ``amplitude``, rising, NaN where not recorded; (k,) each."""
 
     amplitude: np.ndarray
     share: np.ndarray
@@ -466,9 +463,8 @@ class Characteristics:
 def characteristics(
     captures: Sequence[StillCapture], poses: Sequence[np.ndarray | None] | None = None
 ) -> Characteristics:
-    """Measure captures of one camera in their order of time; ``poses``: 4 x 4, each camera's in the first one's frame,
-    which part the surface's own shape from the fixed pattern. Raises UserError for captures of different cameras, and
-    where too few pixels hold still."""
+    """Measure captures of one camera in order of time; ``poses``: 4 x 4, each camera's in the first one's frame, which
+    part shape from fixed pattern. Raises UserError for different cameras, and where too few pixels hold still."""
     first = captures[0]
     if other := next((one for one in captures if one.lens != first.lens), None):
         raise UserError(f"{other.name}: is of another lens than {first.name}", legal="captures of one camera")

@@ -67,13 +67,8 @@ def shared_figures(found: Characteristics) -> Iterator[Told]:
             yield "noise correlation", f"{name}, lag {lag}", "1", alike, "of neighbours' temporal noise"
     yield "frame jitter", "all", "mm", Reading(found.jitter_m / MM), "deviation of whole frames' displacement"
     for capture in found.captures:
-        yield (
-            "drift",
-            capture.name,
-            "mm",
-            Reading(capture.drift_m / MM),
-            "change of the distance from first to last frame",
-        )
+        drift = Reading(capture.drift_m / MM)
+        yield "drift", capture.name, "mm", drift, "change of the distance from first to last frame"
     step = Reading(found.captures[0].step_m / MM)
     yield "rounding step", "all", "mm", step, "of the stored distance along the axis"
     share = Reading(len(found.jumps_m) / found.frames)
@@ -119,9 +114,8 @@ def write_page(
     facts: Mapping[str, Any],
     warnings: Sequence[str],
 ) -> None:
-    """Print the figures; write a page, and beside it the tables' files and provenance.json with further ``facts``.
-    ``sources``: what was measured, simulated and, where there is one, the ``known`` camera's by their names. Raises
-    UserError where they cannot be written."""
+    """Print the figures; write a page, its tables and provenance.json with further ``facts``. ``sources``: measured,
+    simulated, and maybe the ``known`` camera's. Raises UserError where they cannot be written."""
     found, folder = sources[MEASURED], path.parent
     heads = {"known camera": known, "its ratio": known and "its ratio"}
     show([OWN_FIGURES.grid(rows, terminal=True, heads=heads)])

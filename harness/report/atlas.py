@@ -62,16 +62,12 @@ def save_atlas_png(path: Path, rows: Sequence[Row]) -> None:
         for panel, damage in zip(axes, damages, strict=True):
             for frames, style in shown.items():
                 for title, colour in zip(titles, PALETTE, strict=False):
-                    line = [
-                        one
-                        for one in rows
-                        if (one.damage, one.title, one.surface.detector) == (damage, title, detector)
-                    ]
+                    of = (damage, title, detector)
+                    line = [one for one in rows if (one.damage, one.title, one.surface.detector) == of]
                     line = [one for one in line if one.place["frames"] == frames]
                     x = [one.place["distance_m"] for one in line]
-                    low, middle, high = (
-                        [getattr(one.answer, name) for one in line] for name in ("low_mm", "a90_mm", "high_mm")
-                    )
+                    names = ("low_mm", "a90_mm", "high_mm")
+                    low, middle, high = ([getattr(one.answer, name) for one in line] for name in names)
                     label = title if frames == counts[-1] else None
                     panel.plot(x, middle, style, color=colour, label=label)
                     if frames == counts[-1]:

@@ -1,7 +1,6 @@
 """Parts of pages and figures: a skeleton with the one stylesheet, blocks, figures as SVG or PNG. Only `Markup` is HTML.
 
-page(title, answer, [heading("Limits"), LIMITS.grid(rows).html(), figure(figures, "curves", "Each stroke is ...")])
-"""
+page(title, answer, [heading("Limits"), LIMITS.grid(rows).html(), figure(figures, "curves", "Each stroke is ...")])"""
 
 from __future__ import annotations
 
@@ -132,11 +131,8 @@ def closing(provenance: Mapping[str, Any], experiment_yaml_text: str, left_out: 
     parts += [heading("Provenance")]
     table = tag("table", tag("tbody", joined(lines)), kind="prov")
     told = (cost, table, *command_of(provenance.get("command", "not recorded")))
-    return [
-        *parts,
-        fold("Cost, versions and command", *told),
-        fold("The resolved experiment", tag("pre", experiment_yaml_text)),
-    ]
+    folds = fold("Cost, versions and command", *told)
+    return [*parts, folds, fold("The resolved experiment", tag("pre", experiment_yaml_text))]
 
 
 def plain(value: Any) -> str:

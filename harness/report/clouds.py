@@ -1,7 +1,6 @@
 """Damage as a detector has it: parts of trials kept for pictures, and residuals of whole clouds and single damages.
 
-Residuals have one colour scale: linear within 1 mm, logarithmic beyond, red behind the surface, blue before it.
-"""
+Residuals have one colour scale: linear within 1 mm, logarithmic beyond, red behind the surface, blue before it."""
 
 from __future__ import annotations
 
@@ -14,7 +13,7 @@ import numpy as np
 from harness.evaluation.profile import ExampleCloud
 from harness.report.blocks import DAMAGE, INK, svg
 from harness.report.view3d import Scene3d
-from harness.tables.text import inches, many
+from harness.tables.text import many
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -66,9 +65,7 @@ class MappedExample:
 NOTHING = "#b9bec4"
 """Grey: no valid point."""
 LEAST_MM = 10.0
-AROUND_MM = 9.0
-"""Undamaged face shown beyond the rim: more than any of the cameras' filters reaches."""
-MOST_HOLES, MOST_DOWN = 4, 3
+MOST_DOWN = 3
 SMALLEST_RING_PX = 2.5
 WIDTH_IN = 10.0
 TITLES: dict[Where, str] = {"below": "Below the limit", "at": "At the limit", "above": "Above the limit"}
@@ -77,8 +74,7 @@ SIZES: dict[Where, str] = {"below": "Smaller", "at": "Middle", "above": "Larger"
 
 
 class Cut(NamedTuple):
-    """A part of a pixel grid around one damage: residual and pixels of findings (h, w), the rim (k, 2), a pixel's width
-    at the board, words above and below."""
+    """A part of a pixel grid around a damage: residual, findings (h, w), rim (k, 2), a pixel's width; words beside."""
 
     residual_mm: np.ndarray
     detected: np.ndarray
@@ -124,27 +120,6 @@ def residual_figure(clouds: Sequence[ExampleCloud]) -> str:
     return svg("residual", (WIDTH_IN, sum(heights) + 0.75 * len(clouds)), alt, draw)
 
 
-def sights_figure(clouds: Mapping[str, ExampleCloud]) -> str:
-    """Holes down, set-ups across: every second hole from the fourth smallest on, at most `MOST_HOLES`."""
-    first = sorted(next(iter(clouds.values())).truth, key=lambda hole: hole.diameter_mm)
-    rows = []
-    for hole in first[min(3, len(first) - 1) :: 2][:MOST_HOLES]:
-        line = []
-        for title, cloud in clouds.items():
-            at = next(place for place, one in enumerate(cloud.truth) if one.hole == hole.hole)
-            rim = cloud.outlines_px[at]
-            pitch_mm = float(np.mean(hole.diameter_mm / np.ptp(rim, axis=0)))
-            half = int(np.ceil((hole.diameter_mm / 2 + AROUND_MM) / pitch_mm))
-            u, v = np.round(rim.mean(axis=0)).astype(int)
-            part = np.s_[v : v + 2 * half + 1, u : u + 2 * half + 1]
-            residual_mm = np.pad(cloud.residual_mm, half, constant_values=np.nan)[part]
-            detected = np.pad(cloud.detected, half)[part]
-            said = f"hole {hole.hole}, {inches(hole.diameter_mm) or f'{hole.diameter_mm:.1f} mm'}"
-            line.append(Cut(residual_mm, detected, rim - (u - half, v - half), pitch_mm, title, said))
-        rows.append(line)
-    return _cuts("sights", rows, "The same holes as each set-up sees them: residual in millimetres.")
-
-
 def examples_figure(name: str, examples: Sequence[StudyExample], title: str, *, by_limit: bool = True) -> str:
     """One set-up's examples: below, at and above the limit (else, not ``by_limit``, by size) across, others down."""
     titles = TITLES if by_limit else SIZES
@@ -156,9 +131,9 @@ def examples_figure(name: str, examples: Sequence[StudyExample], title: str, *, 
         [None if down >= len(line) else _example_cut(line[down], titles) for line in columns]
         for down in range(max(map(len, columns)))
     ]
-    said = "; ".join(
-        f"{one.diameter_mm:.1f} mm, {titles[one.where].lower()}, {_outcome(one)}" for line in columns for one in line
-    )
+    every = [one for line in columns for one in line]
+    told = (f"{one.diameter_mm:.1f} mm, {titles[one.where].lower()}, {_outcome(one)}" for one in every)
+    said = "; ".join(told)
     return _cuts(name, rows, f"{title}: {said}.")
 
 

@@ -39,8 +39,7 @@ def _tone(row: ComparedSetUps) -> Tone:
 
 
 def _limit_p(row: ComparedSetUps) -> str:
-    test = row.limit_test(0)
-    return f"{p_value(row.limit_p[0])}{' (a90)' if test == 'a90' else ''}" if test else "–"
+    return p_value(row.limit_p[0]) if row.limit else "–"
 
 
 COMPARED = Table(
@@ -70,14 +69,12 @@ COMPARED = Table(
     kind="limits compared",
 )
 TESTS = (
-    "Lost, won: inspections that the first alone, and the second alone, found. The p beside them is twice the smaller "
-    "of two, with boards, not damages, as the units: of a sign-flip test of hits, and, where a90 has changed by more "
-    f"than {100 * (MARGIN - 1):.0f} % and hits do not decide, of an exchange test of a90 itself, marked (a90) where it "
-    "is the smaller. Where the studies have different boards, p is of boards drawn again for each (500 draws). The p "
-    "of false calls is of a sign-flip test where frames and threshold are the same; else it allows for the luck of "
-    "each calibration. Signal: median change of the signals of damage over the signal from which damage is found; its "
-    "p is of a normal test with the scatter over boards and of both calibrations. All are one-sided, of being worse, "
-    "and adjusted. 95 %: of the change of a90, boards drawn again."
+    "Lost, won: inspections that the first alone, and the second alone, found. The p beside them: a sign-flip test of "
+    "hits, with boards, not damages, as the units; where the studies have different boards, of a90 with boards drawn "
+    "again for each (500 draws). The p of false calls is of a sign-flip test where frames and threshold are the same; "
+    "else it allows for the luck of each calibration. Signal: median change of the signals of damage over the signal "
+    "from which damage is found; its p is of a normal test with the scatter over boards and of both calibrations. All "
+    "are one-sided, of being worse, and adjusted. 95 %: of the change of a90, boards drawn again."
 )
 
 
@@ -166,12 +163,9 @@ def _row_data(row: ComparedSetUps) -> dict[str, Any]:
             "paired": row.limit.paired,
             "bootstrap_p": {"grown": row.limit.grown_p, "shrunk": row.limit.shrunk_p},
             "decides": dict(zip(sides, row.limit_p, strict=True)),
-            "decided_by": {side: row.limit_test(at) for at, side in enumerate(sides)},
         }
-    if row.swap is not None:
-        data["a90_swap"] = vars(row.swap)
     if row.hits is not None:
-        data["hits"] = {**vars(row.hits), "boards_p": row.hits.boards_p}
+        data["hits"] = vars(row.hits)
     if row.signal is not None:
         data["signal"] = {**vars(row.signal), "decides": dict(zip(sides, row.signal_p, strict=True))}
     if row.calls is not None:
@@ -184,11 +178,4 @@ def _limit_data(limit: SetUpLimit | None) -> dict[str, Any] | None:
     if limit is None:
         return None
     names = ("a50_mm", "a90_mm", "hits", "inspections", "boards", "why")
-    return {
-        "detector": f"{limit.record.detector} {limit.record.detector_version}",
-        **{name: getattr(limit.record, name) for name in ("threshold", "failed")},
-        **{name: getattr(limit, name) for name in names},
-        "a90_interval_mm": [limit.a90_interval_mm.low, limit.a90_interval_mm.high],
-        "a90_95_mm": limit.a90_95.value,
-        "false_calls": None if limit.false_calls is None else limit.false_calls.calls,
-    }
+    return {**{name: getattr(limit, name) for name in names}, "a90_95_mm": limit.a90_95.value}

@@ -40,8 +40,7 @@ def scene_of(patches: Patches, limits_mm: np.ndarray, found: Findable) -> Scene3
 
 
 def answer(found: Findable, patches: Patches, limits_mm: np.ndarray, size_mm: float, poses: int) -> str:
-    """State the share of the face on which damage of a size is found, and the shares where no size is, and that are not
-    judged."""
+    """State the shares of the face on which damage of a size is found, on which no size is, and that are not judged."""
     some = limits_mm <= size_mm, np.isinf(limits_mm), np.isnan(limits_mm)
     share, blind, unknown = (f"{percent(patches.share(each))} %" for each in some)
     return (

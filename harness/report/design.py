@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
@@ -12,6 +11,7 @@ import numpy as np
 from harness.evaluation.intervals import SITES_PER_TARGET
 from harness.evaluation.pod import design as planned
 from harness.evaluation.pod.curve import PodCurve
+from harness.evaluation.pod.statement import LEAST_TARGETS
 from harness.report import blocks
 from harness.report.pod import axis_text, plain
 from harness.tables.schema import Column, Table, jsonable
@@ -27,22 +27,21 @@ MEDIANS = (
     "*: recommended."
 )
 WIDE = 110
-PLACED = {"uniform": "evenly spread", "concentrated": "concentrated"}
 SIZE_IN = (11.5, 4.9)
-LOOKS = {"uniform": (blocks.BLUE, "o"), "concentrated": (blocks.ORANGE, "s")}
 
 
 @dataclass(frozen=True, eq=False)
 class StudyDesign:
     """All that was found out about a study to be made. Sizes are in ``unit``; ``origin``: of the guess; ``goal``: the
-    bound that was wanted, if any."""
+    bound that was wanted, if any, and ``reaches``: whether nine of ten studies by the ``recommended`` plan show it."""
 
     guess: PodCurve
     origin: str
     unit: str
     range_of_sizes: tuple[float, float]
     plans: tuple[planned.StudyPlan, ...]
-    recommended: planned.Recommendation
+    recommended: planned.StudyPlan
+    reaches: bool | None
     goal: float | None
     hole_free: planned.HoleFree | None
 
@@ -70,47 +69,38 @@ def design_html(design: StudyDesign, command: str) -> str:
     """The page as text: answer, figure, plans and sizes, hole-free area; it needs no network."""
     caption = (
         f"Left: the {design.limit_name} that simulated studies demonstrate, with the guess's own size, below which a "
-        "limit should not fall. Right: the guessed curve and the sizes of the recommended number of targets."
+        "limit should not fall. Right: the guessed curve and the sizes of the recommended plan."
     )
-    body = [
-        blocks.heading("What to expect"),
-        blocks.figure({"design": blocks.svg("design", SIZE_IN, answer(design), _drawing(design))}, "design", caption),
-        plans_grid(design).html(),
-        blocks.note(MEDIANS),
-        blocks.subheading(f"Sizes to make{design.in_unit}"),
-    ]
+    drawn = blocks.svg("design", SIZE_IN, answer(design), lambda canvas: _draw(canvas, design))
+    body = [blocks.heading("What to expect"), blocks.figure({"design": drawn}, "design", caption)]
+    body += [plans_grid(design).html(), blocks.note(MEDIANS), blocks.subheading(f"Sizes to make{design.in_unit}")]
     for plan in design.plans:
-        chosen = plan is design.recommended.plan
-        name = f"{plan.targets} targets, {PLACED[plan.placement]}{' (recommended)' if chosen else ''}"
-        body.append(
-            blocks.fold(name, blocks.tag("pre", " ".join(f"{size:.4g}" for size in plan.sizes)), is_open=chosen)
-        )
-    body += [
-        blocks.heading("Where nothing is"),
-        blocks.bullets(hole_free_lines(design)),
-        blocks.heading("Notes"),
-        blocks.bullets(notes(design)),
-    ]
+        chosen = plan is design.recommended
+        name = f"{plan.targets} targets{' (recommended)' if chosen else ''}"
+        body.append(blocks.fold(name, blocks.tag("pre", _sizes(plan)), is_open=chosen))
+    body += [blocks.heading("Where nothing is"), blocks.bullets(hole_free_lines(design))]
+    body += [blocks.heading("Notes"), blocks.bullets(notes(design)), *blocks.command_of(command)]
     under = [blocks.note(f"Guess: {guess_text(design)}.")]
-    return blocks.page(
-        "Planning a study of detection limits", answer(design), [*body, *blocks.command_of(command)], under
-    )
+    return blocks.page("Planning a study of detection limits", answer(design), body, under)
 
 
 def design_parts(design: StudyDesign) -> list[str | Grid]:
     """Return what a terminal shows: the page's tables and sentences."""
-    sizes = wrap(" ".join(f"{size:.4g}" for size in design.recommended.plan.sizes), WIDE)
     parts: list[str | Grid] = [f"guess: {guess_text(design)}", "", plans_grid(design), *wrap(MEDIANS, WIDE), ""]
-    parts += [f"sizes of the recommended plan (*){design.in_unit}:", *sizes]
+    parts += [f"sizes of the recommended plan (*){design.in_unit}:", *wrap(_sizes(design.recommended), WIDE)]
     parts += ["", *(f"where nothing is: {line}" for line in hole_free_lines(design))]
     return [*parts, "", *(f"note: {line}" for line in notes(design)), "", answer(design)]
 
 
+def _sizes(plan: planned.StudyPlan) -> str:
+    return " ".join(f"{size:.4g}" for size in plan.sizes)
+
+
 def answer(design: StudyDesign) -> str:
     """The recommendation in a sentence."""
-    plan, wish = design.recommended.plan, ""
+    plan, wish = design.recommended, ""
     if design.goal is not None:
-        reached = "nine of ten studies demonstrate" if design.recommended.reaches else "no plan listed is sure to show"
+        reached = "nine of ten studies demonstrate" if design.reaches else "no plan listed is sure to show"
         wish = f"; {reached} the {design.text(design.goal)} that is wanted"
     if not np.isfinite(plan.bound):
         expects = f"even so most studies would demonstrate no {design.limit_name}"
@@ -118,7 +108,7 @@ def answer(design: StudyDesign) -> str:
         spread = f"between {design.text(plan.low)} and {design.text(plan.high)} in eight of ten studies"
         expects = f"expect {design.limit_name} at {design.text(plan.bound)}, {spread}"
     low, high = map(design.text, design.range_of_sizes)
-    return f"Make {plan.targets} targets, {PLACED[plan.placement]} from {low} to {high}: {expects}{wish}."
+    return f"Make {plan.targets} targets, evenly spread from {low} to {high}: {expects}{wish}."
 
 
 def guess_text(design: StudyDesign) -> str:
@@ -134,52 +124,48 @@ def _size(value: float) -> str:
 
 PLANS = Table(
     "plans",
-    "one row per number of targets and placement",
+    "one row per number of targets",
     (
         Column("", "targets", lambda row: f"{'* ' * row[1]}{row[0].targets}"),
-        Column("", "sizes", lambda row: PLACED[row[0].placement]),
         Column("", "limit", lambda row: row[0].bound, text=_size, tone=lambda row: "key" if row[1] else ""),
         Column("", "10 %", lambda row: row[0].low, text=_size),
         Column("", "90 %", lambda row: row[0].high, text=_size),
         Column("", "demonstrated", lambda row: f"{100 * row[0].demonstrated:.1f} %"),
     ),
     formats=(),
-    left=2,
 )
 """Its rows are pairs: a plan, and whether it is the one recommended."""
 
 
 def plans_grid(design: StudyDesign) -> Grid:
     """Every plan, the recommended one with a star, and what its studies demonstrate."""
-    rows = [(plan, plan is design.recommended.plan) for plan in design.plans]
+    rows = [(plan, plan is design.recommended) for plan in design.plans]
     return PLANS.grid(rows, heads={"limit": f"{design.limit_name}{design.in_unit}"})
 
 
 def hole_free_lines(design: StudyDesign) -> list[str]:
     """The unflawed sites and areas that go with the recommended targets."""
-    sites = SITES_PER_TARGET * design.recommended.plan.targets
+    sites = SITES_PER_TARGET * design.recommended.targets
     lines = [f"{sites} unflawed sites: MIL-HDBK-1823A asks for {SITES_PER_TARGET} a target at least"]
     area = design.hole_free
     if area is None:
         return lines
     sure = f"{area.confidence:.0%} confidence".replace("%", " %")
-    lines.append(
+    return [
+        *lines,
         f"a threshold for {area.rate_per_m2:g} false calls per m2 needs {area.calibration_boards} hole-free boards of "
-        f"{area.board_m2:g} m2 at least; from as few its rate is no more than {area.upper_per_m2:.3g} with {sure}"
-    )
-    lines += [
-        f"to show at most {area.rate_per_m2:g} per m2 with {sure}: {('no', 'one', 'two')[calls]} false "
-        f"call{'s' * (calls == 2)} on {square_metres:.4g} m2, which is {area.boards(square_metres)} other boards"
-        for calls, square_metres in zip(planned.CALLS, area.areas_m2, strict=True)
+        f"{area.board_m2:g} m2 at least; from as few its rate is no more than {area.upper_per_m2:.3g} with {sure}",
+        f"to show at most {area.rate_per_m2:g} per m2 with {sure}: no false call on {area.silent_m2:.4g} m2, which is "
+        f"{area.silent_boards} other boards",
     ]
-    return lines
 
 
 def notes(design: StudyDesign) -> list[str]:
     """Return the handbook's minima, Monte Carlo error, and what the plan rests on."""
-    plan, high = design.recommended.plan, design.range_of_sizes[1]
-    found = [f"the recommended plan: {line}" for line in plan.notes if str(planned.LEAST_TARGETS) not in line]
-    if design.goal is not None and not design.recommended.reaches and np.isfinite(plan.high):
+    plan, (low, high), found = design.recommended, design.range_of_sizes, []
+    if not low <= plan.true_size <= high:
+        found.append(f"the guess's own {design.size_name} lies outside the range: it is extrapolated")
+    if design.reaches is False and design.goal is not None and np.isfinite(plan.high):
         # The bound's distance from the truth is a multiple of a standard error.
         wanted = plan.targets * ((plan.high - plan.true_size) / (design.goal - plan.true_size)) ** 2
         found.append(
@@ -191,12 +177,10 @@ def notes(design: StudyDesign) -> list[str]:
             f"the {design.limit_name} to expect lies beyond the largest target of {design.text(high)}: it rests on the "
             "curve's shape there; make larger ones"
         )
-    if not design.recommended.enough:
-        found.append(f"no plan listed has the {planned.LEAST_TARGETS} targets that MIL-HDBK-1823A asks for")
+    if plan.targets < LEAST_TARGETS:
+        found.append(f"no plan listed has the {LEAST_TARGETS} targets that MIL-HDBK-1823A asks for (40 of signals)")
     return [
         *found,
-        f"MIL-HDBK-1823A: {planned.LEAST_TARGETS} independent targets at least for hits and misses, "
-        f"{planned.LEAST_SIGNALS} where signals are recorded (a-hat)",
         f"medians and quantiles of {plan.studies} simulated studies, bound by {plan.method}; the share that "
         f"demonstrates any is known to {50 / np.sqrt(plan.studies):.1f} points or better (one standard error)",
         "repeats of the noise are no further targets: 50 inspections of each of 8 holes are worth 8 targets",
@@ -206,7 +190,7 @@ def notes(design: StudyDesign) -> list[str]:
 
 def design_data(design: StudyDesign) -> dict[str, Any]:
     """Return the plan as JSON's types; an infinite size becomes None."""
-    area, chosen, guess = design.hole_free, design.recommended, design.guess
+    guess = design.guess
     curve = {"link": guess.link, "log_size": guess.log_size, "mu": float(guess.mu), "sigma": float(guess.sigma)}
     said: dict[str, Any] = {
         "recommendation": answer(design),
@@ -214,72 +198,49 @@ def design_data(design: StudyDesign) -> dict[str, Any]:
         "guess": {**curve, "a50": guess.size_at(0.5), "a90": guess.size_at(0.9), "origin": design.origin},
         "range_of_sizes": design.range_of_sizes,
         "goal": design.goal,
-        "reaches_goal": chosen.reaches,
-        "enough_targets": chosen.enough,
-        "plans": [{**vars(plan), "recommended": plan is chosen.plan} for plan in design.plans],
-        "unflawed_sites": SITES_PER_TARGET * chosen.plan.targets,
-        "hole_free": None,
+        "reaches_goal": design.reaches,
+        "plans": [{**vars(plan), "recommended": plan is design.recommended} for plan in design.plans],
+        "unflawed_sites": SITES_PER_TARGET * design.recommended.targets,
+        "hole_free": vars(design.hole_free) if design.hole_free else None,
         "notes": notes(design),
     }
-    if area is not None:
-        said["hole_free"] = {name: value for name, value in vars(area).items() if name != "areas_m2"}
-        said["hole_free"]["upper_bound"] = [
-            {"false_calls": calls, "area_m2": size, "boards": area.boards(size)}
-            for calls, size in zip(planned.CALLS, area.areas_m2, strict=True)
-        ]
     return dict(jsonable(said))
 
 
 def save_design_png(path: Path, design: StudyDesign) -> None:
     """The figure as a PNG at ``path``; the same bytes for the same design."""
-    blocks.save_png(path, SIZE_IN, _drawing(design))
+    blocks.save_png(path, SIZE_IN, lambda canvas: _draw(canvas, design))
 
 
-def _drawing(design: StudyDesign) -> Callable[[Figure], None]:
+def _draw(canvas: Figure, design: StudyDesign) -> None:
     """The limit to expect against the number of targets (median, 10-90 %), and the sizes on the guessed curve."""
-    numbers = sorted({plan.targets for plan in design.plans})
-    low, high = design.range_of_sizes
-    targets = design.recommended.plan.targets
-
-    def draw(canvas: Figure) -> None:
-        left, right = canvas.subplots(1, 2)
-        top = max([1.5 * high, *(1.1 * plan.bound for plan in design.plans if np.isfinite(plan.bound))])
-        for plan in design.plans:
-            (colour, marker), side = LOOKS[plan.placement], -1 if plan.placement == "uniform" else 1
-            place = numbers.index(plan.targets) + 0.11 * side
-            label = f"{PLACED[plan.placement]}: median, 10–90 %" if plan.targets == numbers[0] else None
-            left.plot([], [], marker, color=colour, label=label)
-            if np.isfinite(plan.low):
-                left.plot([place] * 2, [plan.low, min(plan.high, top)], lw=2.2, solid_capstyle="butt", color=colour)
-            said = "none" if not np.isfinite(plan.bound) else "↑" if plan.high > top else ""
-            left.text(place, top, said, ha="center", va="top", color=colour)
-            left.plot([place], [min(plan.bound, 9 * top)], marker, ms=7, mec="white", color=colour)
-        true_size = design.plans[0].true_size
-        said = plain(f"the guess's {design.size_name}: {design.text(true_size)}")
-        left.axhline(true_size, color=blocks.RED, lw=1.2, label=said)
-        if design.goal is not None:
-            left.axhline(
-                design.goal, color=blocks.GREEN, lw=1.2, ls="--", label=plain(f"wanted: {design.text(design.goal)}")
-            )
-        least = min([true_size, *(plan.low for plan in design.plans)])
-        left.set_ylim(0.95 * least, max(top, 1.02 * (design.goal or 0)))
-        left.set_xlim(-0.6, len(numbers) - 0.4)
-        left.set_xticks(range(len(numbers)), [str(number) for number in numbers])
-        left.set(xlabel="targets", ylabel=axis_text(f"{design.limit_name} to expect", design.unit))
-        left.set_title(f"{design.plans[0].studies} simulated studies each")
-        sizes = np.linspace(low, high, 241)[1:]
-        right.plot(sizes, design.guess.pod(sizes), color=blocks.INK, label=f"guessed POD, {design.guess.link}")
-        for row, plan in enumerate(plan for plan in design.plans if plan.targets == targets):
-            chosen = ", recommended" if plan is design.recommended.plan else ""
-            label = f"{targets} targets, {PLACED[plan.placement]}{chosen}"
-            y, colour = np.full(targets, -0.08 - 0.08 * row), LOOKS[plan.placement][0]
-            right.plot(plan.sizes, y, "|", ms=9, mew=1.0, label=label, color=colour, clip_on=False)
-        for pod in (0.5, design.plans[0].pod):
-            at = design.guess.size_at(pod)
-            right.plot([at, at], [0, pod], color=blocks.GREY, lw=0.9, ls=":")
-        right.set(ylim=(-0.24, 1.04), xlim=(low, high), yticks=np.linspace(0, 1, 6))
-        right.set(xlabel=axis_text("size", design.unit), ylabel="probability of detection", title="Sizes to make")
-        for axes in (left, right):
-            axes.legend(loc="upper left", bbox_to_anchor=(0, -0.16), ncols=1, borderaxespad=0)
-
-    return draw
+    (left, right), (low, high), plan = canvas.subplots(1, 2), design.range_of_sizes, design.recommended
+    places, true_size = np.arange(len(design.plans)), plan.true_size
+    # infinite where none is demonstrated
+    lows, bounds, ends = np.array([(one.low, one.bound, one.high) for one in design.plans]).T
+    top = max([1.5 * high, *(1.1 * bounds[np.isfinite(bounds)])])
+    left.vlines(places, np.minimum(lows, top), np.minimum(ends, top), color=blocks.BLUE, lw=2.2)
+    left.plot(places, np.minimum(bounds, 9 * top), "o", color=blocks.BLUE, ms=7, mec="white", label="median, 10–90 %")
+    for place, bound, end in zip(places, bounds, ends, strict=True):
+        said = "none" if not np.isfinite(bound) else "↑" if end > top else ""
+        left.text(place, top, said, ha="center", va="top", color=blocks.BLUE)
+    said = plain(f"the guess's {design.size_name}: {design.text(true_size)}")
+    left.axhline(true_size, color=blocks.RED, lw=1.2, label=said)
+    if design.goal is not None:
+        said = plain(f"wanted: {design.text(design.goal)}")
+        left.axhline(design.goal, color=blocks.GREEN, lw=1.2, ls="--", label=said)
+    left.set(xlim=(-0.6, len(places) - 0.4), ylim=(0.95 * min(true_size, *lows), max(top, 1.02 * (design.goal or 0))))
+    left.set_xticks(places, [str(one.targets) for one in design.plans])
+    left.set(xlabel="targets", ylabel=axis_text(f"{design.limit_name} to expect", design.unit))
+    left.set_title(f"{plan.studies} simulated studies each")
+    sizes = np.linspace(low, high, 241)[1:]
+    right.plot(sizes, design.guess.pod(sizes), color=blocks.INK, label=f"guessed POD, {design.guess.link}")
+    style: dict[str, Any] = {"ms": 9, "mew": 1.0, "color": blocks.BLUE, "clip_on": False}
+    right.plot(plan.sizes, np.full(plan.targets, -0.08), "|", label=f"{plan.targets} targets", **style)
+    for pod in (0.5, plan.pod):
+        at = design.guess.size_at(pod)
+        right.plot([at, at], [0, pod], color=blocks.GREY, lw=0.9, ls=":")
+    right.set(ylim=(-0.16, 1.04), xlim=(low, high), yticks=np.linspace(0, 1, 6))
+    right.set(xlabel=axis_text("size", design.unit), ylabel="probability of detection", title="Sizes to make")
+    for axes in (left, right):
+        axes.legend(loc="upper left", bbox_to_anchor=(0, -0.16), ncols=1, borderaxespad=0)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harness.evaluation.pod.statement import POD
 from harness.evaluation.study.efficiency import Efficiency
 from harness.evaluation.study.ideal import SHARES
 from harness.report.blocks import COLOURS, GREY, INK, MARKERS, command_of, figure, heading, note, page, svg
@@ -18,7 +17,6 @@ from harness.tables.limits import name_of
 from harness.tables.text import Grid, percent, size
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 STYLES = ("-", "--", "-.", ":")
@@ -49,55 +47,37 @@ def answer(rows: Sequence[Efficiency]) -> str:
 
 
 def efficiency_figure(rows: Sequence[Efficiency]) -> str:
-    """Draw hits against d' with the curves of all set-ups, and a90 against the ideal observer's."""
+    """Draw each set-up's curve against d' with the shares of hits in classes of it, and the ideal observer's POD."""
     detectors = list(dict.fromkeys(row.limit.record.detector for row in rows))
     others = list(dict.fromkeys((row.limit.record.frames, row.limit.largest_mm) for row in rows))
-
-    def look(row: Efficiency) -> tuple[str, str, str]:
-        which = detectors.index(row.limit.record.detector) % len(COLOURS)
-        other = others.index((row.limit.record.frames, row.limit.largest_mm))
-        return COLOURS[which], STYLES[other % len(STYLES)], MARKERS[other % len(MARKERS)]
-
-    def draw(figure: Figure) -> None:
-        left, right = figure.subplots(1, 2, width_ratios=(3, 2))
-        _against_index(left, rows, look)
-        most = 1.0
-        for row in rows:
-            colour, _, marker = look(row)
-            a90, ideal = row.limit.a90_mm, row.most.ideal_mm
-            if np.isfinite(a90) and np.isfinite(ideal) and a90 <= row.limit.largest_mm:
-                right.plot(ideal, a90, marker, color=colour, ms=6, mec="white", mew=0.7)
-                most = max(most, a90, ideal)
-        right.plot([0, 1.05 * most], [0, 1.05 * most], color=GREY, lw=0.9, ls=":")
-        right.set(xlabel="a90 of the ideal observer (mm)", ylabel="a90 of the detector (mm)")
-        right.set(xlim=(0, 1.05 * most), ylim=(0, 1.05 * most), title="Size found 90 % of the time")
-        figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=1, fontsize=8)
-
-    return svg("against-d", (10.6, 4.6 + 0.17 * len(rows)), "Probability of detection against d', and a90.", draw)
-
-
-def _against_index(axes: Axes, rows: Sequence[Efficiency], look) -> None:  # type: ignore[no-untyped-def]
-    """Draw each set-up's curve and the shares of hits in classes of d', and the ideal observer's probabilities."""
     index, pod = (np.concatenate([getattr(row, name) for row in rows]) for name in ("index", "pod"))
     order = np.argsort(index)
-    axes.plot(index[order], pod[order], color=INK, lw=2.2, label="ideal observer")
-    for row in rows:
-        colour, style, marker = look(row)
-        seen = np.sort(row.index[row.index > 0])
-        if row.curve is not None and len(seen):
-            x = np.geomspace(LEFT, max(seen[-1], 2 * LEFT), 200)
-            name = plain(fill(f"{row.limit.record.detector}: {name_of(row.limit)}", 100))
-            axes.plot(x, row.curve.pod(x), color=colour, ls=style, lw=1.4, label=name)
-        for members in np.array_split(np.argsort(row.index), CLASSES):
-            if len(members):
-                share = row.hits[members].sum() / row.inspections[members].sum()
-                axes.plot(max(np.median(row.index[members]), LEFT), share, marker, color=colour, ms=4, alpha=0.6)
-    for share in SHARES:
-        axes.axhline(share, color=GREY, lw=0.8, ls=":")
-    hits_in_view(axes, 0.03)
-    axes.set(xscale="log", xlabel="d' of the ideal observer", ylabel="share found", title="All damages against d'")
-    axes.set_xlim(left=LEFT)
-    plain_numbers(axes.xaxis, (1, 2, 5))
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        axes.plot(index[order], pod[order], color=INK, lw=2.2, label="ideal observer")
+        for row in rows:
+            colour = COLOURS[detectors.index(row.limit.record.detector) % len(COLOURS)]
+            other = others.index((row.limit.record.frames, row.limit.largest_mm))
+            seen = np.sort(row.index[row.index > 0])
+            if row.curve is not None and len(seen):
+                x = np.geomspace(LEFT, max(seen[-1], 2 * LEFT), 200)
+                name = plain(fill(f"{row.limit.record.detector}: {name_of(row.limit)}", 100))
+                axes.plot(x, row.curve.pod(x), color=colour, ls=STYLES[other % len(STYLES)], lw=1.4, label=name)
+            for members in np.array_split(np.argsort(row.index), CLASSES):
+                if len(members):
+                    share = row.hits[members].sum() / row.inspections[members].sum()
+                    middle = max(float(np.median(row.index[members])), LEFT)
+                    axes.plot(middle, share, MARKERS[other % len(MARKERS)], color=colour, ms=4, alpha=0.6)
+        for share in SHARES:
+            axes.axhline(share, color=GREY, lw=0.8, ls=":")
+        hits_in_view(axes, 0.03)
+        axes.set(xscale="log", xlabel="d' of the ideal observer", ylabel="share found", title="All damages against d'")
+        axes.set_xlim(left=LEFT)
+        plain_numbers(axes.xaxis, (1, 2, 5))
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=1, fontsize=8)
+
+    return svg("against-d", (8.0, 4.6 + 0.17 * len(rows)), "Probability of detection against d'.", draw)
 
 
 def efficiency_parts(rows: Sequence[Efficiency], first: str, warnings: Sequence[str]) -> list[str | Grid]:
@@ -109,9 +89,8 @@ def efficiency_parts(rows: Sequence[Efficiency], first: str, warnings: Sequence[
 def efficiency_html(rows: Sequence[Efficiency], first: str, warnings: Sequence[str], name: str, command: str) -> str:
     """The page as text. It needs no network."""
     caption = (
-        f"Left: share of damages found against d'; lines are probit curves of ln d', points classes of equally many "
-        f"damages. Detectors that lose the same share everywhere have one curve for all sizes and kinds. Right: the "
-        f"size found {100 * POD:.0f} % of the time."
+        "Share of damages found against d'; lines are probit curves of ln d', points classes of equally many damages. "
+        "Detectors that lose the same share everywhere have one curve for all sizes and kinds."
     )
     body = [
         heading("Set-ups"),

@@ -1,7 +1,6 @@
 """Findings of `harness.detect` as rows, files and pictures: CSV, JSON, PNG, and a point cloud with the damage coloured.
 
-All files of one run are written beside their final names first and renamed together at the end.
-"""
+All files of one run are written beside their final names first and renamed together at the end."""
 
 from __future__ import annotations
 
@@ -109,10 +108,8 @@ def write_findings(
     cloud_name: str = outputs.CLOUD.name,
     beside: Mapping[str, Callable[[Path], object]] | None = None,
 ) -> tuple[Path, ...]:
-    """Write all files of a run into ``folder`` (made where it is missing); all of them or none. ``about``: what the
-    JSON says beside the findings (capture, threshold, settings, provenance): plain data. ``beside``: further files by
-    name, each written by its function to the path that it is given. Raises UserError where the folder cannot be written
-    or the disk is full."""
+    """Write all files of a run into ``folder``, or none. ``about``: plain data that the JSON says beside the findings;
+    ``beside``: further files by name with what writes them. Raises UserError where they cannot be written."""
     is_new, (cloud, missing, detections) = not folder.exists(), (judged.cloud, judged.missing, judged.detections)
     writers: dict[str, Callable[[Path], object]] = {
         outputs.FINDINGS.name: lambda path: path.write_text(csv_text(judged.findings), encoding="utf-8"),
@@ -235,8 +232,7 @@ def save_blind_map(path: Path, cloud: Cloud, missing: MissingReturns, detections
 
 
 def save_targets(path: Path, grid: Cloud, outlines: Sequence[np.ndarray], texts: Sequence[str], taken: int) -> None:
-    """Write the PNG: colour, else amplitude, else depth of a grid, with each outline (h, w), its text and its number,
-    counted from 1 as ``taken`` is."""
+    """Write the PNG: colour, amplitude or depth of a grid with outlines (h, w), texts and numbers from 1."""
     import cv2
     from matplotlib.patheffects import withStroke
 

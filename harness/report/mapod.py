@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
 
     from matplotlib.figure import Figure
 
-SIZE_IN = (11.0, 5.0)
+SIZE_IN = (8.6, 5.2)
 BOARDS = Table(
     "boards",
     "one row before any board, and one after each",
@@ -90,48 +89,34 @@ def mapod_parts(found: Mapod) -> list[str | Grid]:
 def mapod_html(found: Mapod, command: str) -> str:
     """The page as text; it needs no network."""
     caption = (
-        "Left: the simulated curve, the one of the real hits (above) and misses (below) alone, and the combined one "
-        "with its 90 % credible band. Right: what is known after each board."
+        "The simulated curve, the one of the real hits (above) and misses (below) alone, and the combined one with its "
+        "90 % credible band."
     )
-    drawn = blocks.svg("mapod", SIZE_IN, answer(found), _drawing(found))
+    drawn = blocks.svg("mapod", SIZE_IN, answer(found), lambda figure: _draw(figure, found))
     body = [blocks.heading("Simulated, measured, combined"), sizes_grid(found).html()]
-    body += [
-        blocks.figure({"mapod": drawn}, "mapod", caption),
-        blocks.heading("After each board"),
-        BOARDS.grid(found.steps).html(),
-    ]
+    body += [blocks.figure({"mapod": drawn}, "mapod", caption)]
+    body += [blocks.heading("After each board"), BOARDS.grid(found.steps).html()]
     body += [blocks.heading("Notes"), blocks.bullets(notes(found)), *blocks.command_of(command)]
     return blocks.page(f"Model-assisted probability of detection: {found.read.path.name}", answer(found), body)
 
 
 def save_mapod_png(path: Path, found: Mapod) -> None:
     """The figure as a PNG at ``path``."""
-    blocks.save_png(path, SIZE_IN, _drawing(found))
+    blocks.save_png(path, SIZE_IN, lambda figure: _draw(figure, found))
 
 
-def _drawing(found: Mapod) -> Callable[[Figure], None]:
-    def draw(figure: Figure) -> None:
-        curves, boards = figure.subplots(1, 2, width_ratios=(3, 2))
-        middle, low, high = found.transfer.band(found.sizes)
-        curves.fill_between(found.sizes, low, high, color=BLUE, alpha=0.16, lw=0)
-        curves.plot(found.sizes, middle, color=BLUE, lw=2.2, label="combined")
-        curves.plot(found.sizes, found.simulated.curve.pod(found.sizes), color=PURPLE, ls="--", label="simulated")
-        if found.measured is not None:
-            curves.plot(
-                found.sizes, found.measured.curve.pod(found.sizes), color=ORANGE, ls=":", lw=2, label="measured"
-            )
-        draw_hits(curves, found.read.size, found.read.response == 1, 0.6)
-        curves.axhline(POD, color=GREY, lw=0.8, ls=":")
-        if found.sizes[0] < found.a90_95 < found.sizes[-1]:
-            curves.plot([found.a90_95], [POD], "o", color=RED, label=f"a90/95: {sized(found.a90_95, 'mm')}")
-        hits_in_view(curves)
-        curves.set(xlim=(found.sizes[0], found.sizes[-1]), xlabel="size (mm)", ylabel="probability of detection")
-        at = np.arange(len(found.steps))
-        boards.plot(at, [step.a90 for step in found.steps], "o-", color=BLUE, label="a90")
-        boards.plot(at, [step.a90_95 for step in found.steps], "v-", color=RED, label="a90/95")
-        boards.set_xticks(at, [f"{step.board}\n{step.hits}/{step.targets}" for step in found.steps])
-        boards.set(xlabel="after board", ylabel="size (mm)", ylim=(0, None))
-        for axes in (curves, boards):
-            axes.legend(loc="upper left", bbox_to_anchor=(0, -0.16), ncols=3, borderaxespad=0)
-
-    return draw
+def _draw(figure: Figure, found: Mapod) -> None:
+    curves = figure.subplots()
+    middle, low, high = found.transfer.band(found.sizes)
+    curves.fill_between(found.sizes, low, high, color=BLUE, alpha=0.16, lw=0)
+    curves.plot(found.sizes, middle, color=BLUE, lw=2.2, label="combined")
+    curves.plot(found.sizes, found.simulated.curve.pod(found.sizes), color=PURPLE, ls="--", label="simulated")
+    if found.measured is not None:
+        curves.plot(found.sizes, found.measured.curve.pod(found.sizes), color=ORANGE, ls=":", lw=2, label="measured")
+    draw_hits(curves, found.read.size, found.read.response == 1, 0.6)
+    curves.axhline(POD, color=GREY, lw=0.8, ls=":")
+    if found.sizes[0] < found.a90_95 < found.sizes[-1]:
+        curves.plot([found.a90_95], [POD], "o", color=RED, label=f"a90/95: {sized(found.a90_95, 'mm')}")
+    hits_in_view(curves)
+    curves.set(xlim=(found.sizes[0], found.sizes[-1]), xlabel="size (mm)", ylabel="probability of detection")
+    curves.legend(loc="upper left", bbox_to_anchor=(0, -0.16), ncols=3, borderaxespad=0)

@@ -18,7 +18,7 @@ from harness.evaluation.summary import (
 )
 from harness.report import blocks, sections
 from harness.report.blocks import COLOURS, MARKERS
-from harness.report.clouds import ExampleCloud, MappedExample, residual_figure, sights_figure
+from harness.report.clouds import ExampleCloud, MappedExample, residual_figure
 from harness.report.perspectives import map_files, map_text, perspectives_html
 from harness.report.posterior import posterior_section
 from harness.report.summaries import Summaries, is_thesis, of_set_ups, summaries, verdicts_of
@@ -46,61 +46,24 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 GUIDE = "#cfd6dd"
-RULER_MM = 25.4 / 16
-"""One graduation of a ruler in 1/16 in, to compare positions with."""
-
-
-def errors_figure(rows: pd.DataFrame) -> str:
-    """Measured less true diameter and distance from the largest hole, by both measures; ``rows``: one for each hole."""
-
-    def draw(figure: Figure) -> None:
-        panels = figure.subplots(1, 2)
-        for axes, what, of, name in zip(
-            panels,
-            ("diameter", "offset"),
-            ("bias", "offset_bias"),
-            ("diameter", "distance from the largest hole"),
-            strict=True,
-        ):
-            reach = 0.006 * float(rows[f"true_{what}_mm"].max())
-            axes.axhspan(-RULER_MM, RULER_MM, color=blocks.PALE, label="±1/16 in")
-            axes.axhline(0, color=blocks.GREY, lw=1)
-            for side, measure, colour in ((-1, "extent", blocks.ORANGE), (1, "model", blocks.BLUE)):
-                seen = rows[rows[f"{measure}_{of}_mm"].notna()]
-                x, std = seen[f"true_{what}_mm"] + side * reach, seen[f"{measure}_{what}_std_mm"].fillna(0)
-                mean = seen[f"{measure}_{of}_mm"]
-                axes.errorbar(x, mean, std, fmt="o", ms=5, capsize=2.5, color=colour, label=measure)
-            axes.set(xlabel=f"true {name} (mm)", ylabel="measured − true (mm)")
-            axes.set_title("Sizes" if what == "diameter" else "Positions")
-        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
-
-    alt = "Error of the measured diameter and of the distance from the largest hole, with one standard deviation."
-    return blocks.svg("errors", (10, 4.2), alt, draw)
 
 
 def rates_figure(main: pd.DataFrame) -> str:
-    """The share of repeats that detected each hole against its diameter, with Wilson intervals, a line for each number
-    of frames."""
+    """The share of repeats that detected each hole against its diameter, Wilson intervals, a line by frames."""
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
         for (frames, rows), colour, marker in zip(main.groupby("frames"), COLOURS, MARKERS, strict=False):
             by_size = rows.groupby("true_diameter_mm")[["rate", "rate_low", "rate_high"]].mean()
             axes.fill_between(by_size.index, by_size["rate_low"], by_size["rate_high"], color=colour, alpha=0.1, lw=0)
-            style: dict[str, Any] = {
-                "marker": marker,
-                "ms": 4,
-                "color": colour,
-                "label": many(int(str(frames)), "frame"),
-            }
+            label = many(int(str(frames)), "frame")
+            style: dict[str, Any] = {"marker": marker, "ms": 4, "color": colour, "label": label}
             axes.plot(by_size.index, by_size["rate"], **style)
         axes.axhline(0.5, color=blocks.GREY, lw=0.8, ls=":")
         axes.set(xlabel="true diameter (mm)", ylabel="share of repeats that detected it", ylim=(-0.03, 1.03))
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
 
-    return blocks.svg(
-        "rates", (5.4, 4.0), "Detection rate of each hole against its diameter, by number of frames.", draw
-    )
+    return blocks.svg("rates", (5.4, 4.0), "Detection rate of each hole against its diameter, by frames.", draw)
 
 
 def limits_figure(compared: pd.DataFrame, layout: Layout, frames: Sequence[int]) -> str:
@@ -119,9 +82,7 @@ def limits_figure(compared: pd.DataFrame, layout: Layout, frames: Sequence[int])
             axes.set_title(many(n, "frame"))
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(layout.rows))
 
-    return blocks.svg(
-        "limits", (1 + 3.2 * len(frames), 3.6), "Smallest diameter found by each set-up, in millimetres.", draw
-    )
+    return blocks.svg("limits", (1 + 3.2 * len(frames), 3.6), "Smallest diameter found by each set-up.", draw)
 
 
 def noise_figure(noise: pd.DataFrame) -> str:
@@ -246,14 +207,9 @@ def set_ups_html(
     compared, costs, posterior = of_set_ups(found[SET_UPS], tables), found[EFFECTS], found.get(POSTERIOR)
     verdict = next(iter(verdicts_of(found)), None)
     layout, frames = Layout.of(tables), sections.shown_frames(compared)
-    middle = max(0, (len(layout.columns) - 1) // 2)
-    clouds = {cloud.variant: cloud for cloud in sorted(examples, key=lambda cloud: cloud.frames)}
-    sights = {row: clouds[names[middle]] for row, names in layout.rows.items() if names[middle] in clouds}
     figures: dict[str, str] = {}
     if len(compared) and layout.column_values and len(layout.rows) <= len(COLOURS):
         figures["limits"] = limits_figure(compared, layout, frames)
-    if costs.empty and 1 < len(sights) == len(layout.rows) <= len(COLOURS):
-        figures["sights"] = sights_figure(sights)
     figures |= {} if costs.empty else {"effects": effects_figure(costs)}
     shown = [row for row in sections.records(compared) if row["frames"] in frames]
     calls = of_set_ups(found[FALSE_CALLS], tables)
@@ -269,7 +225,6 @@ def set_ups_html(
         posterior=blocks.joined(posterior_section(posterior)) if posterior is not None else "",
         found=sections.set_ups_grid(compared).html(),
         costs="" if costs.empty else _costs_grid(costs).html(),
-        sights_at=f" at {layout.columns[middle]}" if layout.columns else "",
         errors=SET_UPS.grid(shown, only=("set-up", "frames", *ERRORS.values())).html(),
         cameras=SET_UPS.grid(shown, only=CAMERA).html(),
         claims=sections.claims_section("The thesis' claim", [verdict] if verdict else []),
@@ -329,11 +284,10 @@ def write_report(
     facts: Mapping[str, Any] | None = None,
     found: Summaries | None = None,
 ) -> Path:
-    """Write ``folder/report.html`` and return its path: the page of one set-up, that of several side by side, or that
-    of maps, with a page beside it for each map of ``examples`` that turns in the browser. ``provenance``: see
-    `harness.report.blocks.closing`; ``facts``: the resolved experiment as plain data; ``found``: of
-    `summaries`. Claims of the thesis are scored where the target is the thesis'. The same input gives the same bytes.
-    Raises UserError where the folder cannot be written."""
+    """Write ``folder/report.html`` and return its path: the page of one set-up, of several side by side, or of maps,
+    with a page beside it for each map of ``examples``. ``provenance``: see `harness.report.blocks.closing`; ``facts``:
+    the resolved experiment as plain data; ``found``: of `summaries`. Claims are scored of the thesis' target. The
+    same input gives the same bytes. Raises UserError where the folder cannot be written."""
     about = sections.About(provenance, experiment_yaml_text, title, is_thesis(facts or {}), facts or {})
     clouds = [example for example in examples if isinstance(example, ExampleCloud)]
     maps = [example for example in examples if isinstance(example, MappedExample)]
@@ -358,7 +312,7 @@ def report_html(
     frames = sorted(int(n) for n in main["frames"].unique())
     clouds = sorted((e for e in examples if e.variant == MAIN), key=lambda e: e.frames)
     last = main[main["frames"] == main["frames"].max()]
-    figures = {"rates": rates_figure(main), "errors": errors_figure(last)} if frames else {}
+    figures = {"rates": rates_figure(main)} if frames else {}
     figures |= {"residual": residual_figure(clouds)} if clouds else {}
     figures |= {"noise": noise_figure(noise)} if len(noise) and (noise["temporal_rms_mm"] > 0).all() else {}
     return sections.sweep_page(

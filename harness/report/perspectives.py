@@ -15,7 +15,6 @@ from harness.evaluation.set_ups import set_ups_of
 from harness.report import blocks, sections
 from harness.report.clouds import MappedExample
 from harness.report.summaries import Summaries, summaries, verdicts_of
-from harness.report.view3d import KINDS, SEVERAL, VIEW_COLOURS
 from harness.tables.outputs import MAPS
 from harness.tables.schema import Table
 from harness.tables.text import many
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-MOST_CLOUDS = 2
 LEADS = {"borne out": "Yes", "not borne out": "Not in every respect", "undecided": "That stays open"}
 MAPS_SHOWN = (
     *("registration", "merge", "views", "found", "from (mm)", "average (mm)", "offset (mm)", "pattern (mm)"),
@@ -44,12 +42,9 @@ def perspectives_html(
     set_ups = compared[~compared["is_variation"]] if len(compared) else compared
     own = tables.registrations[tables.registrations["variant"].isin(set_ups_of(tables))]
     frames = sections.shown_frames(set_ups)[::-1]
-    several = [example for example in _in_order(examples) if example.views > 1]
     figures: dict[str, str] = {}
     if len(own):
         figures["tre"] = tre_figure(own, frames[::-1])
-    if several:
-        figures["merged"] = merged_figure(several[:MOST_CLOUDS])
     if len(set_ups):
         figures["found"] = found_figure(sections.records(set_ups[set_ups["frames"] == frames[0]]))
     rule = (
@@ -84,9 +79,8 @@ def found_figure(rows: Sequence[sections.Row]) -> str:
         axes = figure.subplots()
         ways = dict.fromkeys((row["registration"], row["merge"]) for row in rows)
         for number, way in enumerate(ways):
-            own = sorted(
-                (row["views"], len(row["found"])) for row in rows if (row["registration"], row["merge"]) == way
-            )
+            there = [row for row in rows if (row["registration"], row["merge"]) == way]
+            own = sorted((row["views"], len(row["found"])) for row in there)
             colour, marker = (each[number % len(each)] for each in (blocks.COLOURS, blocks.MARKERS))
             shift = 0.04 * (number - len(ways) / 2)  # so that equal counts stay apart
             views, counts = np.array(sorted(own), float).T
@@ -97,14 +91,11 @@ def found_figure(rows: Sequence[sections.Row]) -> str:
         axes.set_xticks(sorted({row["views"] for row in rows}))
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
 
-    return blocks.svg(
-        "found", (5.4, 4.4), "Number of holes found against the number of views, by way of merging.", draw
-    )
+    return blocks.svg("found", (5.4, 4.4), "Number of holes found against views, by way of merging.", draw)
 
 
 def answer_sentence(cases: Sequence[maps.MapCase], verdicts: Sequence[Verdict] = ()) -> str:
-    """Say what the experiment found: the holes found with one view, and with the most views by the way that finds most;
-    with verdicts those, too."""
+    """Say how many holes one view finds, and the most views by the way that finds most; with verdicts those, too."""
     said = []
     for case in cases:
         alone = case.single()
@@ -175,7 +166,7 @@ def method_text(method: str) -> str:
 
 
 def tre_figure(registrations: pd.DataFrame, frames: Sequence[int]) -> str:
-    """Every registration's error by method, in the plane and across it, with the median and the predicted value."""
+    """Every registration's error by method, in the plane and across it, with the median."""
     methods = list(dict.fromkeys(registrations["method"]))
 
     def draw(figure: Figure) -> None:
@@ -195,9 +186,6 @@ def tre_figure(registrations: pd.DataFrame, frames: Sequence[int]) -> str:
                         axes.plot(spread, values, ls="none", marker=marker, ms=size, color=shade, alpha=0.45)
                     median = good[f"tre_{part}_mm"].median()
                     axes.plot([x - 0.16, x + 0.16], [median] * 2, color=blocks.INK, lw=2, solid_capstyle="butt")
-                    predicted = np.sqrt((good[f"predicted_{part}_mm"].dropna() ** 2).mean())
-                    if predicted > 0:
-                        axes.plot([x], [predicted], marker="D", ms=6, mfc="white", mec=blocks.INK, mew=1.2, ls="none")
             axes.set_yscale("log")
             blocks.plain_decades(axes.yaxis)
             axes.set_xticks(range(len(methods)), [method_text(method) for method in methods])
@@ -209,48 +197,8 @@ def tre_figure(registrations: pd.DataFrame, frames: Sequence[int]) -> str:
         panels[0].set_ylabel("target registration error (mm)")
         panels[-1].plot([], [], "o", ms=4, color=blocks.GREY, label="one registration")
         panels[-1].plot([], [], color=blocks.INK, lw=2, label="median")
-        panels[-1].plot(
-            [], [], marker="D", ms=6, mfc="white", mec=blocks.INK, mew=1.2, ls="none", label="predicted, rms"
-        )
         panels[-1].plot([], [], "x", ms=5, color=blocks.INK, label="failed, not merged")
         figure.legend(*panels[-1].get_legend_handles_labels(), loc="outside lower center", ncols=4)
 
     alt = "Target registration error of every registration in millimetres by method, in the plane and across it."
     return blocks.svg("tre", (10, 4.4), alt, draw)
-
-
-def merged_figure(examples: Sequence[MappedExample]) -> str:
-    """Merged clouds from the front, coloured by the view that each point came from, with rings at the true holes."""
-
-    def draw(figure: Figure) -> None:
-        panels = figure.subplots(len(examples), 1, squeeze=False, sharex=True)[:, 0]
-        turn = np.linspace(0, 2 * np.pi, 49)
-        for axes, example in zip(panels, examples, strict=True):
-            view_of, (x, y, _) = np.asarray(example.scene.view_of), example.scene.points_mm.T
-            palette = np.array([*(VIEW_COLOURS[n % len(VIEW_COLOURS)] for n in range(example.views)), SEVERAL])
-            chosen = np.where(view_of < 0, example.views, np.minimum(view_of, example.views))
-            axes.scatter(x, y, s=1.1, c=palette[chosen], lw=0, rasterized=True)
-            of_kind = {kind: [one for one in example.scene.circles if one.kind == kind] for kind in KINDS}
-            for hole in of_kind["found"] + of_kind["missed"]:
-                radius = max(hole.diameter_mm / 2, 2.5)
-                style = "-" if hole.kind == "found" else (0, (2, 1.5))
-                ring = hole.centre_mm[0] + radius * np.cos(turn), hole.centre_mm[1] + radius * np.sin(turn)
-                axes.plot(*ring, color=blocks.INK, lw=1.1, ls=style)
-            for false in of_kind["false call"]:
-                axes.plot(*false.centre_mm[:2], "x", ms=7, mew=1.6, color=KINDS[false.kind][1])
-            axes.set_aspect("equal")
-            axes.set_ylabel("y (mm)")
-            axes.grid(visible=False)
-            said = f"{many(example.views, 'view')} ({_way(example)}), {many(example.frames, 'frame')} each"
-            found, holes = len(of_kind["found"]), len(of_kind["found"] + of_kind["missed"])
-            axes.set_title(f"{said}: {found} of {holes} holes found in this repeat")
-        panels[-1].set_xlabel("x along the face (mm)")
-        most = max(example.views for example in examples)
-        for view, colour in enumerate(VIEW_COLOURS[:most]):
-            again = " and on" if view + len(VIEW_COLOURS) < most else ""
-            panels[0].plot([], [], "o", ms=5, color=colour, label=f"view {view + 1}{again}")
-        panels[0].plot([], [], "o", ms=5, color=SEVERAL, label="several views")
-        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=min(most + 1, 6))
-
-    alt = "Front view of merged clouds, each point in the colour of the view that it came from."
-    return blocks.svg("merged", (10, 2.35 * len(examples) + 0.7), alt, draw)

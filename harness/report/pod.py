@@ -74,9 +74,8 @@ def pod_html(statement: PodStatement, command: str) -> str:
         body += [subheading("Tests"), Grid.of(("test", "p", "reads"), rows, left=3).html()]
     body += [heading("Notes"), bullets((*statement.notes, VALIDITY)), *command_of(command)]
     under = [note(f"{statement.kind.capitalize()}: {statement.counts}. Model: {statement.model}.")]
-    return page(
-        f"Probability of detection: {statement.read.path.name}", answer(statement), body, under, statement.doubts
-    )
+    title = f"Probability of detection: {statement.read.path.name}"
+    return page(title, answer(statement), body, under, statement.doubts)
 
 
 def pod_parts(statement: PodStatement) -> list[str | Grid]:
@@ -91,13 +90,11 @@ def pod_parts(statement: PodStatement) -> list[str | Grid]:
 
 
 def sizes_grid(statement: PodStatement) -> Grid:
-    """a50, a90 and every bound: size, and how it was found."""
+    """a50, a90 and a90/95: size, and how it was found."""
     of = f", the largest of {len(statement.fits)} models" if len(statement.fits) > 1 else ""
-    bounds = [(statement.bound, f"{statement.bound.method}{of}: the limit to quote")]
-    if statement.independent is not None:
-        bounds.append((statement.independent, "WRONG here: as if every inspection were a target of its own"))
     rows = [(name, sized(getattr(statement, name), statement.unit), "estimate") for name in ("a50", "a90")]
-    rows += [("a90/95", _bound_text(bound, statement.unit), how) for bound, how in bounds]
+    how = f"{statement.bound.method}{of}: the limit to quote"
+    rows.append(("a90/95", _bound_text(statement.bound, statement.unit), how))
     return Grid.of(("", "size", "how"), rows, left=3)
 
 
@@ -248,9 +245,8 @@ def draw_signals(axes: Axes, statement: PodStatement) -> None:
     axes.scatter(statement.read.size[kept], statement.read.response[kept], **marks)
     if ends:
         censored: dict[str, Any] = {"marker": "x", "color": PURPLE, "label": f"censored, {' or '.join(ends)}"}
-        axes.scatter(
-            statement.read.size[~kept], statement.read.response[~kept], s=18, lw=1, rasterized=many, **censored
-        )
+        size, signal = statement.read.size[~kept], statement.read.response[~kept]
+        axes.scatter(size, signal, s=18, lw=1, rasterized=many, **censored)
     if model.log_signal:
         axes.set_yscale("log")
         plain_numbers(axes.yaxis)

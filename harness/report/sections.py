@@ -133,13 +133,8 @@ def varied_section(tables: ResultTables, compared: pd.DataFrame, frames: Sequenc
         "Each row changes something in the one set-up that it names, and is compared with it; ≠: other holes are found."
         " A variation with fewer repeats and hole-free runs has a lower threshold."
     )
-    return joined(
-        [
-            heading("If facts were otherwise"),
-            paragraph(said),
-            VARIED.grid(rows, heads={"changes": ""} if of else None).html(),
-        ]
-    )
+    grid = VARIED.grid(rows, heads={"changes": ""} if of else None)
+    return joined([heading("If facts were otherwise"), paragraph(said), grid.html()])
 
 
 def claims_section(title: str, verdicts: Sequence[Verdict]) -> Markup:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from textwrap import fill, shorten
 from typing import TYPE_CHECKING, Any
 
@@ -18,10 +17,8 @@ from harness.report.pod import MOST_MARKS, plain, plain_numbers
 from harness.report.scene import scene_svg
 from harness.tables import study
 from harness.tables.limits import is_within_sizes, limit_notes, limit_sentence, limits_grid, name_of, study_answer
-from harness.tables.outputs import REPORT
 from harness.tables.schema import Table
 from harness.tables.text import Grid, unbroken
-from harness.vocabulary.files import write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -119,15 +116,13 @@ def _span(limits: Sequence[SetUpLimit]) -> tuple[float, float]:
 
 
 def operating_figure(results: Sequence[SetUpResult]) -> str:
-    """Draw ROC (of a single set-up by classes of size), free-response curve and overlap of regions of each set-up."""
-    by_size = len(results) == 1
+    """Draw ROC, free-response curve and overlap of regions of each set-up."""
 
     def draw(figure: Figure) -> None:
         left, middle, right = figure.subplots(1, 3)
         for result, colour in zip(results, COLOURS, strict=False):
-            for roc, style in zip(result.roc if by_size else result.roc[:1], STYLES, strict=False):
-                label = f"{roc.name}: {roc.area:.3f}" if by_size else f"{roc.area:.3f}"
-                left.plot(roc.false, roc.true, color=colour, ls=style, lw=1.5, label=label)
+            if (roc := result.roc) is not None:
+                left.plot(roc.false, roc.true, color=colour, lw=1.5, label=f"{roc.area:.3f}")
                 left.plot(*roc.at, "o", color=colour, ms=5.5, mec="white", mew=0.8, zorder=5)
             if (curve := result.free_response) is not None:
                 # thresholds without a false call have no place on a logarithmic axis: they stand at its left end
@@ -146,7 +141,7 @@ def operating_figure(results: Sequence[SetUpResult]) -> str:
                 right.plot(x, y, color=colour, lw=1.6, label=area)
         left.plot([0, 1], [0, 1], color=GREY, lw=0.8, ls=":")
         left.set(xlabel="share of unflawed places above", ylabel="share of damages above", xlim=(-0.02, 1))
-        left.set_title("ROC over places" + ("" if by_size else ", all sizes"))
+        left.set_title("ROC over places")
         middle.set(xscale="log", xlabel="false calls per m², undamaged", ylabel="share of damages found")
         plain_numbers(middle.xaxis, (1,))
         middle.plot([], [], "o", color=GREY, ms=6, label="threshold in use")
@@ -161,9 +156,7 @@ def operating_figure(results: Sequence[SetUpResult]) -> str:
         figure.legend(*middle.get_legend_handles_labels(), loc="outside lower center", ncols=2)
 
     lines = sum(-(-len(name_of(one.limit)) // LONGEST_NAME) for one in results)
-    return svg(
-        "operating", (10.6, 4.3 + 0.13 * lines), "Operating curves over all thresholds, a colour for each set-up.", draw
-    )
+    return svg("operating", (10.6, 4.3 + 0.13 * lines), "Operating curves, a colour for each set-up.", draw)
 
 
 ROOM = 1.3
@@ -236,21 +229,6 @@ def axis_figure(axis: study.AxisGroup, name: str) -> str:
     )
 
 
-def write_study_report(
-    folder: Path,
-    result: StudyResult,
-    examples: Sequence[StudyExample],
-    provenance: Mapping[str, Any],
-    resolved_yaml: str,
-    title: str,
-) -> Path:
-    """Write ``folder/report.html`` and return its path. The same input gives the same bytes. Raises UserError where the
-    folder cannot be written."""
-    path = Path(folder) / REPORT.name
-    write_text(path, study_html(result, examples, provenance, resolved_yaml, title))
-    return path
-
-
 def study_parts(result: StudyResult) -> list[str | Grid]:
     """Return what a terminal shows of a study: warnings, limits, what to know beside them, the answer."""
     warnings = [f"warning: {text}" for text in study.threshold_warnings(result.limits)]
@@ -266,7 +244,7 @@ def study_html(
     resolved_yaml: str,
     title: str,
 ) -> str:
-    """Return the page as text; see `write_study_report`."""
+    """Return the page as text; the same input gives the same bytes."""
     limits, rows = result.limits, study.study_tables(result)
     inspections = [limit.record.inspected for limit in limits]
     groups = {f"axis-{number}": group for number, group in enumerate(study.axis_groups(result.axes), 1)}
@@ -313,16 +291,12 @@ def study_html(
         ],
         has_depths=any(seen.limit_of != "depth" and depth_varies(seen.depth_mm) for seen in inspections),
         size_of=" or ".join(dict.fromkeys(seen.size_of for seen in inspections)),
-        surfaces=table(study.SURFACES),
         surface_notes=_surface_notes(result),
         judged=any(limit.false_calls is not None for limit in limits),
         chance=table(study.CHANCE),
         thresholds=table(study.THRESHOLDS),
         threshold_note=study.threshold_note(result.record),
         warnings=[*provenance.get("warnings", ()), *map(unbroken, study.threshold_warnings(limits))],
-        set_by=table(study.SET_BY),
-        signals=table(study.SIGNALS),
-        signal_notes=study.signal_notes(limits),
         operating=table(study.OPERATING),
         operating_notes=study.operating_notes(result.set_ups),
         examples=named,

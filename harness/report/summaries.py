@@ -29,8 +29,7 @@ def is_thesis(facts: Mapping[str, Any]) -> bool:
 
 
 def summaries(tables: trials.ResultTables, examples: Sequence[Any] = (), *, with_claims: bool = True) -> Summaries:
-    """Return all tables that a page shows. ``examples``: pictures that claims are scored with; without
-    ``with_claims`` there are no claims and no posterior."""
+    """Return all tables that a page shows. ``examples``: pictures for claims; ``with_claims``: claims, posterior."""
     paths, set_ups = [str(path) for path in tables.axes["path"]], set_ups_of(tables)
     summary, everything = summarise_holes(tables.holes, paths), [str(name) for name in tables.variants["variant"]]
     found = {trials.SUMMARY: summary, trials.FALSE_CALLS: false_calls(tables.runs)}

@@ -31,8 +31,7 @@ KINDS: dict[Kind, tuple[str, str]] = {
 
 @dataclass(frozen=True)
 class Circle3d:
-    """A damage ("found", "missed" in this repeat) or a finding (by the thesis' measure): ``centre_mm`` (3,), unit
-    ``normal`` (3,), in the cloud's frame."""
+    """A damage or a finding (by the thesis' measure): ``centre_mm`` (3,), unit ``normal`` (3,), in its frame."""
 
     centre_mm: np.ndarray
     normal: np.ndarray
@@ -62,9 +61,8 @@ class Scene3d:
 
 
 def write_view3d(path: Path, scene: Scene3d, title: str) -> Path:
-    """Write one self-contained page that shows the cloud (by WebGL 1) and return its path. Of more than `MOST_POINTS`
-    points all detected ones and a sample of the others are kept. Raises UserError where the file cannot be written,
-    ValueError where no point is finite."""
+    """Write one self-contained page that shows the cloud (by WebGL 1) and return its path; see `MOST_POINTS`. Raises
+    UserError where the file cannot be written, ValueError where no point is finite."""
     write_text(Path(path), view3d_html(scene, title))
     return Path(path)
 

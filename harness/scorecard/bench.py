@@ -2,8 +2,7 @@
 
 A plane z = d + sx x + sy y is exactly linear in 1/z over the rays' slopes: 1/z = (1 - sx X - sy Y) / d. A stack is
 ``z_m`` (n, h, w) of a static scene, NaN where a frame has no range; ``where`` (h, w) bool names the pixels that count:
-those of it that at least half of the frames, and at least two, give a range.
-"""
+those of it that at least half of the frames, and at least two, give a range."""
 
 from __future__ import annotations
 
@@ -67,8 +66,7 @@ class Bench:
     def taken(
         self, view: NoiseFreeView, effects: EffectsConfig, frames: int, *labels: str | int, **settings: Any
     ) -> FrameStack:
-        """Frames of a unit of the camera, with further ``settings`` of `CameraConfig`, before a view; the noise is the
-        stream of the labels."""
+        """Frames of a unit of the camera with ``settings`` of `CameraConfig` before a view; ``labels`` of noise."""
         config = CameraConfig(name=self.camera_name, effects=effects, **settings)
         unit = SimulatedUnit(self.camera, config, view)
         cut = unit.cut
@@ -80,8 +78,7 @@ class Bench:
 
 @dataclass(frozen=True)
 class FrameStack:
-    """Frames of a static scene: ``z_m`` (n, h, w), NaN where invalid; ``true_z_m`` (h, w); ``slopes`` (h, w, 2); the
-    ``region`` of the sensor."""
+    """A static scene: ``z_m`` (n, h, w), NaN where invalid; ``true_z_m`` (h, w); ``slopes`` (h, w, 2); ``region``."""
 
     z_m: np.ndarray
     true_z_m: np.ndarray
@@ -266,8 +263,7 @@ def correlation_at(z_m: np.ndarray, where: np.ndarray | bool, lag_x: int, lag_y:
 
 @dataclass(frozen=True)
 class FixedPattern:
-    """The part of a wall's average that stays after a smooth surface and the temporal noise are taken off: ``std_m``
-    and ``covariance_m2`` (lags 0..20)."""
+    """The error that a wall's average shows beyond a smooth surface and noise: ``std_m``, ``covariance_m2`` (0..20)."""
 
     std_m: float
     covariance_m2: np.ndarray
@@ -307,7 +303,6 @@ LEAST_TOLERANCE_M = 0.5 * MM
 MOST_OF_STEP = 0.45
 FLAT_PX = 8.0
 """Distance from an edge beyond which the camera's filter sees a single surface."""
-WIDTHS = ("gap", "flying", "front_erosion")
 
 
 def on_surface_tolerance_m(sigma_m: float, step_m: float) -> float:
@@ -327,20 +322,17 @@ def edge_widths(
     reach_px: float,
     across: int,
 ) -> dict[str, np.ndarray]:
-    """The `WIDTHS` (n,) in pixels of what frames (n, h, w) show within ``reach_px`` of an edge that lines of pixels
-    along the axis ``across`` cross: pixels without a range; with a range off both surfaces; whose central ray meets the
-    front and that do not show it; and the share of lines ``with_flying`` pixels. All but the gap are NaN where noise
-    hides the step. ``front_z_m``, ``back_z_m`` (h, w): z along each pixel's ray.
-    ``from_edge_px`` (h, w): below 0 on the front, NaN for pixels that do not count."""
+    """Widths (n,) in pixels of what frames (n, h, w) show within ``reach_px`` of an edge that lines of pixels along the
+    axis ``across`` cross: a ``gap`` without a range, ``flying`` pixels with a range off both surfaces, and the share of
+    lines ``with_flying`` ones. All but the gap are NaN where noise hides the step. ``front_z_m``, ``back_z_m`` (h, w):
+    z along each pixel's ray. ``from_edge_px`` (h, w): below 0 on the front, NaN for pixels that do not count."""
     near = np.abs(from_edge_px) <= reach_px
-    z, side = z_m[:, near], from_edge_px[near]
-    shows_front, shows_back = (np.abs(z - surface[near]) <= tolerance_m for surface in (front_z_m, back_z_m))
-    valid = np.isfinite(z)
-    missing = (~valid, valid & ~shows_front & ~shows_back, ~shows_front[:, side < 0])
+    z = z_m[:, near]
+    on_surface = np.any([np.abs(z - surface[near]) <= tolerance_m for surface in (front_z_m, back_z_m)], axis=0)
     lines = np.asarray(near.any(axis=across - 1))
-    found = {name: pixels.sum(axis=1) / lines.sum() for name, pixels in zip(WIDTHS, missing, strict=True)}
     flying = np.zeros(z_m.shape, bool)
-    flying[:, near] = missing[1]
+    flying[:, near] = np.isfinite(z) & ~on_surface
+    found = {"gap": (~np.isfinite(z)).sum(axis=1) / lines.sum(), "flying": flying.sum(axis=(1, 2)) / lines.sum()}
     found["with_flying"] = np.asarray(flying.any(axis=across))[:, lines].mean(axis=1)
     unknown = np.full(len(z_m), np.nan)
     return {name: unknown if np.isnan(tolerance_m) and name != "gap" else each for name, each in found.items()}

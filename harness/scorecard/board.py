@@ -6,8 +6,7 @@ and the hole's peak is the largest deviation behind that surface near its centre
 fitted: set-ups are declared, and all of them are shown.
 
 Not modelled: what lies on the board, the board's relief, what the maker's alignment does between two surfaces (here the
-depth image is interpolated linearly where the board's plane projects to).
-"""
+depth image is interpolated linearly where the board's plane projects to)."""
 
 from __future__ import annotations
 
@@ -88,8 +87,7 @@ class Image:
         return np.asarray((start[:2] - rays[..., :2] * (start[2] / rays[..., 2:])) / MM)
 
     def resampled(self, z_m: np.ndarray, camera: AnyCamera) -> np.ndarray:
-        """Return frames (n, h, w) of the depth camera's sensor as they are aligned to this image: z along its axis, in
-        whole steps of the camera's output."""
+        """Return frames (n, h, w) of the depth camera as aligned to this image, z in whole steps of its output."""
         import cv2
 
         plane = np.concatenate([self.plan_mm * MM, np.zeros((*self.lens.whole.shape, 1))], axis=-1)
@@ -121,8 +119,7 @@ def measured(
     z_m: np.ndarray, image: Image, target: TargetConfig, config: ExperimentConfig, detectors: dict[str, dict[str, Any]]
 ) -> tuple[Readings, np.ndarray]:
     """Measure frames (n, h, w) on the image's pixels; ``detectors``: settings by name, at the experiment's threshold.
-    Returns readings and the holes' peaks in mm (n,), NaN where one is not all in view. Raises UserError where none
-    is."""
+    Returns readings and holes' peaks in mm (n,), NaN where not all in view. Raises UserError where none is."""
     cloud, noises = _cloud(z_m, image), []
     centres, (height, width) = np.array([hole.centre_mm for hole in target.holes]), image.lens.whole.shape
     peaks = np.full(len(centres), np.nan)

@@ -1,8 +1,7 @@
 """Published figures: what others measured or specified of a camera, what the simulation gives, and its judgement.
 
 The file of figures is YAML; adding an entry is all that a further figure needs. Every problem of a file is told at
-once, with its place. A figure that fails has its reason in the file; any other must pass.
-"""
+once, with its place. A figure that fails has its reason in the file; any other must pass."""
 
 from __future__ import annotations
 
@@ -68,8 +67,7 @@ class Published(Config):
         return (-float("inf") if low is None else low), (float("inf") if high is None else high)
 
     def limits(self, near: float, tolerance: float = 0.0) -> tuple[float, float]:
-        """The lowest and highest simulated value that passes: beyond the ends by ``tolerance``, or by the share
-        ``near`` of a published value where that is more."""
+        """Lowest and highest value that passes: ``tolerance`` beyond the ends, or the share ``near`` of it if more."""
         slack = max(tolerance, near * abs(self.value or 0.0))
         return self.ends[0] - slack, self.ends[1] + slack
 
@@ -77,9 +75,8 @@ class Published(Config):
         """``1.42 ± 0.05``, ``below 17``, ``0.15 to 0.35``."""
         if self.value is not None:
             return f"{self.value:g} ± {self.tolerance:g}"
-        words = [
-            f"{key} {bound:g}" for key, bound in (("above", self.above), ("below", self.below)) if bound is not None
-        ]
+        ends = (("above", self.above), ("below", self.below))
+        words = [f"{key} {bound:g}" for key, bound in ends if bound is not None]
         return " to ".join(f"{end:g}" for end in self.ends) if len(words) == 2 else words[0]
 
 

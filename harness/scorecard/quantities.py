@@ -54,10 +54,6 @@ REACH_PX = 44.0
 """Distance from the edge within which pixels are counted: beyond the widest shadow at 0.75 m shorter than 44 pixels."""
 SLANT = 0.1
 """Pixels across for each pixel along: every position of the edge within a pixel occurs, as in ISO 12233."""
-PITCH_PX, COPIES = 22, 4
-"""Distance of plateaus (the largest diameter, and twice the reach of a filter of 11 pixels), and number an axis."""
-R2 = (0.7548776662466927, 0.5698402909980532)
-"""Roberts' low-discrepancy sequence: the plateaus' positions within a pixel."""
 ROOM_LIGHT = CameraConfig().ambient_uw_cm2_nm
 
 Distance = Annotated[float, Field(ge=0.1, le=20.0, description="along the optical axis, in metres")]
@@ -103,15 +99,6 @@ class StepConditions(Config):
     shadow: bool = False
 
 
-class PlateauConditions(Config):
-    """Round plateaus of one height before a plane, at all positions relative to the pixel grid."""
-
-    distance_m: Distance = 0.75
-    diameter_px: Annotated[float, Field(ge=0.5, le=12.0, description="in pixels, 0.5 to 12")] = 3.0
-    albedo: Albedo = 0.6
-    step_mm: StepMm = 18.0
-
-
 _WORDS: dict[str, Callable[[Any], str]] = {
     "distance_m": "{:g} m".format,
     "albedo": "albedo {:g}".format,
@@ -121,7 +108,6 @@ _WORDS: dict[str, Callable[[Any], str]] = {
     "step_mm": "step {:g} mm".format,
     "across": "across {}".format,
     "shadow": lambda v: "shadowed" if v else "",
-    "diameter_px": "⌀ {:g} px".format,
     "patch_px": "patches of {:g} px".format,
     "apart_px": lambda v: f"{v:g} px apart" if v else "",
     "rounded_mm": lambda v: f"stored in steps of {v:g} mm" if v else "",
@@ -168,8 +154,7 @@ QUANTITIES: dict[str, Quantity] = {}
 
 
 def _quantity(title: str, conditions: type[Config]) -> Callable[[Measure], Measure]:
-    """Put a measuring function on the list. Its name is the quantity's, with the unit as its ending; its docstring's
-    first paragraph is what the page says of it."""
+    """List a measuring function by its name, whose ending is the unit; the page quotes its docstring's first lines."""
 
     def listed(measure: Measure) -> Measure:
         name, says = measure.__name__, " ".join((measure.__doc__ or "").partition("\n\n")[0].split())
@@ -245,8 +230,7 @@ def _left_of_patches(z_m: np.ndarray, n: int) -> np.ndarray:
 
 
 def _patch_products(bench: Bench, c: PatchConditions) -> tuple[np.ndarray, np.ndarray]:
-    """(units, patches): variance about each patch's own plane in one frame, mm^2, and mean product of pixels so far
-    apart, of both directions."""
+    """(units, patches): variance about each patch's own plane in one frame, mm^2, and mean product so far apart."""
     n, k, found = c.patch_px, c.apart_px, []
     for unit in range(1, bench.effort.few_frames + 1):
         z_m = plane_stack(bench, _plane(c), PATTERNED, 1, unit, PATTERN_PATCH).z_m[0]
@@ -322,8 +306,7 @@ def frame_jitter_mm(bench: Bench, c: PlaneConditions) -> Reading:
 
 @lru_cache(maxsize=4)
 def _widths(bench: Bench, c: StepConditions) -> dict[str, np.ndarray]:
-    """Widths at a straight edge near the axis: the front is where sign (across - slant along) < 0, in pixels of the
-    undistorted lens about the principal point."""
+    """Widths at a straight edge near the axis; the front is where sign (across - slant along) < 0, in ideal pixels."""
     camera, axis = bench.camera, ("x", "y").index(c.across)
     lens = camera.nominal_lens
     region = bench.patch(*(EDGE_PATCH if axis == 0 else EDGE_PATCH[::-1]))
@@ -370,39 +353,3 @@ def flying_share(bench: Bench, c: StepConditions) -> Reading:
 def step_height_mm(bench: Bench, c: StepConditions) -> Reading:
     """Mean z of the back less that of the front, more than 8 pixels from the edge, noise alone."""
     return mean_of(_widths(bench, c)["height"] / MM)
-
-
-@_quantity("erosion of the front", StepConditions)
-def front_erosion_px(bench: Bench, c: StepConditions) -> Reading:
-    """Width of pixels that look at the front and do not show it."""
-    return mean_of(_widths(bench, c)["front_erosion"])
-
-
-@_quantity("seen share of a step", PlateauConditions)
-def seen_share(bench: Bench, c: PlateauConditions) -> Reading:
-    """Height seen in the middle of a round plateau by its true height."""
-    # plateaus on a grid about the principal point, each at another place within its pixel; the pixel nearest to the
-    # centre of each, where most frames have a range
-    camera, focal_px = bench.camera, [bench.camera.nominal_lens.fx, bench.camera.nominal_lens.fy]
-    v, u = np.mgrid[:COPIES, :COPIES]
-    number, middle = (u + COPIES * v + 1)[..., None], (COPIES - 1) / 2
-    centres = (np.stack([u, v], axis=-1) - middle) * PITCH_PX + (number * np.array(R2)) % 1 - 0.5
-
-    def covers(slopes: np.ndarray) -> np.ndarray:
-        at = np.nan_to_num(slopes, nan=1e3) * focal_px
-        nearest = np.clip(np.round(at / PITCH_PX + middle), 0, COPIES - 1).astype(int)
-        off = at - centres[nearest[..., 1], nearest[..., 0]]
-        return np.asarray((off**2).sum(axis=-1) < (c.diameter_px / 2) ** 2)
-
-    step_m = c.step_mm * MM
-    front, back = Plane(c.distance_m), Plane(c.distance_m + step_m)
-    view = layered_view(camera, bench.patch(COPIES * PITCH_PX, COPIES * PITCH_PX), front, back, covers, c.albedo)
-    stack = bench.taken(view, NOISE, bench.effort.few_frames, "plateaus", digest(c.to_data()))
-    rays = np.pad(centres.reshape(-1, 2) / focal_px, ((0, 0), (0, 1)), constant_values=1.0)
-    columns, rows = np.round(camera.nominal_lens.project(rays)).astype(int).T
-    at = (rows - stack.region.row0, columns - stack.region.col0)
-    z = stack.z_m[:, at[0], at[1]]
-    often = np.isfinite(z).mean(axis=0) > 0.5
-    height = np.full(len(rays), np.nan)
-    height[often] = back.z_along_m(stack.slopes)[at][often] - np.nanmean(z[:, often], axis=0)
-    return mean_of(height / step_m)

@@ -11,8 +11,7 @@ NOT_SIMULATED = float("nan")
 
 @dataclass(frozen=True)
 class OwnFigure:
-    """One figure: ``measured`` on captures, ``simulated`` from the camera file that they gave, and of the nearest
-    ``known`` camera, NaN where there is none."""
+    """One figure: ``measured``, ``simulated`` from the camera file, of the nearest ``known`` camera; NaN without."""
 
     figure: str
     where: str

@@ -18,10 +18,7 @@ COVERAGE = Table(
         Column("y_mm", note="y"),
         Column("z_mm", note="z"),
         Column("area_m2", note="its area"),
-        Column(
-            "a90_mm",
-            note="size found 90 % of the time in the best pose; inf: none that was inspected; empty: not judged",
-        ),
+        Column("a90_mm", note="size found 90 % of the time in the best pose; inf: none inspected; empty: not judged"),
         Column("pose", note="number of that pose"),
         Column("noise_mm", note="deviation of the detector's residual there in that pose; inf: not judged"),
         Column("angle_deg", note="angle of incidence in that pose"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from harness.evaluation.intervals import UNKNOWN
 from harness.evaluation.study.efficiency import Efficiency, Level
@@ -12,13 +12,6 @@ from harness.tables.schema import Column, Estimate, Table
 from harness.tables.text import unbroken
 
 INDEX = "d' of the ideal observer at the damage"
-FEW_FIELDS = "standard error of the size before, by the finite number of noise fields"
-
-
-def _calls() -> Column:
-    name, label, _, note, how = (getattr(CALLS[0], each) for each in ("name", "label", "value", "note", "text"))
-    paths = ("limit.false_calls.rate_per_m2", "limit.false_calls.interval_per_m2")
-    return Column(name, label, paths, note, how)
 
 
 def _ideal_size(level: Level) -> Estimate:
@@ -44,10 +37,8 @@ EFFICIENCY = Table(
             interval=True,
         ),
         Column("ideal_is_at_most", "", "half.at_most", "it misses nothing: its sizes are at most the smallest"),
-        Column("ideal_a50_error_mm", "", "half.ideal_mm_error", FEW_FIELDS),
         Column("a50_mm", "a50 (mm)", lambda one: a50_of(one.limit), "the detector's", interval=True),
         Column("ideal_a90_mm", "ideal a90 (mm)", lambda one: _ideal_size(one.most), "likewise, 90 %", interval=True),
-        Column("ideal_a90_error_mm", "", "most.ideal_mm_error", FEW_FIELDS),
         Column("a90_mm", "a90 (mm)", lambda one: a90_of(one.limit), "the detector's", interval=True),
         Column("ideal_index_50", "", "half.ideal_index", f"{INDEX} at which it finds 50 %"),
         Column("index_50", "d' at 50 %", ("half.index", "half.index_interval"), "at which the detector finds 50 %"),
@@ -65,7 +56,7 @@ EFFICIENCY = Table(
             ("most.efficiency", "most.interval"),
             "(ideal_index_90 / index_90) squared, interval over boards",
         ),
-        _calls(),
+        replace(CALLS[0], value=("limit.false_calls.rate_per_m2", "limit.false_calls.interval_per_m2")),
         Column("units", "", "ideal.units", "units whose noise the ideal observer knows"),
         Column("kurtosis", "", "ideal.kurtosis", "excess kurtosis of that noise; 0: Gaussian"),
         Column("notes", "", "why", "why there is no efficiency"),

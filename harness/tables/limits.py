@@ -1,7 +1,6 @@
 """The table of detection limits, and limits in words: the answer, a sentence for each set-up, notes beside them.
 
-A curve says nothing of sizes that nobody inspected: what lies beyond the largest is written ``> 15.9``.
-"""
+A curve says nothing of sizes that nobody inspected: what lies beyond the largest is written ``> 15.9``."""
 
 from __future__ import annotations
 
@@ -48,8 +47,7 @@ def bound_text(bound: Estimate) -> str:
 
 
 def size_estimate(limit: SetUpLimit, of: str) -> Estimate:
-    """Return a50 or a90 (``of``) with its interval: at most the smallest size where everything was found; unknown where
-    the curve is so flat that it would be below 0."""
+    """Return a50 or a90 (``of``) with its interval; at most the smallest if all is found; unknown if not above 0."""
     size_mm, ends = getattr(limit, f"{of}_mm"), getattr(limit, f"{of}_interval_mm")
     if size_mm <= 0:
         return Estimate(np.nan)
@@ -167,9 +165,8 @@ LIMITS = Table(
         Column(
             "size_error_mm",
             "size error (mm)",
-            ("size_error_mm", "size_error_interval_mm"),
-            "median size of the error of the measured size of hits (the diameter by the model, of long damage its "
-            "width or length), with its 95 % interval over boards",
+            "size_error_mm",
+            "median error of the measured size of hits (the diameter by the model, of long damage its width or length)",
             brief=False,
         ),
         Column("sized", "", "sized", "hits whose size was measured"),
@@ -183,7 +180,6 @@ LIMITS = Table(
         ),
         Column("hits_by_depth", "", lambda one: (_kinds(one) or (None, None))[0], "hits by depth"),
         Column("hits_by_no_return", "", lambda one: (_kinds(one) or (None, None))[1], "hits by missing returns"),
-        Column("hit_rate", "", ("rate", "rate_interval"), "hits by inspections, with an interval over boards"),
         Column("targets", "targets", "targets", "damages, each counted once", brief=False),
         Column("boards", "boards", "boards", "damaged boards"),
         Column("design_effect", "design effect", "design_effect", EFFECT, text.mm, brief=False),
@@ -212,8 +208,7 @@ SCORES = Table(
 
 
 def limits_grid(limits: Sequence[SetUpLimit], *, terminal: bool = False) -> Grid:
-    """Return the table for a page or a terminal; columns on units only where there are several, and with one unit its
-    first words say so."""
+    """Return the table; columns on units only where there are several: with one, its first words say so."""
     if any(limit.over_units for limit in limits):
         return LIMITS.grid(limits, terminal=terminal, heads={"a90/95 (mm)": "all units (mm)", "over boards (mm)": ""})
     grid = LIMITS.grid(limits, terminal=terminal, heads={"new unit (mm)": "", "one unit (mm)": ""})
@@ -226,8 +221,7 @@ def _ends_mm(*limits: SetUpLimit) -> tuple[float, float]:
 
 
 def study_answer(limits: Sequence[SetUpLimit]) -> str:
-    """Return what the study says: a sentence for each set-up, or the span of the limits of many. With one unit of the
-    camera it says so first."""
+    """Return a sentence for each set-up, or the span of the limits of many; with one unit it says so first."""
     if not limits:
         return "No set-up was inspected, so there is no answer."
     said = _answer(limits)
@@ -241,9 +235,8 @@ def _answer(limits: Sequence[SetUpLimit]) -> str:
         return " ".join(limit_sentence(limit, again=number > 0) for number, limit in enumerate(limits))
     shown = sorted((one for one in limits if is_within_sizes(one, quoted(one))), key=lambda one: quoted(one).value)
     if not shown:
-        return (
-            f"None of {len(limits)} set-ups demonstrates a limit (a90/95) within the sizes inspected{_sizes(*limits)}."
-        )
+        said = f"None of {len(limits)} set-ups demonstrates a limit (a90/95) within the sizes inspected"
+        return f"{said}{_sizes(*limits)}."
     kinds = sorted({one.record.inspected.limit_of for one in shown}, reverse=True)
     spans = []
     for kind in kinds:  # a depth is not compared with a diameter
@@ -258,8 +251,7 @@ def _answer(limits: Sequence[SetUpLimit]) -> str:
 
 
 def limit_sentence(limit: SetUpLimit, *, again: bool = False) -> str:
-    """Return ``50 frames: damage of 5.31 mm is found 90 % of the time with 95 % confidence (a90/95), at ...``;
-    ``again``, where that was said, the size alone."""
+    """Return ``50 frames: damage of 5.31 mm is found 90 % ...``; ``again``, where that was said, the size alone."""
     quote, new = quoted(limit), ""
     if limit.over_units is not None:
         new = f" by a new unit of the camera, judged from {limit.over_units.units},"
@@ -300,13 +292,6 @@ def notes_of(limit: SetUpLimit) -> list[str]:
         if limit.a90_95.demonstrated and not is_within_sizes(limit):
             said.append(f"a90/95 {BEYOND}, {limit.largest_mm:.3g} mm, and no inspection bears it out")
         said += [note.partition(": see --")[0] for note in stated.notes if BEYOND not in note]
-        if (wrong := stated.independent) is not None:
-            size = text.size(wrong.value, limit.largest_mm)
-            claimed = f"would be {size} mm" if wrong.demonstrated else "would not be demonstrated either"
-            said.append(
-                f"were every inspection a target of its own, a90/95 {claimed}: wrong, they share {stated.read.targets} "
-                "targets"
-            )
     if limit.a50_mm <= 0:
         said.append("the curve hardly rises with size: it would put sizes found below 0, which are not stated")
     if limit.boards_matter and limit.over_units is None:

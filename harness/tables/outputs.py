@@ -1,5 +1,4 @@
-"""Files that programs leave in a folder of results (those who write them, `harness.clean` and `results/README.md` take
-their names from here)."""
+"""Files that programs leave in a folder of results: `harness.clean` and `results/README.md` know them from here."""
 
 from __future__ import annotations
 
@@ -37,9 +36,7 @@ COVERAGE_PAGE = Output("coverage.html", "a part that turns, coloured by the dama
 ATLAS_PAGE = Output("atlas.html", "the atlas of limits: choose damage, size and distance", of="atlas")
 ATLAS_PICTURE = Output("atlas.png", "the atlas as a picture", of="atlas")
 FINDINGS = Output("findings.csv", "one row per finding", "capture", "capture")
-FINDINGS_DATA = Output(
-    "findings.json", "the same with both measures, target, settings, provenance", "capture", "capture"
-)
+FINDINGS_DATA = Output("findings.json", "the same with both measures, target, settings, origin", "capture", "capture")
 ANNOTATED = Output("annotated.png", "the findings drawn on the depth image", "capture", "capture")
 TARGETS = Output("targets.png", "targets that were found, and the chosen one", "capture", "capture")
 BLIND = Output("blind.png", "where nothing came back", "capture", "capture")

@@ -70,7 +70,7 @@ def _share(share: float | Estimate) -> str:
 FORMATS: dict[str, Callable[[Any], str]] = {
     "_mm": lambda size: size.text() if isinstance(size, Estimate) else text.mm(np.nan if size is None else size),
     "_share": _share,
-    "_area": lambda area: text.UNKNOWN_TEXT if np.isnan(area.value) else area.text(3),
+    "_area": lambda area: text.UNKNOWN_TEXT if area is None or np.isnan(area) else f"{area:.3f}",
     "_p": text.p_value,
     "": lambda value: value.text() if isinstance(value, Estimate) else text.plain(value),
 }

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from harness.evaluation.pod.statement import CONFIDENCE
-from harness.evaluation.study.curves import PRO_LIMIT, PixelCurves, Roc
+from harness.evaluation.study.curves import PRO_LIMIT
 from harness.evaluation.study.limit import SetUpLimit
 from harness.evaluation.study.record import StudyRecord
 from harness.evaluation.study.result import FRAMES, AxisLine, Difference, SetUpResult, StudyResult
@@ -41,43 +40,27 @@ BOUND = "its upper bound at 95 % confidence; empty where not demonstrated"
 SET_UP_OF = Column("set_up", "set-up", "limit.record.label", SET_UP.note, text.unbroken)
 
 
-def _share_text(pod: float | None) -> str:
-    return text.UNKNOWN_TEXT if pod is None else f"{text.percent(pod)} %"
-
-
-def _pod_at_smallest(result: SetUpResult) -> float | None:
-    stated = result.limit.statement
-    return None if stated is None else float(stated.curve.pod(np.array(stated.read.size.min())))
-
-
-SHUFFLED, UNFLAWED = ("chance.probability", "chance.interval"), ("chance.of_sites", "chance.sites_interval")
+UNFLAWED = ("chance.of_sites", "chance.sites_interval")
 CHANCE = Table(
     "chance",
     "one row per set-up and number of frames: how often a damage would be hit by a finding of something else",
     (
         SET_UP_OF,
-        Column("shuffled_share", "shuffled positions (95 %)", SHUFFLED, "places with another board's finding near"),
-        Column("shuffled_pairs", "", "chance.laid", "pairs of a place and a run that this counts"),
+        Column("shuffled_share", "shuffled positions", "chance.probability", "places near another board's finding"),
         Column("unflawed_share", "unflawed places (95 %)", UNFLAWED, "unflawed places that were found"),
         Column("places", "places", "chance.sites", "unflawed places"),
         Column("expected_share", "from the rate", "chance.expected", "hits, were false calls spread evenly"),
-        Column("expected_upper_share", "", "chance.expected_upper", "its upper bound"),
-        Column("pod_at_smallest", "curve at the smallest size", _pod_at_smallest, "of those inspected", _share_text),
     ),
 )
 
 
-def _unseen(limit: SetUpLimit) -> int | None:
-    unseen = limit.record.unflawed.no_return_calls
-    return None if unseen is None else int(unseen.sum())
-
-
-def _ends_text(rate: Estimate) -> str:
-    return text.UNKNOWN_TEXT if np.isnan(rate.low) else text.interval(rate.low, rate.high)
-
-
 GIVEN = "undamaged runs that set it; 0: given"
-OVER_BOARDS = ("false_calls.rate_per_m2", "false_calls_interval_per_m2")
+
+
+def _runs(count: int) -> str:
+    return str(count or "none: given")
+
+
 THRESHOLDS = Table(
     "thresholds",
     "one row per set-up and number of frames: its threshold and the false calls that it lets through on other boards",
@@ -85,31 +68,23 @@ THRESHOLDS = Table(
         SET_UP,
         Column("threshold", "threshold", "record.threshold", "in the detector's units"),
         Column("threshold_mm", "in mm", "record.threshold_mm", "times the mean scale"),
-        Column(
-            "calibration_runs", "calibration runs", "record.calibration_runs", GIVEN, lambda n: str(n or "none: given")
-        ),
+        Column("calibration_runs", "calibration runs", "record.calibration_runs", GIVEN, _runs),
         replace(CALLS[0], label="per m² (95 %)"),
         replace(CALLS[1], label="false calls on other boards"),
         replace(CALLS[2], label="undamaged m²"),
-        Column("no_return_calls", "without return", _unseen, "false calls without return"),
-        Column("over_boards_per_m2", "over boards (95 %)", OVER_BOARDS, "the rate, interval over boards", _ends_text),
     ),
 )
 
 
 @dataclass(frozen=True)
 class SetBy:
-    """The hole-free run whose highest score is a set-up's threshold, its rank, and the highest score of all.
-    ``same_pixels``: runs, itself included, whose highest score lies on the same pixels of the sensor."""
+    """The hole-free run that set a threshold; ``same_pixels``: runs, itself too, that are loudest on its pixels."""
 
     limit: SetUpLimit
     board: int
     x_mm: float
     y_mm: float
-    rank: int
     runs: int
-    highest_score: float
-    highest_board: int
     same_pixels: int | None
 
     @property
@@ -123,39 +98,17 @@ def set_by(limits: Sequence[SetUpLimit]) -> list[SetBy]:
     found = []
     for limit in limits:
         if (runs := limit.record.calibrated) is not None:
-            at, top = int(np.abs(runs.score - limit.record.threshold).argmin()), int(runs.score.argmax())
+            at = int(np.abs(runs.score - limit.record.threshold).argmin())
             place = (int(runs.board[at]), float(runs.x_mm[at]), float(runs.y_mm[at]))
-            rank = 1 + int((runs.score > runs.score[at]).sum())
             same = None
             if runs.u_px is not None and runs.v_px is not None:
                 same = int((np.hypot(runs.u_px - runs.u_px[at], runs.v_px - runs.v_px[at]) <= BLOB_PX).sum())
-            highest = (float(runs.score[top]), int(runs.board[top]))
-            found.append(SetBy(limit, *place, rank, len(runs.score), *highest, same))
+            found.append(SetBy(limit, *place, len(runs.score), same))
     return found
 
 
-SET_BY = Table(
-    "threshold_runs",
-    "one row per calibrated threshold: the finding on an undamaged board that set it",
-    (
-        SET_UP_OF,
-        Column("threshold", "threshold (deviations)", "limit.record.threshold", "in the detector's units"),
-        Column("board", "board", "board", "calibration board"),
-        Column("", "x, y on it (mm)", "place"),
-        Column("x_mm", "", "x_mm", "place of the pixel with the highest score"),
-        Column("y_mm", "", "y_mm", "likewise"),
-        Column("rank", "rank", "rank", "rank of the score among all calibration runs; 1: highest"),
-        Column("runs", "of runs", "runs", "calibration runs"),
-        Column("highest_score", "highest of all", "highest_score", "highest score of all runs"),
-        Column("highest_board", "on board", "highest_board", "its board"),
-        Column("same_pixels", "runs highest on these pixels", "same_pixels", "runs highest on the same pixels"),
-    ),
-)
-
-
 def threshold_warnings(limits: Sequence[SetUpLimit]) -> list[str]:
-    """Return a sentence for each calibrated threshold that is too high for noise to have set it, or that the same
-    pixels of the sensor set on half of the boards."""
+    """Return sentences on calibrated thresholds too high for noise, or set by the same pixels on half of the boards."""
     rows = set_by(limits)
     said, crowded = [], [one for one in rows if (one.same_pixels or 0) > max(one.runs / 2, 1)]
     if crowded:
@@ -191,62 +144,15 @@ def threshold_note(record: StudyRecord) -> str:
     )
 
 
-def _tests(limit: SetUpLimit) -> dict[str, float]:
-    return {} if limit.signals is None else {f"p: {what}": p for what, p, _ in limit.signals.tests}
-
-
-def _against(limit: SetUpLimit) -> str:
-    """Return the assumptions of a regression that its tests speak against."""
-    assert limit.signals is not None
-    return ", ".join(f"{what} (p = {p:.2g})" for what, p, _ in limit.signals.tests if p < 1 - CONFIDENCE) or "nothing"
-
-
-SIGNALS = Table(
-    "signals",
-    "one row per set-up and number of frames whose signals can be regressed on size",
-    (
-        SET_UP,
-        Column("model", "model", "signals.model", "the regression chosen"),
-        Column("", "tests speak against", _against),
-        Column("signals", "signals", lambda one: len(one.signals.read.size), "signals in the regression"),
-        Column("a50_mm", "a50 (mm)", lambda one: Estimate(one.signals.a50, most=one.largest_mm), FOUND_50),
-        Column("a90_mm", "a90 (mm)", lambda one: Estimate(one.signals.a90, most=one.largest_mm), FOUND_90),
-        Column("a90_95_mm", "a90/95 (mm)", lambda one: bound_estimate(one, one.signals.bound), BOUND, bound_text),
-        Column("hits_a90_95_mm", "from hits (mm)", lambda one: bound_estimate(one, one.a90_95), "same", bound_text),
-        Column("p: <test>", "", _tests, "p-value of a test of what the regression takes for granted", spread=True),
-    ),
-    left=3,
-)
-
-
-def signal_notes(limits: Sequence[SetUpLimit]) -> list[str]:
-    """Return why a set-up has no regression, and what to know of a regression that it has."""
-    notes = [f"{name_of(limit)}: no regression: {limit.signals_why}" for limit in limits if limit.signals is None]
-    for limit in limits:
-        said = () if limit.signals is None else limit.signals.notes
-        notes += [f"{name_of(limit)}: {'; '.join(text.unmeasured(note) for note in said)}"] if said else []
-    return notes
-
-
-class OperatingRow(NamedTuple):
-    """A class of sizes of a set-up; ``pixels`` stand in its first row."""
-
-    limit: SetUpLimit
-    roc: Roc | None
-    pixels: PixelCurves | None
-
-
 OPERATING = Table(
     "operating_points",
-    "one row per set-up, number of frames and class of sizes: areas under the curves over all thresholds",
+    "one row per set-up and number of frames: areas under the curves over all thresholds",
     (
         SET_UP_OF,
-        Column("sizes", "sizes", "roc.name", "class of sizes"),
-        Column("damages", "damages", "roc.damages", "damages of the class"),
+        Column("damages", "damages", "roc.damages", "damages inspected"),
         Column("places", "places", "roc.unflawed", "unflawed places"),
-        Column("roc_area", "ROC's area (95 %)", ("roc.area", "roc.area_interval"), "over sites; interval over boards"),
-        Column("pro_area", "AU-PRO (95 %)", ("pixels.pro", "pixels.pro_interval"), "per-region overlap of pixels"),
-        Column("pixel_area", "pixels' ROC's area", ("pixels.auroc", "pixels.auroc_interval"), "ROC of pixels"),
+        Column("roc_area", "ROC's area", "roc.area", "over sites"),
+        Column("pro_area", "AU-PRO", "pixels.pro", "per-region overlap of pixels"),
     ),
 )
 
@@ -255,7 +161,7 @@ def operating_notes(results: Sequence[SetUpResult]) -> list[str]:
     """Return what AU-PRO is, and of which set-ups it could not be had."""
     said = (
         "AU-PRO: mean over damages of the share of pixels above, against undamaged pixels above, up to a share of "
-        f"{PRO_LIMIT:g} and divided by it, as MVTec AD does. Intervals over boards."
+        f"{PRO_LIMIT:g} and divided by it, as MVTec AD does."
     )
     without = [one for one in results if one.pixels is not None and one.pixels.why]
     return [said, *(f"{name_of(one.limit)}: no AU-PRO: {one.pixels.why}." for one in without if one.pixels)]
@@ -389,37 +295,6 @@ def axis_note(group: AxisGroup) -> str:
     )
 
 
-def _at_depth(result: SetUpResult, at: int) -> Estimate:
-    """The diameter found 90 % of the time at the ``at``-th depth."""
-    surface = result.surface
-    assert surface is not None
-    low, high = float(surface.a90_low_mm[at]), float(surface.a90_high_mm[at])
-    return Estimate(float(surface.a90_mm[at]), low, high, surface.diameter_range_mm[1])
-
-
-def _exponent(result: SetUpResult) -> Estimate:
-    assert result.surface is not None
-    slope, ends = result.surface.depth_slope, result.surface.depth_slope_interval
-    return Estimate(-slope, -ends.high, -ends.low)
-
-
-EXPONENT: dict[str, Any] = {"text": lambda power: power.text().replace("-", "−"), "interval": True}
-SURFACES = Table(
-    "depths",
-    "one row per set-up and number of frames with a surface over diameter and depth",
-    (
-        SET_UP_OF,
-        Column("", "depths (mm)", lambda one: "{:.3g} to {:.3g}".format(*one.surface.depth_range_mm)),
-        Column("shallowest_mm", "", lambda one: one.surface.depth_range_mm[0], "least depth inspected"),
-        Column("deepest_mm", "", lambda one: one.surface.depth_range_mm[1], "greatest depth inspected"),
-        Column("a90_shallow_mm", "a90 at the least (mm)", lambda one: _at_depth(one, 0), "there", interval=True),
-        Column("a90_deep_mm", "a90 at the most (mm)", lambda one: _at_depth(one, -1), "there", interval=True),
-        Column("exponent", "a90 ~ depth to the power of", _exponent, "exponent of depth in a90", **EXPONENT),
-        Column("interaction_p", "interaction, p", "surface.interaction_p", "p-value, of diameter and depth"),
-    ),
-)
-
-
 class DepthAt(NamedTuple):
     """The depth that one set-up finds 90 % of the time at one diameter."""
 
@@ -449,7 +324,7 @@ DEPTH_LIMITS = Table(
 )
 
 
-STUDY_TABLES = (LIMITS, THRESHOLDS, SET_BY, CHANCE, SIGNALS, OPERATING, AXES, SURFACES, DEPTH_LIMITS)
+STUDY_TABLES = (LIMITS, THRESHOLDS, CHANCE, OPERATING, AXES, DEPTH_LIMITS)
 
 
 def study_tables(result: StudyResult) -> dict[Table, list[Any]]:
@@ -458,15 +333,8 @@ def study_tables(result: StudyResult) -> dict[Table, list[Any]]:
     return {
         LIMITS: list(limits),
         THRESHOLDS: list(limits),
-        SET_BY: set_by(limits),
         CHANCE: [one for one in set_ups if one.chance is not None],
-        SIGNALS: [one for one in limits if one.signals is not None],
-        OPERATING: [
-            OperatingRow(one.limit, roc, None if k else one.pixels)
-            for one in set_ups
-            for k, roc in enumerate(one.roc or (None,))
-        ],
+        OPERATING: list(set_ups),
         AXES: [row for group in axis_groups(result.axes) for row in axis_rows(group)],
-        SURFACES: [one for one in set_ups if one.surface is not None],
         DEPTH_LIMITS: depths_at(set_ups),
     }

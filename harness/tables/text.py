@@ -40,8 +40,7 @@ def plus_minus(mean: float, std: float, sign: str = "") -> str:
 
 
 def size(value: float, most: float = np.inf) -> str:
-    """Return a limit in mm with two digits, as a study knows it no better; ``> 15.9`` beyond ``most``, the largest size
-    inspected; ``none`` for NaN."""
+    """Return a limit in mm with two digits; ``> 15.9`` beyond ``most``, the largest inspected; ``none`` for NaN."""
     if np.isnan(value) or value > most:
         return "none" if np.isnan(value) else f">\u00a0{most:.3g}"
     return "∞" if np.isinf(value) else f"{value:#.2g}".removesuffix(".") if abs(value) < 99.5 else f"{value:.3g}"
@@ -85,11 +84,6 @@ def many(count: int, what: str) -> str:
 def unbroken(text: str) -> str:
     """Return ``text`` with numbers held to the words after them by unbreakable spaces: ``0.7 m``, ``50 frames``."""
     return re.sub(r"(?<=\d) (?=[^\W\d])", "\u00a0", text)
-
-
-def unmeasured(note: str) -> str:
-    """Return a statement's note without the number of a size that nobody inspected."""
-    return re.sub(r" = \S+ (?=lies (outside|beyond) the)", " ", note)
 
 
 def inches(diameter_mm: float) -> str:

@@ -1,7 +1,6 @@
 """Tables of trials: what each trial measured, and the summaries of experiments that are no study.
 
-Columns are declared by name and note alone; their values come from `harness.engine.trial` and `harness.evaluation`.
-"""
+Columns are declared by name and note alone; their values come from `harness.engine.trial` and `harness.evaluation`."""
 
 from __future__ import annotations
 
@@ -77,7 +76,6 @@ STATISTICS = {
     "offset_mean_mm": "mean distance from the largest hole",
     "offset_std_mm": "its standard deviation",
     "offset_bias_mm": "mean less the true distance",
-    "offset_measured": "trials with a distance",
 }
 BY = (("extent", "the thesis' measure"), ("model", "the model"))
 ERRORS = {
@@ -240,9 +238,7 @@ PIXELS = Table(
     "one row per trial on a study's damaged boards, damage and threshold of a finer grid",
     (
         *(*COMMON, *BOARD, *ROLE),
-        *_columns(
-            hole="damage; empty: undamaged face", pixels="pixels judged", threshold="threshold", above="above it"
-        ),
+        *_columns(hole="damage; empty: intact face", pixels="pixels judged", threshold="threshold", above="above it"),
     ),
     ("variant", "frames", "board", "repeat"),
     ("parquet",),
@@ -308,10 +304,6 @@ SUMMARY = Table(
             model_depth_bias_mm="mean depth less the depth seen",
             median_residual_mm="mean of the trials' median residuals",
             invalid_fraction="mean share of pixels without a range",
-            share_found="share of trials in this state",
-            share_wrong_depth="likewise",
-            share_invalid="likewise",
-            share_invisible="likewise",
             results_version="version of the results",
         ),
     ),
@@ -331,9 +323,7 @@ NOISE_BY_FRAMES = Table(
         Column("pattern_mm", "pattern (mm)", None, "standard deviation over pixels of the mean error", _fine),
         Column("systematic_mm", "systematic (mm)", None, "offset and pattern together", _fine),
         Column("total_rms_mm", "total (mm)", None, "temporal and systematic together", _fine),
-        Column(
-            "displacement_mm", "whole cloud displaced (mm)", None, "deviation of whole clouds, not in others", _fine
-        ),
+        Column("displacement_mm", "whole cloud displaced (mm)", None, "deviation of whole clouds", _fine),
     ),
 )
 FALSE_CALLS = Table(
@@ -406,29 +396,16 @@ REGISTRATION_ERRORS = Table(
         Column("views", "views", note="views of the map"),
         Column("n", "number", note="registrations"),
         Column("failed", "failed", note="registrations that failed"),
-        *_columns(
-            failed_share="their share",
-            failed_low="lower end of Wilson's interval of the share",
-            failed_high="upper end",
-            converged_share="share that converged",
-        ),
         Column("guess_mm", "before (mm)", note="median error of the starting guess"),
         *(
             column
             for part, label in (("in_plane", "in plane"), ("across", "across"))
             for column in (
                 Column(f"{part}_median_mm", f"{label}: median", note="median error"),
-                Column(f"{part}_q90_mm", note="90 % quantile of the error"),
                 Column(f"{part}_rms_mm", "rms", note="root mean square error"),
                 Column(f"{part}_predicted_mm", "predicted", note="error that the covariances predict"),
                 Column(f"{part}_ratio", "ratio", note="actual over predicted error (1: honest)", interval=True),
             )
-        ),
-        *_columns(
-            iterations="median number of iterations",
-            overlap="median share of points with a partner",
-            pairs="median number of pairs",
-            marks="median number of marks trusted",
         ),
         Column("seconds", "time (s)", note="median time"),
         Column("reasons", "why it failed", note="commonest reasons", text=lambda reasons: "; ".join(reasons) or "–"),

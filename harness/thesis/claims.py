@@ -1,12 +1,10 @@
 """The claims on one view (C1 to C6, C9) and on cameras (C11): one rule each, the same for every run.
 
 A verdict needs certainty in either direction: where an interval leaves room for both, it is "undecided". No rule is a
-parameter of the experiment, and none is chosen to make a claim come out.
-"""
+parameter of the experiment, and none is chosen to make a claim come out."""
 
 from __future__ import annotations
 
-import json
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -86,15 +84,13 @@ FEWEST_RANKED = 4
 
 @dataclass(frozen=True)
 class Case:
-    """The tables of one variant that rules judge by, and its averaged clouds. ``units``: the holes with `MANY` frames
-    of this variant and of variations that change the camera's unit alone."""
+    """The tables of one variant that rules judge by, and its averaged clouds."""
 
     variant: str
     summary: pd.DataFrame
     holes: pd.DataFrame
     runs: pd.DataFrame
     probes: pd.DataFrame
-    units: pd.DataFrame
     examples: Sequence[Any] = ()
 
     def found_with_many(self) -> pd.DataFrame:
@@ -130,21 +126,7 @@ def _c3(case: Case) -> tuple[Answer, str]:
         within, outside = interval.within(-1, 1), interval.above(1) or interval.below(-1)
         parts.append(True if within else False if outside else None)
         said.append(f"hole {row['hole']} {f'{ratio:+.1f} ({span(interval, 1)})' if interval.known else '–'}")
-    evidence = f"(mean - true)/std by the thesis' measure: {', '.join(said)}."
-    return decide(parts), f"{evidence} {_between_units(case, rows)}"
-
-
-def _between_units(case: Case, rows: pd.DataFrame) -> str:
-    """Say by how many deviations between units of the camera the mean over units is off; ``rows``: the holes found."""
-    means = case.units.pivot_table("extent_diameter_mm", "variant", "hole")
-    if len(means) < FEWEST_UNITS:
-        return (
-            "Between units: not judged; repeats scatter by the noise only, and one unit's pattern is the same in all."
-        )
-    true = rows.set_index("hole")["true_diameter_mm"]
-    holes = [hole for hole in true.index if hole in means]
-    off = (means[holes].mean() - true[holes]) / means[holes].std(ddof=1)
-    return f"Between {len(means)} units: {', '.join(f'hole {hole} {off[hole]:+.1f}' for hole in holes)}."
+    return decide(parts), f"(mean - true)/std by the thesis' measure: {', '.join(said)}."
 
 
 def _c4(case: Case) -> tuple[Answer, str]:
@@ -197,17 +179,13 @@ def _c6(case: Case) -> tuple[Answer, str]:
     most = len(shapes) / 2
     bowl, cylinder = bowls > most and not cylinders, cylinders > most and not bowls
     answer: Answer = "borne out" if bowl else "not borne out" if cylinder else "undecided"
-    reached = np.array([shape.reached for shape in shapes])
-    known = reached[np.isfinite(reached).all(axis=1)]
-    depths = ", ".join(f"{100 * share:.0f} %" for share in np.median(known, axis=0)) if len(known) else "unknown"
     ratio = float(np.median([shape.bowl_rms_mm / shape.cylinder_rms_mm for shape in shapes]))
     control = sum(shape.true_bowl_rms_mm < shape.true_cylinder_rms_mm for shape in shapes)
     evidence = (
         f"Of {len(shapes)} holes judged, like a bowl: {hole_list(looks['bowl'])}; like a cylinder: "
         f"{hole_list(looks['cylinder'])}; neither clearly: {hole_list(looks['neither'])}. Median misfit of the bowl "
-        f"{ratio:.2f} of the cylinder's. Median share of the true depth reached at 1/4, 1/2 and 3/4 of the radius: "
-        f"{depths} (a hemisphere as deep: 97, 87 and 66 %). Control: the true geometry at the same pixels is nearer "
-        f"to a bowl in {control} of {len(shapes)} holes."
+        f"{ratio:.2f} of the cylinder's. Control: the true geometry at the same pixels is nearer to a bowl in "
+        f"{control} of {len(shapes)} holes."
     )
     return answer, evidence
 
@@ -244,23 +222,19 @@ def score_claims(
     """A verdict for each of `RULES` on one variant. ``summary`` saves making `summarise_holes` again."""
     summary = summarise_holes(tables.holes) if summary is None else summary
     holes = with_columns(tables.holes)
-    alone = tables.variants["settings"].map(lambda text: set(json.loads(text or "{}")) == {CAMERA_UNIT})
-    units = {variant, *tables.variants["variant"][alone]}
     case = Case(
         variant=variant,
         summary=summary[summary["variant"] == variant],
         holes=holes[holes["variant"] == variant],
         runs=tables.runs[tables.runs["variant"] == variant],
         probes=tables.probes[tables.probes["variant"] == variant],
-        units=holes[holes["variant"].isin(units) & (holes["frames"] == MANY)],
         examples=[example for example in examples if example.variant == variant],
     )
     return [verdict_of(claim, *rule(case)) for claim, rule in RULES.items()]
 
 
 def falling_rank(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Spearman's rho of (x, y) and the one-sided p of "y falls as x grows", by permutation: exact up to 8 pairs, 20000
-    fixed random ones beyond. A constant input has rho 0, p 1."""
+    """Spearman's rho and the one-sided p of "y falls as x grows" by permutation, exact to 8 pairs; constant: 0, 1."""
     ranks, other = rankdata(x), rankdata(y)
     if np.ptp(ranks) == 0 or np.ptp(other) == 0:
         return 0.0, 1.0

@@ -2,8 +2,7 @@
 
 The outcome is one cloud of one frame, in which holes 5 to 11 were found, and one of 50, with holes 4 to 11. Each hole's
 chance is (hits + 1/2) / (repeats + 1), so that few repeats neither prove nor exclude anything; holes count as
-independent given the set-up. All set-ups have the same prior probability.
-"""
+independent given the set-up. All set-ups have the same prior probability."""
 
 from __future__ import annotations
 
@@ -67,9 +66,8 @@ def _of_kind(kind: str) -> str:
 
 
 def borne_out_if(posterior: pd.DataFrame) -> str:
-    """Say in one sentence what the thesis' outcome asks for: of each axis the values that are not `DOUBTED`, where one
-    is; and how probable the outcome is in the likeliest set-up. A fact of a kind of hole that is doubted is left
-    out."""
+    """Say in one sentence what the thesis' outcome asks for: of each axis the values that are not `DOUBTED`, and how
+    probable the outcome is in the likeliest set-up; without facts of a kind of hole that is doubted."""
     best, doubted = posterior.iloc[0], posterior["posterior_share"] < DOUBTED * posterior["prior_share"]
     asked = []
     for name, rows in posterior[posterior["axis"] != SET_UP].groupby("axis", sort=False):

@@ -1,8 +1,7 @@
 """The claims on several views (C7, C8, C10) and the thesis' proposal (H1), each for one place of an experiment.
 
 Repeats vary the noise and the error of the nominal poses; the poses, the board and the camera's unit stay the same. So
-C7 is judged over pairs of views, and C8 and C10, which have one pair, over units of the camera.
-"""
+C7 is judged over pairs of views, and C8 and C10, which have one pair, over units of the camera."""
 
 from __future__ import annotations
 
@@ -88,9 +87,8 @@ def _c8(case: maps.MapCase) -> tuple[Answer, str]:
 def _c10(case: maps.MapCase) -> tuple[Answer, str]:
     chosen = [one for one in case.maps if (one.registration, one.merge) == SLAM and one.views > 1]
     chosen.sort(key=lambda one: (not one.is_variation, -one.views))
-    finished = (
-        maps.Map(one.variant, case.frames(one.variant)[-1], one.views) for one in chosen if case.frames(one.variant)
-    )
+    ended = [one for one in chosen if case.frames(one.variant)]
+    finished = (maps.Map(one.variant, case.frames(one.variant)[-1], one.views) for one in ended)
     slam, alone, two = next(finished, None), case.single(), case.named(2, maps.THESIS_REGISTRATION, maps.THESIS_MERGE)
     if slam is None or alone is None or two is None:
         there = {"SLAM map": slam, "single view": alone, "merge of two": two}
@@ -136,8 +134,7 @@ def _c10(case: maps.MapCase) -> tuple[Answer, str]:
 
 
 def rms_gap(first: np.ndarray, second: np.ndarray) -> intervals.Interval:
-    """95 % interval of rms(first) - rms(second) over (repeats, h), NaN left out, by bootstrap over the repeats of each;
-    unknown below two repeats of either."""
+    """95 % interval of rms(first) - rms(second) over (repeats, h), NaN left out, by bootstrap; unknown below two."""
     if min(len(first), len(second)) < 2 or not (np.isfinite(first).any() and np.isfinite(second).any()):
         return intervals.UNKNOWN
     rng = np.random.default_rng(0)

@@ -49,7 +49,6 @@ class AhatFit:
     y: np.ndarray
     below: np.ndarray
     above: np.ndarray
-    target: np.ndarray
     n: int
     targets: int
     per_target: float
@@ -115,7 +114,7 @@ def fit_ahat(
     log_likelihood = line.log_likelihood - (float(y[~(below | above)].sum()) if log_signal else 0.0)  # the Jacobian
     numbers = (float(b0), float(b1), line.tau, covariance, log_likelihood, -2 * log_likelihood)
     axes = (log_size, log_signal, decision, left, right, tuple(notes))
-    return AhatFit(curve, *numbers, x, y, below, above, names, n, targets, per_target, *axes)
+    return AhatFit(curve, *numbers, x, y, below, above, n, targets, per_target, *axes)
 
 
 def choose_axes(
@@ -138,11 +137,10 @@ def choose_axes(
     return tuple(sorted(fits, key=lambda one: one.deviance))
 
 
-def ahat_bound(fit: AhatFit, pod: float = 0.9, confidence: float = 0.95, *, rows_are_targets: bool = False) -> Bound:
-    """One-sided upper bound of the size found with probability ``pod``, the handbook's way: delta method on x, x = mu +
-    z sigma + z_confidence sqrt(V11 + 2 z V12 + z^2 V22), z = Phi^-1(pod). ``rows_are_targets``: the wrong bound that
-    takes each row for a target of its own. Infinite where sigma itself is not told from 0 at this confidence."""
-    curve, v = fit.curve, fit.curve.covariance / (fit.per_target if rows_are_targets else 1.0)
+def ahat_bound(fit: AhatFit, pod: float = 0.9, confidence: float = 0.95) -> Bound:
+    """One-sided upper bound of the size found with probability ``pod`` by the delta method on x: mu + z sigma +
+    z_confidence sqrt(V11 + 2 z V12 + z^2 V22), z = Phi^-1(pod). Infinite where sigma is not told from 0."""
+    curve, v = fit.curve, fit.curve.covariance
     z, quantile = float(stats.norm.ppf(pod)), float(stats.norm.ppf(confidence))
     if curve.sigma**2 <= quantile**2 * v[1, 1]:
         why = "the signal's growth with size is too uncertain at this confidence (band open at large sizes)"
@@ -152,9 +150,8 @@ def ahat_bound(fit: AhatFit, pod: float = 0.9, confidence: float = 0.95, *, rows
 
 
 def ahat_band(fit: AhatFit, sizes: ArrayLike, confidence: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
-    """(lower, upper) POD at ``sizes`` (any shape), each one-sided: the curves through the bounds of all sizes a_p. So
-    the lower one passes 0.9 at `ahat_bound`. (x - mu - z sigma)^2 = z_confidence^2 (V11 + 2 z V12 + z^2 V22) solved for
-    z; 0 and 1 where the band is open."""
+    """(lower, upper) POD at ``sizes`` (any shape), each one-sided, through the bounds of all sizes a_p: (x - mu - z
+    sigma)^2 = z_confidence^2 (V11 + 2 z V12 + z^2 V22) solved for z; 0 and 1 where the band is open."""
     at = np.asarray(sizes, float)
     curve, c = fit.curve, float(stats.norm.ppf(confidence)) ** 2
     (v11, v12), (_, v22) = curve.covariance
@@ -197,9 +194,7 @@ def fit_censored(design: np.ndarray, y: np.ndarray, below: np.ndarray, above: np
     exact = ~(below | above)
     p = design.shape[1]
     if exact.sum() <= p or np.linalg.matrix_rank(design[exact]) < p:
-        said = (
-            f"{exact.sum()} of {len(y)} signals lie between the limits: too few, or at too few sizes, for a regression"
-        )
+        said = f"{exact.sum()} of {len(y)} signals lie between the limits: too few, or at too few sizes, for a line"
         raise UserError(said, legal=f"more than {p} signals that are not censored, at different sizes")
     start = np.linalg.lstsq(design[exact], y[exact], rcond=None)[0]
     rest = y - design @ start
@@ -253,8 +248,8 @@ class Diagnostic(NamedTuple):
 
 
 def diagnose(fit: AhatFit) -> tuple[Diagnostic, ...]:
-    """Test the assumptions of MIL-HDBK-1823A: linearity, equal scatter, normality, independence of rows in their order,
-    and of repeats. Below 20 signals trust none of it; nothing with fewer than `LEAST` between the limits."""
+    """Test the assumptions of MIL-HDBK-1823A: linearity, equal scatter, normality, independence of rows in their order.
+    Below 20 signals trust none of it; nothing with fewer than `LEAST` between the limits."""
     exact = ~(fit.below | fit.above)
     if exact.sum() < LEAST:
         return ()
@@ -273,18 +268,12 @@ def diagnose(fit: AhatFit) -> tuple[Diagnostic, ...]:
     # divisor n in both: mean 2, variance 4 (n - 2) / ((n - 1)(n + 1)) for independent normal values.
     ratio = float(np.sum(np.diff(z) ** 2) / np.sum((z - z.mean()) ** 2))
     score = (ratio - 2) / np.sqrt(4 * (n - 2) / ((n - 1) * (n + 1)))
-    tests = [
+    return (
         Diagnostic("linearity", "quadratic term, likelihood ratio", bend, float(stats.chi2.sf(bend, 1))),
         Diagnostic("equal scatter", "Breusch-Pagan", share, float(stats.chi2.sf(share, 1))),
         Diagnostic("normality", "Anderson-Darling", *_anderson_darling(z)),
         Diagnostic("independence of rows", "Durbin-Watson", ratio, float(2 * stats.norm.sf(abs(score)))),
-    ]
-    # One-way analysis of variance of the residuals over targets: alike within a target, repeats are no targets.
-    groups = [z[fit.target[exact] == name] for name in np.unique(fit.target[exact])]
-    if fit.per_target > 1 and 2 <= len(groups) < n:
-        f, p = stats.f_oneway(*groups)
-        tests.append(Diagnostic("independence of repeats", "ANOVA over targets", float(f), float(p)))
-    return tuple(tests)
+    )
 
 
 def residual_scores(fit: AhatFit) -> np.ndarray:

@@ -67,8 +67,7 @@ def slopes_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.nda
 
 @dataclass(frozen=True)
 class PodCurve:
-    """``mu``, ``sigma`` in the unit of x (size, or its natural logarithm where ``log_size``); ``covariance`` (2, 2) of
-    the two."""
+    """``mu``, ``sigma`` in the unit of x (size, or ln size where ``log_size``); ``covariance`` (2, 2) of the two."""
 
     link: str
     log_size: bool

@@ -1,11 +1,9 @@
-"""Plans of hit/miss studies, made before anybody drills a hole: studies are simulated from a guess of the POD curve and
-analysed as real ones would be."""
+"""Plans of hit/miss studies: studies are simulated from a guess of the POD curve and analysed as real ones would be."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from scipy import stats
@@ -17,19 +15,8 @@ from harness.evaluation.pod.statement import LEAST_TARGETS
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.seeds import random_stream
 
-SPREAD_SHARE = 1 / 3
-"""Share of a concentrated design's targets that is still spread over the whole range: insurance against the guess."""
 RISE = (0.03, 0.97)
 """POD between which a curve counts as rising (MIL-HDBK-1823A: sizes should cover about that)."""
-LEAST_SIGNALS = 40
-"""MIL-HDBK-1823A: independent targets where signals are recorded (a-hat), at least."""
-WORTH = 0.05
-"""Concentrated sizes are recommended where they lower the 90 % quantile of the bound by more than this share: evenly
-spread ones do not rest on the guess. The ratio's Monte Carlo error is 0.028 with 200 studies of 60 targets."""
-CALLS = (0, 1, 2)
-"""Numbers of false calls for which the area of an upper bound is told."""
-Placement = Literal["uniform", "concentrated"]
-PLACEMENTS: tuple[Placement, ...] = ("uniform", "concentrated")
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +26,6 @@ class StudyPlan:
     own; ``demonstrated``: share of studies with a finite bound; ``sizes`` (targets,) to make."""
 
     targets: int
-    placement: Placement
     pod: float
     confidence: float
     method: str
@@ -50,7 +36,6 @@ class StudyPlan:
     high: float
     demonstrated: float
     sizes: np.ndarray
-    notes: tuple[str, ...]
 
 
 def curve_through(a50: float, a90: float, link: str = "logit", *, log_size: bool = False) -> PodCurve:
@@ -65,98 +50,56 @@ def curve_through(a50: float, a90: float, link: str = "logit", *, log_size: bool
     return PodCurve(link, log_size, float(start - sigma * half), sigma, np.zeros((2, 2)))
 
 
+def even_sizes(number: int, range_of_sizes: tuple[float, float]) -> np.ndarray:
+    """Ascending sizes (number,): midpoints of equal parts of the range, so that none is wasted on its very ends."""
+    low, high = range_of_sizes
+    return low + (high - low) * (np.arange(number) + 0.5) / number
+
+
 def design(
     guess: PodCurve,
     targets: Sequence[int],
     range_of_sizes: tuple[float, float],
     *,
-    placements: Sequence[Placement] = PLACEMENTS,
     pod: float = 0.9,
     confidence: float = 0.95,
     studies: int = 200,
     seed: int = 0,
 ) -> tuple[StudyPlan, ...]:
-    """Simulate one `StudyPlan` for each number of targets and placement, in that order; a study takes about 5 ms.
-    Studies are analysed with the guess's link and axis. A study that found all or nothing, or whose POD does not grow
-    with size, demonstrates nothing."""
-    low, high = range_of_sizes
-    true_size, plans = guess.size_at(pod), []
+    """Simulate a `StudyPlan` of evenly spread sizes for each number of targets, analysed with the guess's link, axis. A
+    study that found all or nothing, or whose POD does not grow with size, demonstrates nothing."""
+    plans = []
     for number in targets:
-        for placement in placements:
-            sizes = place_sizes(guess, number, range_of_sizes, placement)
-            stream = random_stream(seed, "pod design", number, placement)
-            bounds = np.full(studies, np.inf)
-            for study, hits in enumerate(stream.random((studies, number)) < guess.pod(sizes)):
-                try:
-                    fit = fit_hit_miss(sizes, hits, link=guess.link, log_size=guess.log_size)
-                except UserError:  # All or nothing found, or POD does not grow with size: nothing is demonstrated.
-                    continue
-                bounds[study] = bound(fit, pod, confidence).value
-            notes = []
-            if number < LEAST_TARGETS:
-                notes.append(f"{number} targets; MIL-HDBK-1823A asks for at least {LEAST_TARGETS}")
-            if not low <= true_size <= high:
-                size = f"the guess's size at POD {pod:g}, {true_size:.4g}"
-                notes.append(f"{size}, lies outside the range: it is extrapolated")
-            # Order statistics, as there is no mean between a number and infinity.
-            least, median, most = np.quantile(bounds, [0.1, 0.5, 0.9], method="inverted_cdf").tolist()
-            shown, told = float(np.mean(np.isfinite(bounds))), (number, placement, pod, confidence, METHOD, studies)
-            plans.append(StudyPlan(*told, true_size, median, least, most, shown, sizes, tuple(notes)))
+        sizes, bounds = even_sizes(number, range_of_sizes), np.full(studies, np.inf)
+        stream = random_stream(seed, "pod design", number, "uniform")
+        for study, hits in enumerate(stream.random((studies, number)) < guess.pod(sizes)):
+            try:
+                fit = fit_hit_miss(sizes, hits, link=guess.link, log_size=guess.log_size)
+            except UserError:  # All or nothing found, or POD does not grow with size: nothing is demonstrated.
+                continue
+            bounds[study] = bound(fit, pod, confidence).value
+        # Order statistics, as there is no mean between a number and infinity.
+        low, median, high = np.quantile(bounds, [0.1, 0.5, 0.9], method="inverted_cdf").tolist()
+        told = (number, pod, confidence, METHOD, studies, guess.size_at(pod))
+        plans.append(StudyPlan(*told, median, low, high, float(np.mean(np.isfinite(bounds))), sizes))
     return tuple(plans)
 
 
-def place_sizes(guess: PodCurve, number: int, range_of_sizes: tuple[float, float], placement: Placement) -> np.ndarray:
-    """Ascending sizes (number,), evenly spaced on the Cartesian scale over the range ("uniform"), or `SPREAD_SHARE` of
-    them so and the rest evenly where the guess rises through `RISE`, cut to the range ("concentrated")."""
-
-    def evenly(n: int, start: float, end: float) -> np.ndarray:
-        """Midpoints of equal parts: no target wasted on the very ends."""
-        return start + (end - start) * (np.arange(n) + 0.5) / max(n, 1)
-
-    low, high = range_of_sizes
-    if placement == "uniform":
-        return evenly(number, low, high)
-    rise = [guess.size_at(share) for share in RISE]
-    start, end = np.clip(rise, low, high).tolist()
-    if not start < end:
-        legal = f"a range that meets {rise[0]:.4g} to {rise[1]:.4g}"
-        raise UserError(f"the guessed curve does not rise between sizes {low:g} and {high:g}", legal=legal)
-    spread = round(number * SPREAD_SHARE)
-    return np.sort(np.concatenate([evenly(spread, low, high), evenly(number - spread, start, end)]))
-
-
-@dataclass(frozen=True)
-class Recommendation:
-    """The ``plan`` to take. ``enough``: it has the handbook's number of targets. ``reaches``: nine of ten of its
-    studies demonstrate the wanted size, None where none was wanted; where it is False no plan does."""
-
-    plan: StudyPlan
-    enough: bool
-    reaches: bool | None
-
-
-def recommend(plans: Sequence[StudyPlan], goal: float | None = None) -> Recommendation:
+def recommend(plans: Sequence[StudyPlan], goal: float | None = None) -> tuple[StudyPlan, bool | None]:
     """Choose the plan with the fewest targets, `LEAST_TARGETS` or more if any plan has them, of whose studies nine of
-    ten demonstrate ``goal`` (None: no wish); the most targets where none do. Evenly spread, unless concentrating is
-    `WORTH` it."""
-    enough = [plan for plan in plans if plan.targets >= LEAST_TARGETS]
+    ten demonstrate ``goal`` (None: no wish); the most targets where none do. Beside it: whether they do."""
+    most = max(plan.targets for plan in plans)
     # Below the handbook's minimum the most targets are nearest to it.
-    allowed = enough or [plan for plan in plans if plan.targets == max(one.targets for one in plans)]
+    allowed = sorted((plan for plan in plans if plan.targets >= min(LEAST_TARGETS, most)), key=lambda one: one.targets)
     reaching = [plan for plan in allowed if goal is None or plan.high <= goal]
-    pool = reaching or allowed
-    number = (min if reaching else max)(plan.targets for plan in pool)
-    by_placement = {plan.placement: plan for plan in pool if plan.targets == number}
-    plan, close = (by_placement.get(placement) or next(iter(by_placement.values())) for placement in PLACEMENTS)
-    if close.high < (1 - WORTH) * plan.high:
-        plan = close
-    return Recommendation(plan, bool(enough), None if goal is None else bool(reaching))
+    return (reaching or allowed[-1:])[0], None if goal is None else bool(reaching)
 
 
 @dataclass(frozen=True)
 class HoleFree:
     """Hole-free boards for a rate of false calls. ``calibration_boards``: the fewest that give a threshold, with
-    ``expected_per_m2`` on average and at most ``upper_per_m2`` with ``confidence``. ``areas_m2``: for each of `CALLS`
-    false calls the area on which no more of them bound the rate by the wanted one."""
+    ``expected_per_m2`` on average and at most ``upper_per_m2`` with ``confidence``. ``silent_m2``: the area without a
+    false call, on ``silent_boards`` other boards, that bounds the rate by the wanted one."""
 
     rate_per_m2: float
     board_m2: float
@@ -164,11 +107,8 @@ class HoleFree:
     calibration_boards: int
     expected_per_m2: float
     upper_per_m2: float
-    areas_m2: tuple[float, ...]
-
-    def boards(self, area_m2: float) -> int:
-        """Number of boards that have this area."""
-        return int(np.ceil(area_m2 / self.board_m2 * (1 - 1e-12)))
+    silent_m2: float
+    silent_boards: int
 
 
 def hole_free(rate_per_m2: float, board_m2: float, confidence: float = 0.95) -> HoleFree:
@@ -179,6 +119,6 @@ def hole_free(rate_per_m2: float, board_m2: float, confidence: float = 0.95) -> 
     fewest = max(int(np.ceil(1 / calling * (1 - 1e-12))) - 1, 1)
     # Any distinct scores: what the rule says of its rates does not depend on them.
     threshold = threshold_for_rate(np.arange(float(fewest)), board_m2, rate_per_m2, confidence)
-    areas = tuple(float(stats.chi2.ppf(confidence, 2 * (calls + 1)) / 2 / rate_per_m2) for calls in CALLS)
-    rates = threshold.rate_per_m2, threshold.upper_per_m2
-    return HoleFree(rate_per_m2, board_m2, confidence, fewest, *rates, areas)
+    area_m2 = float(stats.chi2.ppf(confidence, 2) / 2 / rate_per_m2)
+    silent = area_m2, int(np.ceil(area_m2 / board_m2 * (1 - 1e-12)))
+    return HoleFree(rate_per_m2, board_m2, confidence, fewest, threshold.rate_per_m2, threshold.upper_per_m2, *silent)

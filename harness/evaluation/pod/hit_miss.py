@@ -137,9 +137,7 @@ def fit_hit_miss(
     if targets < n:
         notes += (f"{n} inspections of {targets} targets count as {targets}: variance times {repeats:.4g}",)
         if np.ptp(rows_each):
-            notes += (
-                f"{rows_each.min()} to {rows_each.max()} inspections a target: weighted, each target counts once",
-            )
+            notes += (f"{rows_each.min()} to {rows_each.max()} inspections a target: weighted, each counts once",)
     curve = PodCurve(link, log_size, -b0 / b1, 1.0 / b1, slopes @ covariance @ slopes.T)
     null = float(-2.0 * n * (rate * np.log(rate) + (1.0 - rate) * np.log1p(-rate)))
     numbers = (b0, b1, covariance, -2.0 * log_likelihood, null, log_likelihood, n, int(hits.sum()), targets, repeats)
@@ -275,9 +273,8 @@ REACH = 10
 
 
 def bound(fit: HitMissFit, pod: float = 0.9, confidence: float = 0.95, *, design_effect: float = 1.0) -> Bound:
-    """Upper bound on the size with this POD, a90/95 by default; infinite, with its reason, where there is none.
-    ``design_effect``: what targets that come in clusters multiply the variance by; so it multiplies the criterion (Rao
-    and Scott, Annals of Statistics 12 (1984), 46)."""
+    """Upper bound on the size with this POD; infinite, with its reason, where there is none. ``design_effect``: what
+    targets in clusters multiply variance and criterion by (Rao and Scott, Annals of Statistics 12 (1984), 46)."""
     if not 0 < pod < 1:
         raise UserError(f"POD {pod:g} is out of range", legal="between 0 and 1")
     x, why = _likelihood_bound(fit, pod, criterion(confidence) * design_effect * fit.repeats)
@@ -290,8 +287,7 @@ def bound(fit: HitMissFit, pod: float = 0.9, confidence: float = 0.95, *, design
 
 
 def band(fit: HitMissFit, sizes: np.ndarray, confidence: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper POD at ``sizes`` (n,), each one-sided at ``confidence`` as in `bound`, for drawing: the lower one
-    crosses 90 % at a90/95 to a part in 1e4."""
+    """Lower and upper POD at ``sizes`` (n,), each one-sided as in `bound`: the lower one crosses 90 % at a90/95."""
     x = np.log(np.maximum(sizes, np.finfo(float).tiny)) if fit.curve.log_size else np.asarray(sizes, float)
     outline = _outline(fit, criterion(confidence) * fit.repeats)
     predictors = outline[:, :1] + outline[:, 1:] * (x - fit.centre) / fit.spread

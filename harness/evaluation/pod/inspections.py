@@ -1,8 +1,7 @@
 """Tables of inspections as people have them: CSV in several encodings and number formats, or a sheet of Excel.
 
 A row is one flaw, or one inspection of it. Several response columns (one for each inspector, the handbook's own layout)
-are inspections of the row's flaw. What had to be understood rather than read stands in `Inspections.notes`.
-"""
+are inspections of the row's flaw. What had to be understood rather than read stands in `Inspections.notes`."""
 
 from __future__ import annotations
 
@@ -74,10 +73,8 @@ def read_inspections(
     lines = np.array([line for line, _ in rows], int)
     texts = [[row[column].strip() for _, row in rows] for column in columns]
     sizes = _numbers(path, size, lines, texts[0], notes)
-    each = [
-        (_hits if hits else _numbers)(path, name, lines, text, notes)
-        for name, text in zip(responses, texts[1:], strict=False)
-    ]
+    read_one = _hits if hits else _numbers
+    each = [read_one(path, name, lines, text, notes) for name, text in zip(responses, texts[1:], strict=False)]
     names = np.array(texts[-1]) if target else (lines.astype(str) if len(responses) > 1 else None)
     for line, name in zip(lines, names if target and names is not None else (), strict=False):
         if not name:
@@ -224,8 +221,7 @@ def _rows(path: Path) -> Rows:
 
 
 def _text_rows(path: Path, content: bytes) -> Rows:
-    """Return the rows of a CSV file: UTF-8, UTF-16 with its mark, else Latin-1. The separator is what a line ``sep=``
-    states, else the one that parts the header most."""
+    """Return the rows of a CSV file: UTF-8, UTF-16 or Latin-1; separated as ``sep=`` says, else as suits its header."""
     try:
         text = content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
     except UnicodeDecodeError:
@@ -272,11 +268,8 @@ def _sheet_rows(path: Path, content: bytes) -> Rows:
         raise UserError(f"{path}: has {len(filled)} sheets with data: {', '.join(filled)}", legal=legal, fix=fix)
     rows = next(iter(filled.values()), [])
     # a table may begin in any column, and rows end where their last cell does
-    used = [
-        k
-        for k in range(max((len(row) for _, row in rows), default=0))
-        if any(k < len(row) and row[k] for _, row in rows)
-    ]
+    width = max((len(row) for _, row in rows), default=0)
+    used = [k for k in range(width) if any(k < len(row) and row[k] for _, row in rows)]
     return [(line, [row[k] if k < len(row) else "" for k in range(used[0], used[-1] + 1)]) for line, row in rows]
 
 

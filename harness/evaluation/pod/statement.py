@@ -18,9 +18,7 @@ from harness.evaluation.pod.hit_miss import (
     HitMissFit,
     bound,
     choose_model,
-    fit_hit_miss,
     floor_ceiling_tests,
-    largest_bound,
     near_models,
     widest_band,
 )
@@ -63,8 +61,7 @@ class ModelRow:
 class PodStatement:
     """Statement on inspections, as ``read``; sizes are in ``unit``. ``fits``: of hits, the models over which bound and
     band are the widest, that of the curve first; ``signal``: the regression, None of hits; ``models``: all that were
-    tried; ``independent``: the bound had every row been a target of its own, None where it was; ``numbers``: what else
-    the fit says; ``tests``: (what, p-value, how it reads)."""
+    tried; ``numbers``: what else the fit says; ``tests``: (what, p-value, how it reads)."""
 
     read: Inspections
     kind: str
@@ -73,7 +70,6 @@ class PodStatement:
     signal: AhatFit | None
     models: tuple[ModelRow, ...]
     bound: Bound
-    independent: Bound | None
     numbers: dict[str, float]
     notes: tuple[str, ...]
     tests: tuple[tuple[str, float, str], ...]
@@ -118,8 +114,7 @@ class PodStatement:
 
     @property
     def doubts(self) -> list[str]:
-        """Return warnings where a90/95 of models that fit about equally well differ by more than `APART`, and where the
-        data speak for a floor or a ceiling."""
+        """Return warnings: near models with a90/95 more than `APART` apart; data that speak for floor or ceiling."""
         doubts = [note for note in self.notes if note.endswith(DOUBTED)]
         most = min(row.deviance for row in self.models) + NEAR_DEVIANCE * len(self.read.size) / self.read.targets
         limits = [row.bound.value for row in self.models if row.deviance <= most]
@@ -147,7 +142,6 @@ class PodStatement:
             "a50": finite(self.a50),
             "a90": finite(self.a90),
             "a90_95": _bound_data(self.bound),
-            "if_every_inspection_were_a_target": None if self.independent is None else _bound_data(self.independent),
             "models": models,
             "numbers": {name: finite(value) for name, value in self.numbers.items()},
             "tests": [{"test": what, "p": finite(p), "reads": reads} for what, p, reads in self.tests],
@@ -166,8 +160,7 @@ def state_hits(
 ) -> PodStatement:
     """State the curve of hits and misses: of all links and sizes or their logarithms (of those that ``link``,
     ``log_size`` leave) the fit with the least deviance; its bound is the largest over the `near_models` of those left.
-    Of targets inspected more than once also the limit as if every row had its own. ``tested``: for hits by chance and
-    misses at any size, which takes most of the time."""
+    ``tested``: for hits by chance and misses at any size, which takes most of the time."""
     from threadpoolctl import threadpool_limits
 
     # L-BFGS-B hands systems of four unknowns to LAPACK, whose threads wait for each other: 9 s, not 0.6 s, on two
@@ -177,11 +170,7 @@ def state_hits(
         tried = choose_model(size, hit, inspections=read.target)
         left = [one for one in tried if link in (None, one.curve.link) and log_size in (None, one.curve.log_size)]
         fit, near = left[0], near_models(left)
-        curve, notes, independent = fit.curve, [*read.notes, *fit.notes], None
-        if fit.targets < fit.n:
-            # A fit of its own, because where hits and misses separate the penalty counts targets.
-            axes = [(one.curve.link, one.curve.log_size) for one in near]
-            independent = largest_bound([fit_hit_miss(size, hit, link=of, log_size=log) for of, log in axes])
+        curve, notes = fit.curve, [*read.notes, *fit.notes]
         tests = floor_ceiling_tests(fit) if tested else ()
         models = [(one, bound(one, POD, CONFIDENCE)) for one in tried]
         limit = max((limit for one, limit in models if one in near), key=lambda limit: limit.value)
@@ -205,7 +194,7 @@ def state_hits(
     numbers |= {"log likelihood": fit.log_likelihood, "inspections": float(fit.n)}
     numbers |= {"targets": float(fit.targets), "hits": float(fit.hits)}
     numbers |= false_positives(read)
-    what = (read, "hit/miss", unit, near, None, _models(models, near), limit, independent)
+    what = (read, "hit/miss", unit, near, None, _models(models, near), limit)
     return PodStatement(*what, numbers, tuple(notes), tuple(said))
 
 
@@ -228,7 +217,6 @@ def state_signals(
         raise UserError(f"{read.path}: the axes asked for need logarithms of values <= 0", fix=fix)
     fit, curve = fits[0], fits[0].curve
     limit = ahat_bound(fit, POD, CONFIDENCE)
-    rows = ahat_bound(fit, POD, CONFIDENCE, rows_are_targets=True) if fit.targets < fit.n else None
     (of_mu, common), (_, of_sigma) = curve.covariance.tolist()
     numbers = {"b0": fit.b0, "b1": fit.b1, "tau": fit.tau, "mu": curve.mu, "sigma": curve.sigma}
     numbers |= {"variance of mu": of_mu, "covariance of mu, sigma": common, "variance of sigma": of_sigma}
@@ -238,7 +226,7 @@ def state_signals(
     models = [(one, ahat_bound(one, POD, CONFIDENCE)) for one in tried]
     reads = {True: f"doubtful at {LEVEL:.0%}", False: f"nothing against it at {LEVEL:.0%}"}
     said = [(f"{one.assumption} ({one.test})", one.p_value, reads[one.p_value < LEVEL]) for one in diagnose(fit)]
-    what = (read, "signal against size", unit, (), fit, _models(models, (fit,)), limit, rows)
+    what = (read, "signal against size", unit, (), fit, _models(models, (fit,)), limit)
     return PodStatement(*what, numbers, (*read.notes, *fit.notes), tuple(said))
 
 

@@ -2,15 +2,13 @@
 
 The transfer function says that real damage of size a is as easily found as simulated damage of size a / k, and that the
 curve's rise is w times as wide. Prior: ln k and ln w have a bivariate Student distribution about 0 with `FREEDOM`
-degrees of freedom, whose heavy tails let data that contradict the simulation overrule it; its scale matrix adds the
-simulated curve's own covariance to the squares of the stated scales. Posterior: prior times the likelihood of the real
-hits and misses, on a grid. Sources: MIL-HDBK-1823A, appendix H (model-assisted POD); Thompson et al., Review of
-Progress in QNDE 28 (2009), 1685 (transfer functions); O'Hagan and Pericchi, Brazilian Journal of Probability and
-Statistics 26 (2012), 372 (heavy tails and conflict).
+degrees of freedom, whose heavy tails let data that contradict the simulation overrule it (O'Hagan and Pericchi,
+Brazilian J. Probability and Statistics 26 (2012), 372); its scale matrix adds the simulated curve's own covariance.
+Posterior: prior times the likelihood of the real hits and misses, on a grid. Sources: MIL-HDBK-1823A, appendix H;
+Thompson et al., Review of Progress in QNDE 28 (2009), 1685.
 
-Not modelled: a link other than the simulated curve's, a floor or a ceiling of the real inspections, and real targets
-that share a part; a simulation that is wrong in another way than in size and width is what the test of agreement is
-for."""
+Not modelled: another link, a floor or a ceiling of real inspections, real targets that share a part. What else may be
+wrong with the simulation is what the test of agreement is for."""
 
 from __future__ import annotations
 
@@ -40,8 +38,7 @@ ENOUGH = 1.2
 
 @dataclass(frozen=True)
 class BoardStep:
-    """The knowledge after so many boards: ``a50``, ``a90`` posterior medians, ``a90_95`` the posterior's 95 % quantile
-    of a90; ``enough``: whether the stop rule says to stop."""
+    """After so many boards: posterior medians ``a50``, ``a90``; ``a90_95``: the posterior's 95 % quantile of a90."""
 
     board: str
     targets: int
@@ -58,8 +55,7 @@ class BoardStep:
 
 @dataclass(frozen=True, eq=False)
 class Transfer:
-    """A simulated ``curve``, and the real inspections' ``size`` (n,), ``hit`` (n,) bool and ``board`` (n,) names. Sizes
-    are in the simulation's unit."""
+    """A simulated ``curve`` and real inspections in its unit (n,): ``size``, ``hit`` bool, ``board`` names."""
 
     curve: PodCurve
     size: np.ndarray
@@ -142,9 +138,8 @@ class Transfer:
         weight = self.posterior(np.ones(len(self.size), bool))
         kept = weight > weight.max() * 1e-6
         at = Transfer(self.curve, sizes, np.zeros(len(sizes), bool), sizes)._logs(self.grid[kept])[0]
-        middle, low, high = (
-            np.array([quantile(column, weight[kept], share) for column in np.exp(at).T]) for share in (0.5, 0.05, 0.95)
-        )
+        columns, ends = np.exp(at).T, (0.5, 0.05, 0.95)
+        middle, low, high = (np.array([quantile(one, weight[kept], share) for one in columns]) for share in ends)
         return middle, low, high
 
     def agreement(self, seed: int = 1) -> float:
@@ -216,8 +211,7 @@ class Mapod:
 
     @property
     def a90_95(self) -> float:
-        """The limit to quote: the combined one; where the simulation is contradicted, the larger of it and the measured
-        one, which is infinite where not demonstrated."""
+        """The combined limit; of a contradicted simulation the larger of it and the measured one, maybe infinite."""
         combined = self.steps[-1].a90_95
         if not self.contradicted:
             return combined

@@ -3,16 +3,14 @@
 Hits are fitted against the ideal observer's index d' of each damage instead of its size, by a probit curve of ln d'.
 Where a detector needs d'_p to find a share p and the ideal observer d'_p,ideal, its efficiency is (d'_p,ideal /
 d'_p)^2: the share of independent pixels, or of frames without a fixed pattern, with which the ideal observer would do
-as well (Tanner and Birdsall, J. Acoust. Soc. Am. 30 (1958), 922). Where d'_p is none of those inspected there is no
-efficiency. Hits by missing returns are left out, as the ideal observer does not see these. Intervals draw boards again,
-the same for both."""
+as well (Tanner and Birdsall, J. Acoust. Soc. Am. 30 (1958), 922); unknown where d'_p was not inspected. Hits by missing
+returns are left out, as the ideal observer does not see these."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special
 
 from harness.evaluation.intervals import UNKNOWN, Interval, percentiles
 from harness.evaluation.pod.curve import HitsAndMisses, PodCurve, maxima
@@ -34,13 +32,11 @@ MOST_LOST = 0.01
 
 @dataclass(frozen=True)
 class Level:
-    """Both observers at one share of damages found. ``ideal_mm``: size for the ideal observer, the smallest inspected
-    where it misses none (``at_most``), and its standard error by the finite number of noise fields; d' that it needs,
-    ``ideal_index``, and that the detector needs, ``index``, NaN where unknown; and the efficiency."""
+    """Both observers at one share of damages found: ``ideal_mm``, the smallest inspected where none is missed
+    (``at_most``); d' that each needs (``ideal_index``, ``index``), NaN where unknown; the efficiency."""
 
     ideal_mm: float
     ideal_mm_interval: Interval
-    ideal_mm_error: float
     at_most: bool
     ideal_index: float
     index: float
@@ -72,9 +68,8 @@ class Efficiency:
 
 
 def expected_sizes(x: np.ndarray, pod: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return (2, d) the values of x (n,) with POD of 50 and 90 % on probit curves of ln x through probabilities ``pod``
-    (n,), under each of the weights (d, n); infinite where hardly one is found, the smallest x where hardly one is
-    missed."""
+    """Return (2, d) values of x (n,) with POD of 50 and 90 % on probit curves of ln x through shares ``pod`` (n,)
+    under weights (d, n); infinite where hardly one is found, the smallest x where hardly one is missed."""
     log = np.log(x)
     centre, spread = float(log.mean()), float(log.std()) or 1.0
     design = np.column_stack([np.ones_like(log), (log - centre) / spread])
@@ -94,16 +89,11 @@ def efficiency_of(limit: SetUpLimit, ideal: IdealDamages) -> Efficiency:
     place = {key: number for number, key in enumerate(zip(ideal.board.tolist(), ideal.hole.tolist(), strict=True))}
     rows = np.array([place[key] for key in zip(seen.board.tolist(), seen.hole.tolist(), strict=True)])
     kept, first, which = np.unique(rows, return_index=True, return_inverse=True)
-    size_mm, pod, without = seen.diameter_mm[first], ideal.pod[kept], ideal.without[:, kept]
+    size_mm, pod = seen.diameter_mm[first], ideal.pod[kept]
     index = np.maximum(ideal.index[kept], LEAST_INDEX)
     hits, inspections = np.bincount(which, hit), np.bincount(which).astype(float)
     weights = np.vstack([np.ones(len(kept)), row_weights(ideal.board[kept])])
     ideal_mm, ideal_index = expected_sizes(size_mm, pod, weights), _means(ideal.needed[:, kept], weights)
-    # d' without a part of the noise moves the probability along the normal curve
-    moved = [special.ndtr(special.ndtri(pod) + other - ideal.index[kept]) for other in without]
-    parts = np.array([expected_sizes(size_mm, other, weights[:1])[:, 0] for other in moved])
-    with np.errstate(invalid="ignore"):
-        error_mm = np.sqrt((len(parts) - 1) * parts.var(axis=0))
     curve, why, needed = None, "", np.full((2, 1 + DRAWS), np.nan)
     try:
         fit = fit_hit_miss(index[which], hit, link=LINK, log_size=True, inspections=which)
@@ -119,7 +109,7 @@ def efficiency_of(limit: SetUpLimit, ideal: IdealDamages) -> Efficiency:
     except UserError as error:
         why = error.message
     all_found = bool((1.0 - pod).sum() <= HARDLY)
-    half, most = (_level(*each, all_found) for each in zip(ideal_mm, error_mm, ideal_index, needed, strict=True))
+    half, most = (_level(*each, all_found) for each in zip(ideal_mm, ideal_index, needed, strict=True))
     board, hole, exact, threshold = (getattr(ideal, name)[kept] for name in ("board", "hole", "index", "threshold"))
     of_damage = (board, hole, size_mm, exact, threshold, pod, hits, inspections)
     return Efficiency(limit, ideal, half, most, *of_damage, curve, why)
@@ -132,9 +122,7 @@ def _means(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
         return np.asarray((np.where(known, values, 0.0) @ weights.T) / (known @ weights.T))
 
 
-def _level(
-    ideal_mm: np.ndarray, error_mm: float, ideal_index: np.ndarray, needed: np.ndarray, all_found: bool
-) -> Level:
+def _level(ideal_mm: np.ndarray, ideal_index: np.ndarray, needed: np.ndarray, all_found: bool) -> Level:
     """One share of damages found; arrays (1 + draws,), the estimate first."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         share = (ideal_index / needed) ** 2
@@ -142,7 +130,6 @@ def _level(
     return Level(
         ideal_mm=float(ideal_mm[0]),
         ideal_mm_interval=percentiles(ideal_mm[1:]),
-        ideal_mm_error=float(error_mm),
         at_most=all_found,
         ideal_index=float(ideal_index[0]),
         index=float(needed[0]),

@@ -10,8 +10,7 @@ maxima on the pixels; a damage is found where any pixel about its place exceeds 
 C is stationary but for its scale: C = D R D, with the deviations D of each pixel and the autocovariance R of noise in
 deviations, pooled over boards and units and faded out by Parzen's window. Not modelled: tails that are not Gaussian,
 noise that differs within damage, information in missing returns, size and depth as unknowns (a bank of templates has a
-higher threshold).
-"""
+higher threshold)."""
 
 from __future__ import annotations
 
@@ -41,8 +40,6 @@ NEAR_CORRELATION = 0.2
 """Places that are correlated by less with the damage's own do not add to its detection."""
 SHARES = (0.5, 0.9)
 """Shares of damages found at which observers are compared."""
-FOLDS = 5
-"""Parts of the noise fields that are left out in turn."""
 RANGE = (1.0, 12.0)
 """Thresholds in deviations between which the wanted one is sought."""
 
@@ -89,8 +86,7 @@ class NoiseSums:
         return float(self.fourth / self.pixels / (self.products[middle, middle] / self.pixels) ** 2 - 3.0)
 
     def power(self, shape: tuple[int, int]) -> np.ndarray:
-        """Return the power spectrum on a periodic grid of ``shape``, 2 m + 1 pixels at least, ordered as by
-        `scipy.fft.rfft2`."""
+        """Return the power spectrum on a periodic grid of ``shape``, ordered as by `scipy.fft.rfft2`."""
         image = np.zeros(shape)
         image[np.ix_(LAGS, LAGS)] = self.autocovariance
         power = scipy.fft.rfft2(image).real
@@ -138,8 +134,7 @@ def inverse_times(images: np.ndarray, known: np.ndarray, sums: NoiseSums) -> np.
 
 
 def detectability(signals: np.ndarray, surface: np.ndarray, known: np.ndarray, sums: NoiseSums) -> np.ndarray:
-    """Return d' (n,) of signals (n, h, w) in deviations of the noise, before a surface of unknown coefficients of the
-    images ``surface`` (p, h, w), likewise in deviations."""
+    """Return d' (n,) of signals (n, h, w) before an unknown sum of images ``surface`` (p, h, w), both in deviations."""
     whitened = inverse_times(np.concatenate([surface, signals]), known, sums)
     flat = whitened.reshape(len(whitened), -1)
     gram = flat @ np.concatenate([surface, signals]).reshape(len(flat), -1).T
@@ -252,9 +247,8 @@ class BoardView:
 @dataclass(frozen=True, eq=False)
 class IdealDamages:
     """The ideal observer on damages, (n,) each: ``board``, ``hole``, ``index`` (d'), ``threshold`` (NaN where d' is 0)
-    and ``pod``. ``needed`` (2, n): d' at which shares of `SHARES` are found. ``without`` (g, n): d' with each of g
-    parts of the noise left out in turn, whose scatter is the error of d'. ``units`` and excess ``kurtosis`` of the
-    noise; ``lost``: greatest share of a board's damage without return."""
+    and ``pod``. ``needed`` (2, n): d' at which shares of `SHARES` are found. ``units`` and excess ``kurtosis``
+    of the noise; ``lost``: greatest share of a board's damage without return."""
 
     board: np.ndarray
     hole: np.ndarray
@@ -262,7 +256,6 @@ class IdealDamages:
     threshold: np.ndarray
     pod: np.ndarray
     needed: np.ndarray
-    without: np.ndarray
     units: int
     kurtosis: float
     lost: float
@@ -271,10 +264,8 @@ class IdealDamages:
 def ideal_damages(views: Sequence[BoardView], calls_per_m2: float) -> IdealDamages:
     """Judge the damages of a set-up's boards at a rate of false calls. The noise of all boards is pooled."""
     sums = reduce(add, (view.sums for view in views))
-    parts = [reduce(add, (view.sums for view in views[part::FOLDS])) for part in range(min(FOLDS, len(views)))]
-    rest = [sums - part for part in parts] if len(parts) > 1 else [sums]
     rows: list[tuple[int, str, float, float, float]] = []
-    at_shares, without = [], []
+    at_shares = []
     for view in views:
         signals, surface = (images / view.deviation_m * view.known for images in (view.signals_m, view.surface))
         seen = signals.any(axis=(1, 2))
@@ -284,7 +275,6 @@ def ideal_damages(views: Sequence[BoardView], calls_per_m2: float) -> IdealDamag
             if d == 0.0:
                 rows.append((view.board, hole, 0.0, np.nan, 0.0))
                 at_shares.append([np.nan] * len(SHARES))
-                without.append([0.0] * len(rest))
                 continue
             field = responses(signal, sums)
             square = field[LONGEST_LAG_PX, LONGEST_LAG_PX]
@@ -292,9 +282,6 @@ def ideal_damages(views: Sequence[BoardView], calls_per_m2: float) -> IdealDamag
             needed = needed_indices(field / square, threshold)
             rows.append((view.board, hole, d, threshold, detection_probability(needed, d)))
             at_shares.append([index_for(needed, share) for share in SHARES])
-            others = (responses(signal, other)[LONGEST_LAG_PX, LONGEST_LAG_PX] for other in rest)
-            without.append([d * float(np.sqrt(other / square)) for other in others])
     boards, holes, indices, thresholds, pods = (np.array(column) for column in zip(*rows, strict=True))
     units, lost = sum(view.units for view in views), max(view.lost for view in views)
-    of_damages = (boards, holes, indices, thresholds, pods, np.array(at_shares).T, np.array(without).T)
-    return IdealDamages(*of_damages, units, sums.kurtosis, lost)
+    return IdealDamages(boards, holes, indices, thresholds, pods, np.array(at_shares).T, units, sums.kurtosis, lost)

@@ -33,7 +33,7 @@ from harness.evaluation.pod.curve import (
 )
 from harness.evaluation.pod.hit_miss import METHOD, largest_bound
 from harness.evaluation.pod.inspections import Inspections
-from harness.evaluation.pod.statement import CONFIDENCE, POD, PodStatement, state_hits, state_signals
+from harness.evaluation.pod.statement import CONFIDENCE, POD, PodStatement, state_hits
 from harness.evaluation.study.record import Inspected, SetUpRecord, Unflawed
 from harness.evaluation.study.units import OverUnits, over_units
 from harness.vocabulary.errors import UserError
@@ -69,10 +69,10 @@ def targets_of(board: np.ndarray, hole: np.ndarray, size_mm: np.ndarray, hit: np
     return Targets(board[first], size_mm[first], hits, inspections)
 
 
-def board_weights(boards: int, draws: int = DRAWS, population: str = "damaged") -> np.ndarray:
-    """Draw boards again: (draws, boards) how often each is in each draw; the same for the same number of boards of a
-    population, so that set-ups are paired; two populations ("damaged", "hole-free") are drawn independently."""
-    return _drawn(random_stream(0, "boards drawn again", population, boards), boards, draws)
+def row_weights(board: np.ndarray, draws: int = DRAWS, population: str = "damaged") -> np.ndarray:
+    """Draw boards again: (draws, n) how often the ``board`` (n,) of each row is in each draw; alike for as many boards
+    of a population, so that set-ups are paired; two populations ("damaged", "hole-free") are drawn independently."""
+    return np.concatenate([weights for (weights,) in weights_in_blocks(draws, (board, population))])
 
 
 def _drawn(stream: np.random.Generator, boards: int, draws: int) -> np.ndarray:
@@ -81,15 +81,8 @@ def _drawn(stream: np.random.Generator, boards: int, draws: int) -> np.ndarray:
     return stream.multinomial(boards, np.full(boards, 1.0 / boards), size=draws).astype(float)
 
 
-def row_weights(board: np.ndarray, draws: int = DRAWS, population: str = "damaged") -> np.ndarray:
-    """Lay `board_weights` on rows that belong to ``board`` (n,): (draws, n)."""
-    names, which = np.unique(board, return_inverse=True)
-    return board_weights(len(names), draws, population)[:, which]
-
-
 def weights_in_blocks(draws: int, *rows: tuple[np.ndarray, str]) -> Iterator[tuple[np.ndarray, ...]]:
-    """Yield the `row_weights` of one or several (board (n,), population) in blocks of draws, so that memory does not
-    grow with draws times rows."""
+    """Yield the `row_weights` of one or several (board (n,), population) in blocks of draws, to bound the memory."""
     found = [(*np.unique(board, return_inverse=True), population) for board, population in rows]
     streams = [random_stream(0, "boards drawn again", of, len(names)) for names, _, of in found]
     at_once = max(1, CELLS // max(1, *(len(which) for _, which, _ in found)))
@@ -100,9 +93,8 @@ def weights_in_blocks(draws: int, *rows: tuple[np.ndarray, str]) -> Iterator[tup
 
 
 def refitted_sizes(targets: Targets, curve: PodCurve, pods: tuple[float, ...], draws: int = DRAWS) -> np.ndarray:
-    """Refit ``curve``'s link and axis to boards drawn again: (len(pods), draws) sizes in mm with these PODs, by Firth's
-    likelihood where hits and misses do not overlap. Infinite where nothing is found or the chance does not grow with
-    size; the smallest size inspected where everything is found."""
+    """Refit ``curve``'s link and axis to boards drawn again: (len(pods), draws) sizes in mm, by Firth's likelihood
+    where hits and misses part. Infinite where nothing is found or POD does not grow; smallest where everything is."""
     rows = [(targets.board, "damaged")] + ([] if targets.unit is None else [(targets.unit, "units")])
     blocks = (_refitted(targets, curve, pods, np.multiply.reduce(w)) for w in weights_in_blocks(draws, *rows))
     return np.concatenate(list(blocks), axis=1)
@@ -163,37 +155,24 @@ LINKS = ("logit", "probit")
 LEAST_RATIO = 1.2
 """Deepest over shallowest damage below which a coefficient of depth would be guesswork."""
 STEPS = 25
-"""Depths at which a90 is drawn, and diameters at which the depth found is, in equal ratios over those inspected."""
-
-
-Contour = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""Sizes (k,), the other size with a POD of 90 % there (k,), and the ends of its interval (k,)."""
+"""Diameters at which the depth found is drawn, in equal ratios over those inspected."""
 
 
 @dataclass(frozen=True, eq=False)
 class PodSurface:
-    """``b`` (4,): coefficients of 1, ln a, ln d and ln a ln d, sizes in mm, the last 0 unless ``interaction_p``, its
-    p-value, is below 5 %. ``depth_mm`` (k,), ``a90_mm`` (k,) with ``a90_low_mm``, ``a90_high_mm`` (k,) 95 % percentiles
-    over boards, which hold the truth in some 87 % of studies of 30 boards; ``diameter_mm``, ``d90_mm``, ``d90_low_mm``,
-    ``d90_high_mm`` (k,): the depth found 90 % of the time at each diameter, likewise; infinite where depth does not
-    help. ``depth_slope``: minus d ln a90 / d ln depth at the mean logarithms, with its interval. ``diameter_range_mm``,
-    ``depth_range_mm``: inspected. ``note``: what to know beside it, or ""."""
+    """``b`` (4,): coefficients of 1, ln a, ln d and ln a ln d, sizes in mm, the last 0 unless its p-value,
+    ``interaction_p``, is below 5 %. ``diameter_mm``, ``d90_mm``, ``d90_low_mm``, ``d90_high_mm`` (k,): the depth found
+    90 % of the time at each diameter, infinite where depth does not help, with 95 % percentiles over boards, which hold
+    the truth in some 87 % of studies of 30 boards. ``depth_range_mm``: inspected. ``note``: what to know, or ""."""
 
     link: str
     b: np.ndarray
     interaction_p: float
     deviance: float
-    depth_mm: np.ndarray
-    a90_mm: np.ndarray
-    a90_low_mm: np.ndarray
-    a90_high_mm: np.ndarray
     diameter_mm: np.ndarray
     d90_mm: np.ndarray
     d90_low_mm: np.ndarray
     d90_high_mm: np.ndarray
-    depth_slope: float
-    depth_slope_interval: Interval
-    diameter_range_mm: tuple[float, float]
     depth_range_mm: tuple[float, float]
     note: str = ""
 
@@ -251,25 +230,13 @@ def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | No
     b0, b1, b2, b3 = np.vstack([b, np.pad(again, ((0, 0), (0, 4 - terms)))]).T[..., None]
     many = len(np.unique(seen.board)) > 1
 
-    def contour(own: np.ndarray, other: np.ndarray, at_mm: np.ndarray) -> Contour:
-        """Sizes of POD 90 % at the other sizes ``at_mm`` (k,), with the ends of their intervals; ``own`` and ``other``
-        (draws + 1, 1) are their coefficients."""
-        slope = own + b3 * np.log(at_mm)
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            found = np.where(slope > 0, np.exp((level - b0 - other * np.log(at_mm)) / slope), np.inf)
-        ends = [percentiles(column) if many else UNKNOWN for column in found[1:].T]
-        return at_mm, found[0], np.array([end.low for end in ends]), np.array([end.high for end in ends])
-
-    of_depth, of_diameter = (
-        contour(b1, b2, np.geomspace(*depths, STEPS)),
-        contour(b2, b1, np.geomspace(*diameters, STEPS)),
-    )
-    with np.errstate(divide="ignore", invalid="ignore"):
-        rise = b1 + b3 * d.mean()
-        slopes = np.where(rise > 0, (b2 + b3 * a.mean()) / rise, np.nan)[:, 0]
-    of_slope = percentiles(slopes[1:]) if many else UNKNOWN
-    whole = (*of_depth, *of_diameter, float(slopes[0]), of_slope, diameters, depths, note)
-    return PodSurface(link, b, p, deviance, *whole), ""
+    at_mm = np.geomspace(*diameters, STEPS)
+    slope = b2 + b3 * np.log(at_mm)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        found = np.where(slope > 0, np.exp((level - b0 - b1 * np.log(at_mm)) / slope), np.inf)
+    ends = [percentiles(column) if many else UNKNOWN for column in found[1:].T]
+    low, high = np.array([(end.low, end.high) for end in ends]).T
+    return PodSurface(link, b, p, deviance, at_mm, found[0], low, high, depths, note), ""
 
 
 def _coefficients(
@@ -304,14 +271,11 @@ WIDER = 1.1
 class SetUpLimit:
     """Sizes in mm, diameters or depths (`Inspected.limit_of`). ``statement``: curve, band and bounds from hits, None
     where none can be fitted, and ``why``. ``a90_95``: the limit to quote; infinite where not demonstrated.
-    ``a90_draws_mm`` (B,): over boards drawn again, in one order for all set-ups of as many boards. ``over_boards``:
-    a90/95 were damages of one board as alike as the data say. Where everything is found the estimates are the smallest
-    size inspected, which they do not exceed; where nothing is, or POD does not grow with size, they are NaN and their
-    draws infinite. ``signals``: a second opinion, the signal's regression with the threshold as decision, or
-    ``signals_why`` not. ``over_units``: limits of the units of a study with several and of a new one; draws are then
-    over boards and units. ``beside``: findings on damaged boards that count for no damage. ``size_error_mm``: median
-    size of the error of the diameter of those ``sized``, hits whose diameter a model gives. ``seconds_detect``: median
-    a cloud."""
+    ``a90_draws_mm`` (B,): over boards (and units) drawn again, in one order for all set-ups of as many boards.
+    ``over_boards``: a90/95 were damages of one board as alike as the data say. Where everything is found the estimates
+    are the smallest size inspected, which they do not exceed; where nothing is, or POD does not grow with size, they
+    are NaN and their draws infinite. ``beside``: findings on damaged boards that count for no damage.
+    ``size_error_mm``: median error of the size of hits ``sized`` by a model. ``seconds_detect``: median a cloud."""
 
     record: SetUpRecord
     statement: PodStatement | None
@@ -328,17 +292,12 @@ class SetUpLimit:
     targets: int
     hits: int
     inspections: int
-    rate: float
-    rate_interval: Interval
     false_calls: FalseCallRate | None
     false_calls_interval_per_m2: Interval
-    signals: PodStatement | None
-    signals_why: str
     largest_mm: float
     over_units: OverUnits | None
     beside: FalseCallRate | None
     size_error_mm: float = np.nan
-    size_error_interval_mm: Interval = UNKNOWN
     sized: int = 0
     seconds_detect: float = np.nan
 
@@ -357,12 +316,9 @@ class SetUpLimit:
         return bool(np.isfinite(self.design_effect) and self.over_boards.value > WIDER * self.a90_95.value)
 
 
-def limit_of(
-    record: SetUpRecord, *, draws: int = DRAWS, noise_floor: float = np.nan, tested: bool = False
-) -> SetUpLimit:
-    """Judge ``record``. ``noise_floor``: signals up to this are what unflawed places give too, so they enter the
-    regression of signals as censored; NaN where unknown. ``tested``: for a floor and a ceiling too, with a note.
-    Deterministic. No error for data without a curve: ``why``."""
+def limit_of(record: SetUpRecord, *, draws: int = DRAWS, tested: bool = False) -> SetUpLimit:
+    """Judge ``record``. ``tested``: for a floor and a ceiling too, with a note. Deterministic. Data without a curve are
+    no error: ``why``."""
     seen = record.inspected
     targets = targets_of(seen.board, seen.hole, seen.size_mm, seen.hit)
     statement: PodStatement | None = None
@@ -370,7 +326,7 @@ def limit_of(
     units: OverUnits | None = None
     if n:
         try:
-            statement, why = state_hits(_rows(record, seen.hit, np.ones(n, bool)), unit="mm", tested=tested), ""
+            statement, why = state_hits(_rows(record), unit="mm", tested=tested), ""
         except UserError as error:
             why = error.message
     if statement is not None:
@@ -405,41 +361,13 @@ def limit_of(
         a50 = a90 = np.nan
         a90_95 = over_boards = Bound(POD, CONFIDENCE, METHOD, np.inf, f"not demonstrated: {why}")
         of_a50 = of_a90 = np.full(draws, np.inf)
-    rate_interval = UNKNOWN
-    if targets.hits.sum() not in (0.0, targets.inspections.sum()):
-        rate_interval = _over_boards(targets.board, targets.hits, targets.inspections, draws, "damaged")
     calls, calls_interval = _false_calls(record.unflawed, draws, "hole-free")
     beside, _ = _false_calls(record.beside, draws, "damaged")
-    judged = np.isfinite(seen.signal)  # where no pixel was judged there is no signal
-    signals: PodStatement | None = None
-    signals_why = f"{int(judged.sum())} signals"
-    if judged.sum() > 2:
-        decision = record.threshold
-        left = None if np.isnan(noise_floor) else min(noise_floor, decision)
-        try:
-            read = _rows(record, seen.signal, judged)
-            signals, signals_why = state_signals(read, decision=decision, left=left, unit="mm"), ""
-        except UserError as error:
-            signals_why = error.message
     ends = (UNKNOWN, UNKNOWN) if statement is None else (percentiles(of_a50), percentiles(of_a90))
-    counts = (targets.boards, len(targets.board), int(seen.hit.sum()), n, float(seen.hit.mean()) if n else np.nan)
+    counts = (targets.boards, len(targets.board), int(seen.hit.sum()), n)
     estimates = (a90_95, a50, a90, of_a90, *ends, over_boards, effect)
     largest_mm = float(seen.size_mm.max()) if n else np.nan
-    further = (signals_why, largest_mm, units, beside)
-    return SetUpLimit(
-        record, statement, why, *estimates, *counts, rate_interval, calls, calls_interval, signals, *further
-    )
-
-
-def median_over_boards(board: np.ndarray, values: np.ndarray, draws: int = DRAWS) -> tuple[float, Interval]:
-    """Return the median of values (n,) and its 95 % percentiles over boards drawn again; NaN of none."""
-    if not len(values):
-        return np.nan, UNKNOWN
-    order = np.argsort(values, kind="stable")
-    blocks = weights_in_blocks(draws, (board[order], "damaged"))
-    sums = (np.cumsum(weights, axis=1) for (weights,) in blocks)
-    drawn = values[order][np.concatenate([(2.0 * below >= below[:, -1:]).argmax(axis=1) for below in sums])]
-    return float(np.median(values)), percentiles(drawn) if len(np.unique(board)) > 1 else UNKNOWN
+    return SetUpLimit(record, statement, why, *estimates, *counts, calls, calls_interval, largest_mm, units, beside)
 
 
 def target_names(seen: Inspected) -> np.ndarray:
@@ -452,24 +380,17 @@ def _false_calls(runs: Unflawed | None, draws: int, population: str) -> tuple[Fa
     if runs is None or not len(runs.board):
         return None, UNKNOWN
     rate = false_call_rate(int(runs.calls.sum()), float(runs.area_m2.sum()))
-    return rate, _over_boards(runs.board, runs.calls, runs.area_m2, draws, population) if rate.calls else UNKNOWN
+    if not rate.calls or len(np.unique(runs.board)) < 2:
+        return rate, UNKNOWN
+    blocks = weights_in_blocks(draws, (runs.board, population))
+    return rate, percentiles(np.concatenate([(w @ runs.calls) / (w @ runs.area_m2) for (w,) in blocks]))
 
 
-def _over_boards(board: np.ndarray, count: np.ndarray, of: np.ndarray, draws: int, population: str) -> Interval:
-    """95 % percentiles of sum(count) / sum(of) over boards drawn again; unknown of a single board."""
-    if len(np.unique(board)) < 2:
-        return UNKNOWN
-    blocks = weights_in_blocks(draws, (board, population))
-    return percentiles(np.concatenate([(weights @ count) / (weights @ of) for (weights,) in blocks]))
-
-
-def _rows(record: SetUpRecord, response: np.ndarray, kept: np.ndarray) -> Inspections:
-    seen, names = record.inspected, target_names(record.inspected)[kept]
-    column = "hit" if response.dtype == bool else "signal"
+def _rows(record: SetUpRecord) -> Inspections:
+    seen, names = record.inspected, target_names(record.inspected)
     target = names if len(np.unique(names)) < len(names) else None
-    values = np.asarray(response[kept], float)
-    lines = np.flatnonzero(kept) + 1
-    return Inspections(Path(record.label), seen.limit_of, column, seen.size_mm[kept], values, target, lines)
+    lines = np.arange(1, len(names) + 1)
+    return Inspections(Path(record.label), seen.limit_of, "hit", seen.size_mm, seen.hit.astype(float), target, lines)
 
 
 def _all_found(size_mm: np.ndarray, what: str) -> Bound:

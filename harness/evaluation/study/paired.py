@@ -1,7 +1,6 @@
-"""Two set-ups compared: hits and a90 board by board, their limits, and their false calls. Boards are the unit: damages
-of one board share its render, its pose and its surface, so they are not exchanged one by one. Not in any test of hits
-and limits: that each set-up drew its own calibration of the threshold; the tests of signals and of false calls have it.
-A gate needs a margin for that (`harness.evaluation.study.verdict`). Of two one-sided p the first is of being worse."""
+"""Two set-ups compared: hits, a90, signals and false calls. Boards are the unit: damages of one board share its render,
+its pose and its surface. The tests of hits and limits do not know that each set-up drew its own calibration of the
+threshold; those of signals and of false calls do. Of two one-sided p the first is of being worse."""
 
 from __future__ import annotations
 
@@ -12,11 +11,8 @@ import numpy as np
 from scipy.stats import betabinom, binomtest, hypergeom, norm
 
 from harness.evaluation.intervals import Interval, percentiles
-from harness.evaluation.pod.curve import HitsAndMisses, maxima
-from harness.evaluation.pod.statement import POD
-from harness.evaluation.study.limit import SetUpLimit, crossings, targets_of
+from harness.evaluation.study.limit import SetUpLimit
 from harness.evaluation.study.record import Inspected, SetUpRecord, Unflawed
-from harness.vocabulary.seeds import random_stream
 
 Tails = tuple[float, float]
 
@@ -24,22 +20,15 @@ Tails = tuple[float, float]
 @dataclass(frozen=True)
 class HitsChange:
     """Hits of two set-ups on the same inspections, ``inspections`` of them on ``boards``. ``only_first``,
-    ``only_second``: found by one alone. ``mcnemar_p``: McNemar's exact test (two-sided), which takes inspections as
-    independent. ``fewer_p``, ``more_p``: one-sided sign-flip test over boards: how likely so few (many) hits of the
-    second are if each board's two sums of hits might as well be exchanged."""
+    ``only_second``: found by one alone. ``fewer_p``, ``more_p``: one-sided sign-flip test over boards: the chance of so
+    few (many) hits of the second if each board's two sums of hits might as well be exchanged."""
 
     boards: int
     inspections: int
     only_first: int
     only_second: int
-    mcnemar_p: float
     fewer_p: float
     more_p: float
-
-    @property
-    def boards_p(self) -> float:
-        """The test over boards, two-sided: the test that decides."""
-        return min(1.0, 2 * min(self.fewer_p, self.more_p))
 
 
 def hits_change(first: Inspected, second: Inspected) -> HitsChange | None:
@@ -51,8 +40,7 @@ def hits_change(first: Inspected, second: Inspected) -> HitsChange | None:
     only_first, only_second = int((found & ~now).sum()), int((now & ~found).sum())
     names, board = np.unique(first.board[one], return_inverse=True)
     gained = np.bincount(board, now.astype(float) - found.astype(float)).round().astype(int)
-    p = mcnemar(only_first, only_second)
-    return HitsChange(len(names), len(one), only_first, only_second, p, *sign_flip(gained))
+    return HitsChange(len(names), len(one), only_first, only_second, *sign_flip(gained))
 
 
 def shared_rows(first: Inspected, second: Inspected) -> tuple[np.ndarray, np.ndarray]:
@@ -61,12 +49,6 @@ def shared_rows(first: Inspected, second: Inspected) -> tuple[np.ndarray, np.nda
     at, there = ({key: row for row, key in enumerate(one)} for one in keys)
     shared = [key for key in at if key in there]
     return np.array([at[key] for key in shared], int), np.array([there[key] for key in shared], int)
-
-
-def mcnemar(only_first: int, only_second: int) -> float:
-    """Exact two-sided p: discordant pairs fall on either side with equal chance (McNemar 1947, exact by Liddell)."""
-    discordant = only_first + only_second
-    return float(binomtest(only_first, discordant, 0.5).pvalue) if discordant else 1.0
 
 
 def sign_flip(gained: np.ndarray) -> Tails:
@@ -86,9 +68,8 @@ def _tails(chance: np.ndarray, observed: int) -> Tails:
 @dataclass(frozen=True)
 class LimitChange:
     """a90 of the second set-up over and less that of the first. ``interval_mm``: 95 % percentiles of the difference
-    over boards drawn again, the same for both where ``paired``. ``grown_p``, ``shrunk_p``: share of draws in which it
-    has not grown (shrunk), never below 1/501 with 500 paired draws. Unpaired it is a share of all pairs of draws, and
-    below 1/501 no p known to its digits."""
+    over boards drawn again, alike where ``paired``. ``grown_p``, ``shrunk_p``: share of draws in which it has not grown
+    (shrunk), of 500 paired ones never below 1/501; unpaired, of all pairs of draws."""
 
     ratio: float
     difference_mm: float
@@ -113,129 +94,14 @@ def limit_change(first: SetUpLimit, second: SetUpLimit, same_boards: bool) -> Li
     return LimitChange(now / before, now - before, percentiles(differences), grown, shrunk, paired)
 
 
-LINK = "logit"
-"""The link, on size itself, for all: the choice of a curve must not depend on which result is whose."""
-TOSSES = 19_999
-ENOUGH = 10
-"""Tosses as far out after which p is known to about a third of itself and no more are drawn."""
-FIRST_TOSSES = 64
-CELLS = 200_000
-"""Tosses times damages at a time: a few MB."""
-ARRIVED = 1e-5
-"""Newton's errors are squared with every step."""
-TIE = 1e-6
-"""Newton's method leaves errors of this order in ln a90: closer ones are ties, and ties count against."""
-
-
-@dataclass(frozen=True)
-class SwapChange:
-    """``ratio``: a90 of the second set-up over that of the first, by curves of `LINK` on size for both, NaN where
-    neither has one. ``grown_p``, ``shrunk_p``: one-sided, 1 on the side on which it does not lie; of ``tosses``."""
-
-    ratio: float
-    grown_p: float
-    shrunk_p: float
-    tosses: int
-
-
-@dataclass(frozen=True, eq=False)
-class Exchange:
-    """Damages that both set-ups inspected, one a row: ``board`` (n,) as 0, 1, ...; ``z`` (n,) sizes in ``spread_mm``
-    from ``centre_mm``; ``first``, ``second`` (n,) hits of ``inspections`` (n,); ``start`` (2,): the pooled curve."""
-
-    board: np.ndarray
-    boards: int
-    z: np.ndarray
-    centre_mm: float
-    spread_mm: float
-    first: np.ndarray
-    second: np.ndarray
-    inspections: np.ndarray
-    start: np.ndarray
-
-    def log_ratios(self, exchanged: np.ndarray) -> np.ndarray:
-        """ln(a90 of the second / a90 of the first), (draws,), with the results of boards ``exchanged`` (draws, boards)
-        exchanged. NaN where neither has an a90."""
-        swapped = exchanged[:, self.board]
-        one, two = np.where(swapped, self.second, self.first), np.where(swapped, self.first, self.second)
-        with np.errstate(invalid="ignore"):
-            return self._log_a90(two) - self._log_a90(one)
-
-    def _log_a90(self, hits: np.ndarray) -> np.ndarray:
-        """(draws,) of ``hits`` (draws, n): infinite without a rising chance, the gap's middle where separated."""
-        misses = self.inspections - hits
-        largest_miss = np.where(misses > 0, self.z, -np.inf).max(axis=1)
-        smallest_hit = np.where(hits > 0, self.z, np.inf).min(axis=1)
-        overlap = largest_miss > smallest_hit
-        at = 0.5 * (largest_miss + smallest_hit)
-        b = maxima(_curves(self.z, hits[overlap], misses[overlap]), self.start, ARRIVED)
-        at[overlap] = crossings(b, LINK, (POD,))[0]
-        return np.asarray(np.log(self.centre_mm + self.spread_mm * np.maximum(at, self.z.min())))
-
-
-def exchange(first: Inspected, second: Inspected) -> Exchange | None:
-    """Pair the inspections that both have; None where there are none."""
-    one, two = shared_rows(first, second)
-    if not len(one):
-        return None
-    before, now = (
-        targets_of(first.board[one], first.hole[one], first.size_mm[one], hit)
-        for hit in (first.hit[one], second.hit[two])
-    )
-    centre, spread = float(before.size_mm.mean()), float(before.size_mm.std()) or 1.0
-    z, hits = (before.size_mm - centre) / spread, before.hits + now.hits
-    misses, start = before.inspections + now.inspections - hits, np.array([0.0, 1.0])
-    # Where the hits of both do not overlap the misses of both, no exchange has a curve to be searched.
-    if hits.any() and misses.any() and z[misses > 0].max() > z[hits > 0].min():
-        start = np.asarray(maxima(_curves(z, hits[None], misses[None]), start)[0])
-    names, board = np.unique(before.board, return_inverse=True)
-    return Exchange(board, len(names), z, centre, spread, before.hits, now.hits, before.inspections, start)
-
-
-def swap_change(first: Inspected, second: Inspected, tosses: int = TOSSES) -> SwapChange | None:
-    """Test whether a90 differs on the inspections that both have: results exchanged board by board, curves refitted. It
-    sees what the total of hits cannot: luck that grows. Fisher's randomisation test for pairs; a one-sided p is half of
-    the two-sided one. Tosses are drawn until `ENOUGH` are as far out as what was observed, at most ``tosses`` (Besag
-    and Clifford, Biometrika 78 (1991), 301: p is exact whatever their number). None without shared inspections."""
-    pair = exchange(first, second)
-    if pair is None:
-        return None
-    observed = float(pair.log_ratios(np.zeros((1, pair.boards), bool))[0])
-    ratio = float(np.exp(observed))
-    if np.isnan(observed) or abs(observed) <= TIE:
-        return SwapChange(ratio, 1.0, 1.0, 0)
-    stream = random_stream(0, "set-ups exchanged", pair.boards)
-    most = max(1, CELLS // len(pair.z))
-    drawn = as_far = 0
-    p = np.nan
-    while drawn < tosses and np.isnan(p):
-        count = min(max(FIRST_TOSSES, drawn), most, tosses - drawn)
-        ratios = pair.log_ratios(stream.random((count, pair.boards)) < 0.5)
-        far = ~(np.abs(ratios) < abs(observed) - TIE)  # NaN is as far
-        reached = np.flatnonzero(as_far + np.cumsum(far) >= ENOUGH)
-        if len(reached):
-            count = int(reached[0]) + 1
-            p = ENOUGH / (drawn + count)
-        as_far += int(far.sum())
-        drawn += count
-    p = (as_far + 1) / (tosses + 1) if np.isnan(p) else p
-    grown, shrunk = (0.5 * p, 1.0) if observed > 0 else (1.0, 0.5 * p)
-    return SwapChange(ratio, grown, shrunk, drawn)
-
-
-def _curves(z: np.ndarray, hits: np.ndarray, misses: np.ndarray) -> HitsAndMisses:
-    return HitsAndMisses(np.column_stack([np.ones_like(z), z]), hits, misses, LINK)
-
-
 SAME = 1e-6
 """Relative difference of one threshold from machine to machine."""
 
 
 @dataclass(frozen=True)
 class SignalChange:
-    """Median change of ``damages``' signals over the signal from which damages are found (``found_from``, first and
-    second), as a factor ``ratio``. ``error``: standard error of its logarithm, over boards and over both calibrations;
-    ``less_p``, ``more_p``: one-sided, normal."""
+    """Median change, a factor ``ratio``, of ``damages``' signals over the signal from which they are found
+    (``found_from``: first, second). ``error`` of its logarithm, over boards and calibrations; p one-sided, normal."""
 
     damages: int
     ratio: float
@@ -275,8 +141,7 @@ def signal_change(first: SetUpRecord, second: SetUpRecord) -> SignalChange | Non
 
 def found_from(seen: Inspected) -> float:
     """Find the signal that parts hits from misses with the fewest exceptions, midway between its two neighbours: the
-    threshold as it acts, whatever the record says of it. Hits by missing returns alone do not count; NaN without any
-    signal."""
+    threshold as it acts. Hits by missing returns alone do not count; NaN without any signal."""
     hit = seen.hit if seen.by_depth is None else seen.by_depth
     known = np.flatnonzero(seen.signal > 0)
     if not len(known):

@@ -1,7 +1,5 @@
-"""The record of a study: every inspection of every set-up, by itself enough for limits and comparisons. Stored as
-``study.json`` in a result folder and as the baseline of a gate, so that a comparison needs no other file. The classes
-here declare the file: each field's type says what JSON may hold in its place, and the file is written, checked and read
-by these types alone."""
+"""The record of a study: every inspection of every set-up, by itself enough for limits and comparisons. It is stored as
+``study.json`` in a result folder and as the baseline of a gate; the classes here declare, check and write the file."""
 
 from __future__ import annotations
 
@@ -97,11 +95,10 @@ FORM = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 @dataclass(frozen=True, eq=False)
 class Inspected:
-    """Inspections of damage, one a row: each damage of each board once for every repeat of the noise. ``diameter_mm``
-    (of long damage the width or length that ``size_of`` names), ``depth_mm`` (removed material), ``x_mm``, ``y_mm`` (on
-    the board) are true. ``signal`` (n,): the highest score within the hit radius of the damage's centre, NaN where no
-    pixel there was judged. ``by_depth``, ``by_no_return`` (n,) bool: hits by each kind of finding; None where hits were
-    counted by depth alone."""
+    """Inspections of damage, one a row: each damage of each board for every repeat of the noise. True: ``diameter_mm``
+    (of long damage the width or length that ``size_of`` names), ``depth_mm`` removed, ``x_mm``, ``y_mm`` on the board.
+    ``signal`` (n,): the highest score within the hit radius, NaN where no pixel there was judged. ``by_depth``,
+    ``by_no_return`` (n,) bool: hits by each kind of finding; None where hits were counted by depth alone."""
 
     __pydantic_config__ = FORM
     board: Counts
@@ -119,8 +116,7 @@ class Inspected:
 
     @property
     def limit_of(self) -> str:
-        """Name the size that limits are of: the depth where damage of one diameter (width, length) differs in it, else
-        the diameter (width, length)."""
+        """Name the size of limits: the depth where damage of one diameter (width, length) differs in it, else that."""
         one_diameter = len(self.hit) > 0 and np.ptp(self.diameter_mm) == 0
         return "depth" if one_diameter and 0 < self.depth_mm.min() < self.depth_mm.max() else self.size_of
 
@@ -132,9 +128,8 @@ class Inspected:
 
 @dataclass(frozen=True, eq=False)
 class Unflawed:
-    """Runs on boards of one kind that set no threshold, hole-free or damaged: ``board``, ``repeat`` (m,) int, ``calls``
-    (m,) int false calls, ``area_m2`` (m,) of face that was judged; ``no_return_calls`` (m,) int: calls without return
-    among them, or None."""
+    """Runs on boards of one kind that set no threshold, hole-free or damaged, (m,) each: false ``calls`` on ``area_m2``
+    of judged face; ``no_return_calls``: calls without return among them, or None."""
 
     __pydantic_config__ = FORM
     board: Counts
@@ -165,10 +160,9 @@ class SetUpRecord:
     """One set-up at one number of frames. ``axes``: by dotted path, without frames. ``threshold`` in the detector's
     units, ``threshold_mm`` NaN where it has no scale; ``calibration_runs`` hole-free runs on boards of their own set it
     (0: given). ``failed``: trials that raised. ``targets_digest`` names boards and damage, ``frames_digest`` those with
-    camera, noise seed and the code that simulates. ``calibrated``: what those runs found, where kept. ``beside``: runs
-    on the damaged boards, where kept, whose false calls are findings that count for no damage. ``units`` of the camera:
-    of more than one, repeat r of a damaged board is before unit r modulo ``units``, and every other board before a unit
-    of its own."""
+    camera, noise seed and simulating code. ``calibrated``, ``beside``: what calibration runs found, and runs on the
+    damaged boards, where kept. Of more than one of ``units``, repeat r of a damaged board is before unit r modulo
+    ``units``, and every other board before a unit of its own."""
 
     __pydantic_config__ = FORM
     variant: Name
@@ -197,9 +191,8 @@ class SetUpRecord:
 
 @dataclass(frozen=True, eq=False)
 class StudyRecord:
-    """A whole study. ``hit_radius_mm``, ``hit_overlap`` (None: not asked): what counts as a hit, fixed beforehand.
-    ``false_calls_per_m2``: the rate that thresholds were calibrated to, None where they were given. ``provenance``:
-    commit, dirty, versions, seed."""
+    """A whole study. ``hit_radius_mm``, ``hit_overlap`` (None: not asked): what counts as a hit. The thresholds' rate
+    ``false_calls_per_m2`` is None where they were given. ``provenance``: commit, dirty, versions, seed."""
 
     __pydantic_config__ = FORM
     name: Name
@@ -218,9 +211,8 @@ class StudyRecord:
         rule = f"where the centre of a finding lies within {self.hit_radius_mm:.3g} mm of {of}"
         if self.hit_overlap is None:
             return rule
-        return (
-            f"{rule}, or at least {100 * self.hit_overlap:.3g} % of a finding's pixels lie on it or 2 pixels beside it"
-        )
+        share = f"{100 * self.hit_overlap:.3g} %"
+        return f"{rule}, or at least {share} of a finding's pixels lie on it or 2 pixels beside it"
 
     def to_data(self) -> dict[str, Any]:
         """Return JSON's types; NaN becomes None, and a column or table that is None is left out."""

@@ -23,7 +23,7 @@ from harness.evaluation.study.curves import (
     chance_hits,
     free_response,
     pixel_curves,
-    roc_curves,
+    roc_curve,
 )
 from harness.evaluation.study.limit import (
     ALL_FOUND,
@@ -32,7 +32,6 @@ from harness.evaluation.study.limit import (
     SetUpLimit,
     depth_varies,
     limit_of,
-    median_over_boards,
     surface_of,
 )
 from harness.evaluation.study.record import SetUpRecord, StudyRecord
@@ -92,17 +91,14 @@ def axis_lines(limits: Sequence[SetUpLimit]) -> tuple[AxisLine, ...]:
             if len(members) > 1:
                 line = tuple(limits[index] for index in members)
                 held = {name: value for name, value in places[members[0]].items() if name != axis}
-                ordered, steps = (
-                    [places[index][axis] for index in members],
-                    [difference(*two) for two in pairwise(line)],
-                )
+                ordered = [places[index][axis] for index in members]
+                steps = [difference(*two) for two in pairwise(line)]
                 lines.append(AxisLine(axis, held, tuple(ordered), line, tuple(steps), numeric))
     return tuple(lines)
 
 
 def difference(frm: SetUpLimit, to: SetUpLimit) -> Difference:
-    """Compare a90 of one set-up with that of another: paired where both have the same boards and damage; boards whose
-    trials failed in one of the two are missing there."""
+    """Compare a90 of two set-ups: paired where both have the same boards and damage, none missing by failed trials."""
     a, b = frm.record.inspected, to.record.inspected
     paired = all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("board", "hole", "x_mm", "y_mm"))
     before, after = frm.a90_draws_mm, to.a90_draws_mm
@@ -270,6 +266,7 @@ def _missing(limits: Sequence[SetUpLimit], facts: Mapping[str, Any]) -> tuple[st
     controls = any(limit.record.detector in TESTS_THE_HARNESS for limit in limits)
     one_unit = "camera" in source and "source.camera.unit_seed" not in sweep
     one_unit &= all(limit.record.units == 1 for limit in limits)
+    judged = any(limit.boards for limit in limits)
     simulated, drawn = source.get("kind") == "simulated", target.get("name") == "drawn"
     rules = (
         (controls, "A detector: the oracle is handed the truth and the blind one guesses, to test the harness."),
@@ -281,10 +278,7 @@ def _missing(limits: Sequence[SetUpLimit], facts: Mapping[str, Any]) -> tuple[st
             "Other units of the camera: fixed pattern and offset are those of one unit. What many frames leave over "
             "lies on the same pixels of all its boards, which are not as independent as the intervals take them to be.",
         ),
-        (
-            any(limit.boards for limit in limits),
-            "Boards of another family: intervals are over boards drawn like these.",
-        ),
+        (judged, "Boards of another family: intervals are over boards drawn like these."),
     )
     return _true(rules)
 
@@ -306,8 +300,7 @@ CONDITIONS = (
 
 
 def conditions_of(facts: Mapping[str, Any], limits: Sequence[SetUpLimit] = ()) -> str:
-    """Return what all set-ups of a study have in common, its damage first, in one line, and whether damage was out of
-    view or lost with failed trials; empty where nothing is known."""
+    """Return what all set-ups have in common, damage first, in one line, and whether damage was out of view or lost."""
     said = [words] if (words := _damage_words(facts)) else []
     for path, words in CONDITIONS:
         value: Any = facts
@@ -326,30 +319,23 @@ def conditions_of(facts: Mapping[str, Any], limits: Sequence[SetUpLimit] = ()) -
     return ", ".join(said)
 
 
-NOISE_SHARE = 0.95
-"""Signals up to this quantile of those at unflawed places are noise's: censored in the regression of signals."""
-
-
 @dataclass(frozen=True, eq=False)
 class SetUpResult:
-    """One set-up: ``limit``; ``chance`` hits (None: nothing to lay them over); ``roc`` over sites by classes of size;
-    ``free_response``; ``pixels`` (None where not counted); ``surface`` over diameter and depth, or ``surface_why``
-    there is none; ``noise_floor``: signal of unflawed places."""
+    """One set-up: ``limit``; ``chance`` hits (None: nothing to lay them over); ``roc``, ``free_response``, ``pixels``
+    (None where not counted); ``surface`` over diameter and depth, or ``surface_why`` there is none."""
 
     limit: SetUpLimit
     chance: ChanceHits | None
-    roc: tuple[Roc, ...]
+    roc: Roc | None
     free_response: FreeResponse | None
     pixels: PixelCurves | None
     surface: PodSurface | None
     surface_why: str
-    noise_floor: float
 
 
 @dataclass(frozen=True, eq=False)
 class StudyResult:
-    """All set-ups in the record's order, lines of limits over the swept axes, the limits of validity; ``facts``: the
-    resolved experiment as plain data."""
+    """Set-ups in the record's order, lines over swept axes, limits of validity; ``facts``: the resolved experiment."""
 
     record: StudyRecord
     set_ups: tuple[SetUpResult, ...]
@@ -367,8 +353,7 @@ class StudyResult:
 def evaluate_study(
     record: StudyRecord, tables: ResultTables, facts: Mapping[str, Any], *, draws: int = DRAWS
 ) -> StudyResult:
-    """Judge a study. ``facts``: its resolved experiment as plain data. Deterministic; a set-up without a curve is no
-    error (its limit says why)."""
+    """Judge a study; ``facts``: its resolved experiment, plain data. Deterministic. A limit without curve says why."""
     set_ups = tuple(_set_up(one, tables, record.hit_radius_mm, draws) for one in record.set_ups)
     limits = tuple(one.limit for one in set_ups)
     validity = validity_of(record, limits, [one.chance for one in set_ups], facts)
@@ -382,24 +367,17 @@ def _set_up(record: SetUpRecord, tables: ResultTables, radius_mm: float, draws: 
         return table[(table["variant"] == record.variant) & (table["frames"] == record.frames)]
 
     holes, sites, runs = own(tables.holes), own(tables.sites), own(tables.runs)
-    signal = sites["signal"].dropna().to_numpy(float) if len(sites) else np.zeros(0)
-    floor = float(np.quantile(signal, NOISE_SHARE)) if len(signal) else np.nan
-    limit = limit_of(record, draws=draws, noise_floor=floor, tested=True)
+    limit = limit_of(record, draws=draws, tested=True)
     if not holes.empty and not runs.empty:
         of = "model_diameter_mm" if record.inspected.size_of == "diameter" else f"{record.inspected.size_of}_mm"
         sized = holes[holes["detected"].astype(bool) & holes[of].notna()]
-        error_mm = (sized[of] - sized["true_diameter_mm"]).abs().to_numpy()
-        typical_mm, ends_mm = median_over_boards(sized["board"].to_numpy(), error_mm, draws)
+        typical_mm = float((sized[of] - sized["true_diameter_mm"]).abs().median())
         seconds = float(runs.loc[runs["role"] == "damaged", "seconds_detect"].median())
-        limit = replace(
-            limit, size_error_mm=typical_mm, size_error_interval_mm=ends_mm, sized=len(sized), seconds_detect=seconds
-        )
-    a50, a90 = (limit.a50_mm, limit.a90_mm) if limit.statement else (np.nan, np.nan)
+        limit = replace(limit, size_error_mm=typical_mm, sized=len(sized), seconds_detect=seconds)
     chance = None
     if not holes.empty and not runs.empty:
-        chance = chance_hits(holes, sites, runs, own(tables.findings), radius_mm, limit.false_calls, draws)
-    by = "depth" if record.inspected.limit_of == "depth" else "diameter"
-    roc = roc_curves(holes, sites, record.threshold, a50, a90, draws, by=by)
+        chance = chance_hits(holes, sites, runs, own(tables.findings), radius_mm, limit.false_calls)
+    roc = roc_curve(holes, sites, record.threshold)
     response = free_response(own(tables.operating), runs, holes, draws)
-    pixels = pixel_curves(own(tables.pixels), draws)
-    return SetUpResult(limit, chance, roc, response, pixels, *surface_of(record, draws), floor)
+    pixels = pixel_curves(own(tables.pixels))
+    return SetUpResult(limit, chance, roc, response, pixels, *surface_of(record, draws))

@@ -43,9 +43,8 @@ class OverUnits:
 def over_units(
     size_mm: np.ndarray, hit: np.ndarray, target: np.ndarray, unit: np.ndarray, curve: PodCurve, limit: Bound
 ) -> OverUnits:
-    """Judge inspections, one a row (n,): ``hit`` bool, names of what was inspected (``target``), and ``unit`` numbers.
-    ``curve`` is that of all units together, ``limit`` its a90/95 over boards. A unit that found all or nothing has no
-    limit of its own, and then none is demonstrated for a new one."""
+    """Judge inspections, one a row (n,): ``hit`` bool, names of ``target``, numbers of ``unit``; ``curve`` of all
+    units, ``limit`` its a90/95 over boards. If a unit found all or nothing, no limit of a new one is demonstrated."""
     found = []
     for number in np.unique(unit):
         own = unit == number

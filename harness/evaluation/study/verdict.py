@@ -1,10 +1,8 @@
 """The verdict whether a detection limit has become worse: a factor *and* a paired test, as asv judges benchmarks. Worse
 is a set-up whose a90, or rate of false calls, has grown by more than `MARGIN`, or whose signals over the threshold have
 fallen by as much, and than chance explains, by Holm's step-down over the three questions of all set-ups at `ALPHA`; or
-that has no limit any more. On the same boards two tests
-answer for the limit, and its p is twice the smaller one's: that of hits, and that of a90 itself, which takes seconds
-and is asked only where a90 has changed by more than the margin and hits do not decide. On other boards the bootstrap of
-a90 answers. See `harness.evaluation.study.paired`."""
+that has no limit any more. On the same boards the test of hits answers for the limit, on other boards the bootstrap of
+a90. See `harness.evaluation.study.paired`."""
 
 from __future__ import annotations
 
@@ -22,18 +20,12 @@ from harness.evaluation.study.record import SetUpRecord, StudyRecord
 from harness.vocabulary.seeds import canonical_json
 
 MARGIN = 1.10
-"""Growth of a90, of the rate of false calls, or of the threshold over signals, up to which nothing is worse (and
-shrinkage, nothing better)."""
+"""Growth of a90, the rate of false calls, or the threshold over signals up to which nothing is worse, or better."""
 ALPHA = 0.001
 """Level of a gate's tests, for a whole comparison. As low as this because each set-up's luck with the calibration of
 its threshold is in no test over boards; see `harness.check` for how often the rule fails with it."""
 QUESTIONS = 3
 """Limit, false calls and signals of a set-up."""
-LIMIT_TESTS = 2
-"""Two tests, of hits and of a90: each p is multiplied by their number."""
-TOSSES_PER_QUESTION, MOST_TOSSES = 5_000, 50_000
-"""So many that four tosses as far out still convict one of that many questions. Of more than 50 questions, those of 25
-set-ups, none is decided by the test of a90: it would take a minute for each."""
 
 Mark = Literal[
     "worse", "better", "as good", "not significant", "newly failing", "newly working", "no limit",
@@ -48,9 +40,7 @@ Pair = tuple[SetUpRecord | None, SetUpRecord | None]
 
 @dataclass(frozen=True, eq=False)
 class ComparedSetUps:
-    """One set-up of two studies; ``why``: the reason of ``mark``. ``swap``: the test of a90 on the same boards, None
-    where it was not asked. ``limit_p``, ``calls_p``, ``signal_p``: adjusted p of (worse, better), 1 where there is no
-    test."""
+    """One set-up of two studies; ``why``: of ``mark``. ``*_p``: adjusted p of (worse, better), 1 without a test."""
 
     first: SetUpLimit | None
     second: SetUpLimit | None
@@ -59,7 +49,6 @@ class ComparedSetUps:
     hits: paired.HitsChange | None = None
     calls: paired.CallsChange | None = None
     signal: paired.SignalChange | None = None
-    swap: paired.SwapChange | None = None
     limit_p: Tails = (1.0, 1.0)
     calls_p: Tails = (1.0, 1.0)
     signal_p: Tails = (1.0, 1.0)
@@ -71,13 +60,6 @@ class ComparedSetUps:
         """Set-up and frames, of both where they differ."""
         labels = [limit.record.label for limit in (self.first, self.second) if limit is not None]
         return " → ".join(dict.fromkeys(labels))
-
-    def limit_test(self, side: int) -> Literal["hits", "a90", "bootstrap", ""]:
-        """Name the test that ``limit_p[side]`` is of: the one with the smaller p; empty where there is none."""
-        if self.limit is None or self.hits is None:
-            return "bootstrap" if self.limit else ""
-        of_hits, of_a90 = _of_limit(self.hits, self.swap)
-        return "a90" if of_a90[side] < of_hits[side] else "hits"
 
     @property
     def is_worse(self) -> bool:
@@ -101,8 +83,8 @@ class Comparison:
 
 def fewest_boards(set_ups: int, alpha: float = ALPHA) -> int:
     """Shared boards from which on the tests can convict one of so many set-ups at all: if every board is worse, one
-    toss in 2^boards says as much, and that p is multiplied by the tests of a limit and by all set-ups' questions."""
-    return int(np.floor(np.log2(LIMIT_TESTS * QUESTIONS * set_ups / alpha))) + 1
+    toss in 2^boards says as much, and that p is multiplied by all set-ups' questions."""
+    return int(np.floor(np.log2(QUESTIONS * set_ups / alpha))) + 1
 
 
 def compare_studies(first: StudyRecord, second: StudyRecord, alpha: float = ALPHA) -> Comparison:
@@ -122,8 +104,6 @@ def compare_studies(first: StudyRecord, second: StudyRecord, alpha: float = ALPH
         calls = paired.calls_change(one, other, first.false_calls_per_m2)
         signal = paired.signal_change(one, other) if same else None
         rows.append(ComparedSetUps(before, now, changed, paired.limit_change(before, now, same), hits, calls, signal))
-    questions = sum(p is not None for row in rows for p in _p_values(row))
-    rows = [_with_swap(row, questions, alpha) for row in rows]
     # A question that was not asked is no member of the family.
     asked = [p for row in rows for p in _p_values(row)]
     sides = []
@@ -208,32 +188,12 @@ def differences(one: SetUpRecord, other: SetUpRecord) -> tuple[str, ...]:
     return tuple(said)
 
 
-def _of_limit(hits: paired.HitsChange, swap: paired.SwapChange | None) -> tuple[Tails, Tails]:
-    """(worse, better) by hits and by a90 itself, on the same boards."""
-    return (hits.fewer_p, hits.more_p), (swap.grown_p, swap.shrunk_p) if swap else (1.0, 1.0)
-
-
-def _with_swap(row: ComparedSetUps, questions: int, alpha: float) -> ComparedSetUps:
-    """The row with the test of a90 where it is asked, as one of so many ``questions``."""
-    if row.hits is None or row.first is None or row.second is None:
-        return row
-    growth, p = _growth(row.first, row.second), (row.hits.fewer_p, row.hits.more_p)
-    # Comparisons with NaN are false: without both limits there is nothing to ask.
-    beyond = (growth > MARGIN, growth < 1 / MARGIN)
-    if not any(beyond) or LIMIT_TESTS * questions * p[beyond.index(True)] < alpha:
-        return row
-    tosses = min(TOSSES_PER_QUESTION * questions, MOST_TOSSES) - 1
-    return replace(row, swap=paired.swap_change(row.first.record.inspected, row.second.record.inspected, tosses))
-
-
 def _p_values(row: ComparedSetUps) -> tuple[Tails | None, Tails | None, Tails | None]:
     """(worse, better) of the limit, of false calls and of signals."""
     calls = None if row.calls is None else (row.calls.more_p, row.calls.fewer_p)
     signal = None if row.signal is None else (row.signal.less_p, row.signal.more_p)
     if row.hits is not None:
-        both = zip(*_of_limit(row.hits, row.swap), strict=True)
-        worse, better = (min(1.0, LIMIT_TESTS * min(pair)) for pair in both)
-        return (worse, better), calls, signal
+        return (row.hits.fewer_p, row.hits.more_p), calls, signal
     return None if row.limit is None else (row.limit.grown_p, row.limit.shrunk_p), calls, signal
 
 
