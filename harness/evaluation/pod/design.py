@@ -15,9 +15,6 @@ from harness.evaluation.pod.statement import LEAST_TARGETS
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.seeds import random_stream
 
-RISE = (0.03, 0.97)
-"""POD between which a curve counts as rising (MIL-HDBK-1823A: sizes should cover about that)."""
-
 
 @dataclass(frozen=True, eq=False)
 class StudyPlan:
