@@ -162,8 +162,8 @@ def _apart(agreement: Agreement) -> str:
         limit = marks_limit
     else:
         return ""
-    blur = f"which would blur the map (up to {limit / MM:.1f} mm are merged)"
-    return f"{said.format(f'{distance / MM:.1f}')}, {blur}: a wrong registration, or different targets"
+    blurred = f"which would blur the map (up to {limit / MM:.1f} mm are merged)"
+    return f"{said.format(f'{distance / MM:.1f}')}, {blurred}: a wrong registration, or different targets"
 
 
 def _widened(
