@@ -1,4 +1,4 @@
-"""What `harness.ls` lists and `harness.clean` removes: only what tofpod wrote in ``--out``, never through a link."""
+"""Entries that `harness.ls` lists and `harness.clean` removes: tofpod's own in ``--out``, never through a link."""
 
 from __future__ import annotations
 

@@ -170,7 +170,7 @@ START_FROM_MARKS = ("icp", "cpd")
 
 @dataclass(frozen=True)
 class Inspection:
-    """What a run knows when it is told. ``mapped`` None: one capture; ``registrations``: data of registrations.json."""
+    """Everything that a run found. ``mapped`` None: one capture; ``registrations``: data of registrations.json."""
 
     arguments: argparse.Namespace
     recordings: list[Recording]
