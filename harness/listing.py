@@ -1,4 +1,4 @@
-"""What `harness.ls` lists and `harness.clean` removes: only what tofpod wrote in ``--out``, never through a link."""
+"""Contents of `harness.ls`; removal by `harness.clean`: only what tofpod wrote in ``--out``, never through a link."""
 
 from __future__ import annotations
 

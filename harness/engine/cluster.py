@@ -56,7 +56,7 @@ class Bundle:
 
 @dataclass(frozen=True)
 class NodeFacts:
-    """What a node says of itself. ``digests``: of code and packages by stage, without those that are not installed;
+    """A node in its own words. ``digests``: of code and packages by stage, without those that are not installed;
     ``processes``: jobs at once; ``sees``: content of the file that it was asked for."""
 
     python: str

@@ -45,7 +45,7 @@ VARIANT = "main"
 
 @dataclass(frozen=True)
 class Judging:
-    """How clouds are judged. ``threshold`` None: ``threshold_of`` an undamaged cloud returns it, with warnings."""
+    """Rules of judging clouds. ``threshold`` None: ``threshold_of`` an undamaged cloud returns it, with warnings."""
 
     detector: str
     settings_json: str

@@ -170,7 +170,7 @@ START_FROM_MARKS = ("icp", "cpd")
 
 @dataclass(frozen=True)
 class Inspection:
-    """What a run knows when it is told. ``mapped`` None: one capture; ``registrations``: data of registrations.json."""
+    """A run and all that is told. ``mapped`` None: one capture; ``registrations``: data of registrations.json."""
 
     arguments: argparse.Namespace
     recordings: list[Recording]
