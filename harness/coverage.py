@@ -87,7 +87,7 @@ def main(options: argparse.Namespace, command: str) -> int:
         raise UserError(said, fix="choose one by --set, such as sweep={} and the values of its axes")
     asked = options.goal or options.size
     size_mm = length_m("--goal" if options.goal else "--size", asked) / MM if asked else None
-    for point in experiment.points if size_mm else ():
+    for point in experiment.points:
         refuse_size(point.config, size_mm)
     given, further = _poses(options, declared(experiment.config)[1].distance_m)
     folder, cache = options.out or options.results / "coverage" / name, options.results / ".cache" / "renders"

@@ -79,13 +79,14 @@ def shown(kind: str, name: str) -> Row:
 
 def grid_of(kind: str, rows: Sequence[Row]) -> Grid:
     """Return rows of offers as a table."""
+    heads: tuple[str, ...] = ("pixels", "range", "light", "title")
     if kind == "detectors":
-        heads, told = ("version", "what it does"), lambda row: (row["version"] or "-", row["about"])
-    else:
-        heads, told = ("pixels", "range", "light", "title"), _camera_cells
+        heads = ("version", "what it does")
     lines = []
     for row in rows:
-        said = ("-",) * (len(heads) - 1) + (f"broken: {row['broken']}",) if "broken" in row else told(row)
+        said = _camera_cells(row) if "title" in row else (row.get("version") or "-", row.get("about", ""))
+        if "broken" in row:
+            said = ("-",) * (len(heads) - 1) + (f"broken: {row['broken']}",)
         lines.append((row["name"], f"{row['package']} {row['package_version']}".strip(), *said))
     return Grid.of(("name", "package", *heads), lines, left=2 + len(heads))
 

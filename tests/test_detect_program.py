@@ -309,7 +309,7 @@ def test_a_camera_may_lend_its_lens(tmp_path: Path, capsys: pytest.CaptureFixtur
         (("--threshold", "nan"), "above 0"),
         (("--threshold", "3", "--quiet-capture", "x"), "give one of them"),
         (("--threshold", "3", "--false-calls", "1"), "--threshold and --false-calls set the threshold"),
-        (("--quiet-capture", "x", "--false-calls", "1"), "--quiet-capture and --false-calls both set"),
+        (("--quiet-capture", "x", "--false-calls", "1"), "--quiet-capture and --false-calls set"),
         (("--false-calls", "0"), "above 0"),
         (("--false-calls", "inf"), "above 0"),
         (("--intrinsics", "no_such_camera"), "azure_kinect_nfov"),

@@ -116,14 +116,14 @@ def declared(config: ExperimentConfig) -> tuple[SimulatedSource, DrawnTargetConf
     raise UserError(f"{config.name}: is no study of drawn damage, each seen in a single view", fix=fix)
 
 
-def refuse_size(config: ExperimentConfig, size_mm: float) -> None:
+def refuse_size(config: ExperimentConfig, size_mm: float | None) -> None:
     """Raise UserError for a size outside the range that is declared: of damage of one size in plan, of its depths."""
     damage = declared(config)[1].damage
     low, high = damage.size_mm
     word = damage.size_of
     if high - low < SAME_MM and damage.depths_mm:
         word, (low, high) = "depth", damage.depths_mm
-    if not low <= size_mm <= high:
+    if size_mm is not None and not low <= size_mm <= high:
         fix = "change the damage's range in the experiment: nothing is said of sizes that are not inspected"
         said = f"{size_mm:.3g} mm: {config.name} inspects no damage of that size"
         raise UserError(said, legal=f"{low:.3g} to {high:.3g} mm ({word})", fix=fix)

@@ -256,8 +256,9 @@ def study_rows(known: KnownCloud, judged: JudgedCloud, radius_m: float, *, hole_
     operating = _operating(known, judged, threshold, radius_m, hole_free=hole_free)
     tables: Rows = {"runs": [run], "holes": [], "sites": [], "findings": [], "operating": [operating], "pixels": []}
     for number, (detection, place) in enumerate(zip(judged.detections, judged.places_m, strict=True)):
-        row = {"x_mm": float(place[0]) / MM, "y_mm": float(place[1]) / MM, "score": float(detection.score)}
-        tables["findings"].append({**row, "hole": counts_for.get(number, "")})
+        x_mm, y_mm = float(place[0]) / MM, float(place[1]) / MM
+        of = {"score": float(detection.score), "hole": counts_for.get(number, "")}
+        tables["findings"].append({"x_mm": x_mm, "y_mm": y_mm, **of})
     if hole_free:  # places of left-out damage
         for i, (damage, signal) in enumerate(zip(known.truth, signals, strict=True)):
             tables["sites"].append(_place(damage) | {"detected": i in judged.pairs, "signal": signal})

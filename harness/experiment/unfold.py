@@ -233,8 +233,8 @@ def _variation_problems(variations: list[Draft], axes: list[list[Setting]], sour
     # variations at a number of frames that the main experiment does not have could be compared with nothing
     main = [setting.value for axis in axes for setting in axis if setting.path == FRAMES]
     main = main or [shape.get(source.data, ("capture", "frames"))]
-    at = ("sensitivity", "frames")
-    for setting in _frame_settings(shape.get(source.data, at), at):
+    listed_at: KeyPath = ("sensitivity", "frames")
+    for setting in _frame_settings(shape.get(source.data, listed_at), listed_at):
         if setting.value not in main:
             message = f"{setting.value} frames are not run in the main experiment: there is nothing to compare with"
             yield Problem(message, source.place_of(setting.written_at), "of " + ", ".join(map(str, main)))

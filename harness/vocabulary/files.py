@@ -60,7 +60,8 @@ def bounded_bytes(path: Path, at_most: int) -> bytes:
     """Return a file's content. Raises UserError where it is larger, also of a device or pipe; OSError as files do."""
     with Path(path).open("rb") as stream:
         content = stream.read(at_most + 1)
-    refuse_bytes(str(path), len(content), at_most, "has at least")
+    if len(content) > at_most:
+        raise UserError(f"{path}: has more than {size_text(at_most)}", legal=f"at most {size_text(at_most)}", fix=RAISE)
     return content
 
 
