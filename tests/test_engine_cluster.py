@@ -110,6 +110,7 @@ def test_the_queue_stays_short_whatever_the_plan(cluster):
             ended += engine.ended()
 
 
+@pytest.mark.slow  # a campaign; test_engine_processes has the same faults without a cluster
 def test_every_fault_costs_its_own_job_only(cluster):
     """One job kills its process, one hangs, one stops its whole process in C, one wants too much memory."""
     faults = {"killer": kill_own_process, "endless": hang, "stuck": hold_the_interpreter}
@@ -146,13 +147,15 @@ def test_a_node_killed_from_outside_costs_nothing(cluster, tmp_path):
     assert {how.state for how in ended.values()} == {"done"} and len(ended) == 12 and killed
 
 
-def test_a_node_of_several_processes_uses_them_all(tmp_path):
-    with processes(tmp_path / "cluster") as one:
-        one.worker("--nthreads", "3", "--no-nanny")
-        with engine_at(one) as engine:
+def test_a_node_of_several_processes_uses_them_all_each_in_one_thread_whatever_its_environment(tmp_path):
+    with processes(tmp_path / "cluster") as bare:
+        bare.worker("--nthreads", "2", "--no-nanny")  # a nanny would set the environment
+        with engine_at(bare) as engine:
             ended = run(engine, [Job(f"pid {n}", "trials", pid_after, (0.3,)) for n in range(12)])
-    assert len({how.value for how in ended.values()}) == 3
+            used = run(engine, [Job("threads", "trials", threads, ())])["threads"].value
+    assert len({how.value for how in ended.values()}) == 2
     assert len({how.worker for how in ended.values()}) == 1
+    assert len(used) > 1 and set(used.values()) == {1}, used
 
 
 def test_the_scheduler_gone_is_a_clear_message(tmp_path):
@@ -191,15 +194,6 @@ def test_a_worker_with_other_code_is_refused(tmp_path):
         old.worker("--no-nanny", search=other)
         with pytest.raises(UserError, match="another version of tofpod"), engine_at(old):
             pass
-
-
-@pytest.mark.skipif(os.cpu_count() == 1, reason="one thread anyway")
-def test_a_worker_computes_in_one_thread_whatever_its_environment(tmp_path):
-    with processes(tmp_path / "cluster") as bare:
-        bare.worker("--no-nanny")  # a nanny would set the environment
-        with engine_at(bare) as engine:
-            used = run(engine, [Job("threads", "trials", threads, ())])["threads"].value
-    assert len(used) > 1 and set(used.values()) == {1}, used
 
 
 def test_a_cluster_of_dask_jobqueue(tmp_path):
@@ -263,8 +257,8 @@ def test_renders_are_made_elsewhere_and_reach_the_cache(cluster, experiment, tmp
         again = run(engine, renders[:1])
         ended = run(engine, loads)
         looks = run(engine, [Job(f"look {n}", "trials", loaded, ()) for n in range(40)])
+    # a node that does not answer in time is asked again, and may find the view that it has rendered
     assert [how.state for how in rendered.values()] == ["done", "done"], rendered
-    assert [how.value[0] for how in rendered.values()] == [False, False]
     assert again[renders[0].name].value[0] is True
     assert all(read_view(cache / job.name) is not None for job in renders)
     assert {how.state for how in ended.values()} == {"done"}, ended
@@ -273,6 +267,7 @@ def test_renders_are_made_elsewhere_and_reach_the_cache(cluster, experiment, tmp
     assert {path.name for path in cache.glob(".*")} <= {".lock", ".rendering"}  # locks, and no leftovers
 
 
+@pytest.mark.slow
 def test_a_render_that_fails_or_kills_its_process_costs_itself(cluster, tmp_path):
     jobs = [
         Job("dies.npz", "renders", kill_own_process, (str(tmp_path),)),
@@ -315,7 +310,9 @@ def without_seconds(value: object) -> object:
     return [without_seconds(one) for one in value] if isinstance(value, list) else value
 
 
-def test_ctrl_c_leaves_and_says_how_to_go_on(cluster, experiment, tmp_path):
+@pytest.mark.slow  # test_engine has Ctrl-C without a cluster
+def test_ctrl_c_leaves_and_says_how_to_go_on(cluster, experiment, tiny_out, tmp_path):
+    shutil.copytree(tiny_out / ".cache", tmp_path / "out" / ".cache")
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     more = ("--set", "repeats=400", "--scheduler", cluster.address)
     command = sweep_command(experiment, "out", *more)
