@@ -81,7 +81,6 @@ def test_it_is_listed_with_its_package_and_what_is_broken_is_said_to_be(python: 
         "package_version": "2.5",
         "version": 4,
         "about": "What departs from the mean of its surroundings, in robust standard deviations.",
-        "tests_the_harness": False,
     }
     assert "of the package acme-inspection 2.5" in detectors["acme_broken"]["broken"]
     assert "NoSuchDetector" in detectors["acme_broken"]["broken"]
