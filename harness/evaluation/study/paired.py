@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.stats import betabinom, binomtest, hypergeom, norm
+from scipy.stats import betabinom, binomtest, hypergeom, norm, t
 
 from harness.evaluation.intervals import Interval, percentiles
 from harness.evaluation.study.limit import SetUpLimit
@@ -68,8 +68,9 @@ def _tails(chance: np.ndarray, observed: int) -> Tails:
 @dataclass(frozen=True)
 class LimitChange:
     """a90 of the second set-up over and less that of the first. ``interval_mm``: 95 % percentiles of the difference
-    over boards drawn again, alike where ``paired``. ``grown_p``, ``shrunk_p``: share of draws in which it has not grown
-    (shrunk), of 500 paired ones never below 1/501; unpaired, of all pairs of draws."""
+    over boards drawn again, alike where ``paired``. ``grown_p``, ``shrunk_p``: one-sided, by Student's t of the
+    change's logarithm over its deviation in paired draws; unpaired, or where many draws have no a90, the share of draws
+    in which it has not grown (shrunk)."""
 
     ratio: float
     difference_mm: float
@@ -77,6 +78,10 @@ class LimitChange:
     grown_p: float
     shrunk_p: float
     paired: bool
+
+
+KNOWN = 0.9
+"""Share of draws with an a90 from which on their deviation is taken for the change's."""
 
 
 def limit_change(first: SetUpLimit, second: SetUpLimit, same_boards: bool) -> LimitChange:
@@ -91,6 +96,11 @@ def limit_change(first: SetUpLimit, second: SetUpLimit, same_boards: bool) -> Li
     shares = (float(np.mean(differences < 0)) + tie, float(np.mean(differences > 0)) + tie)
     grown, shrunk = ((1 - weight) * share + weight for share in shares)
     before, now = first.a90_mm, second.a90_mm
+    with np.errstate(all="ignore"):
+        change, logs = float(np.log(now / before)), np.log(two / one) if paired else np.empty(0)
+    known = logs[np.isfinite(logs)]
+    if len(known) > KNOWN * len(logs) and known.std() > 0 and np.isfinite(change):
+        grown, shrunk = t.sf([change, -change], len(boards[0]) - 1, scale=known.std()).tolist()
     return LimitChange(now / before, now - before, percentiles(differences), grown, shrunk, paired)
 
 

@@ -1,8 +1,8 @@
 """The verdict whether a detection limit has become worse: a factor *and* a paired test, as asv judges benchmarks. Worse
 is a set-up whose a90, or rate of false calls, has grown by more than `MARGIN`, or whose signals over the threshold have
 fallen by as much, and than chance explains, by Holm's step-down over the three questions of all set-ups at `ALPHA`; or
-that has no limit any more. On the same boards the test of hits answers for the limit, on other boards the bootstrap of
-a90. See `harness.evaluation.study.paired`."""
+that has no limit any more. On the same boards the tests of hits and of a90 answer for the limit, on other boards the
+bootstrap of a90. See `harness.evaluation.study.paired`."""
 
 from __future__ import annotations
 
@@ -192,9 +192,12 @@ def _p_values(row: ComparedSetUps) -> tuple[Tails | None, Tails | None, Tails | 
     """(worse, better) of the limit, of false calls and of signals."""
     calls = None if row.calls is None else (row.calls.more_p, row.calls.fewer_p)
     signal = None if row.signal is None else (row.signal.less_p, row.signal.more_p)
-    if row.hits is not None:
-        return (row.hits.fewer_p, row.hits.more_p), calls, signal
-    return None if row.limit is None else (row.limit.grown_p, row.limit.shrunk_p), calls, signal
+    if row.limit is None:
+        return None, calls, signal
+    worse, better = row.limit.grown_p, row.limit.shrunk_p
+    if row.hits is not None and row.limit.paired:  # the better of two tests counts twice
+        worse, better = min(1.0, 2 * min(worse, row.hits.fewer_p)), min(1.0, 2 * min(better, row.hits.more_p))
+    return (worse, better), calls, signal
 
 
 def _verdict(row: ComparedSetUps, alpha: float) -> tuple[Mark, str]:
