@@ -2,15 +2,13 @@
 
 The study is run and compared with a baseline that lies in the repository, by `harness.evaluation.study.verdict`: a
 set-up fails if its a90 or its rate of false calls has grown, or its signals over what is needed have fallen, by more
-than 10 % and the tests say that it is not by chance (0.1 % for the whole check); or if it has no limit any more, more
-failed trials, or is missing.
+than 10 % and not by chance, as the tests say (0.1 % for the whole check); or if its limit is gone, more trials failed,
+or it is missing. With the same seed and code nothing fails that is the same.
 
 Of 25 checks each with 1.2 and 1.4 times the camera's noise and with 1.2 times the threshold all fail; with another
 draw of all noise alone 1 of 500 (95 %: 0.005 to 1.1 %; `tests/validation/gate_power.py`, boards as of regression.yaml).
 The diameter of through-holes hardly follows noise and threshold, the depth of blind holes does in proportion. Where
-both thresholds were calibrated anew, a90 must grow by more than two standard errors of that above the 10 %
-(`harness.evaluation.study.verdict.limit_margin`). With the same seed and code nothing fails that is the same.
-"""
+both thresholds were calibrated anew, a90 must grow by two standard errors more (`verdict.limit_margin`)."""
 
 from __future__ import annotations
 
@@ -21,7 +19,7 @@ from typing import TYPE_CHECKING
 
 from harness.engine.work import add_engine_options, engine_options
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.files import shipped
+from harness.vocabulary.files import shipped, write_text
 from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
@@ -57,7 +55,6 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.experiment.load import load_experiment
     from harness.report.compare import compare_parts
     from harness.tables.text import show
-    from harness.vocabulary.files import write_text
 
     experiment = load_experiment(options.experiment, options.overrides)
     study, set_ups = experiment.config.study, len(experiment.points)

@@ -12,6 +12,7 @@ import numpy as np
 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM
+from harness.vocabulary.path_names import camera_title, in_words
 from harness.vocabulary.program import program, whole_number
 
 if TYPE_CHECKING:
@@ -72,7 +73,6 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.tables.outputs import COVERAGE_PAGE, EXPERIMENT
     from harness.tables.text import many, show
     from harness.vocabulary.files import write_text
-    from harness.vocabulary.path_names import camera_title
     from harness.vocabulary.provenance import RESULTS_VERSION, record
     from scenes.render.cache import in_use
 
@@ -160,7 +160,6 @@ def _rows(one: Survey, poses: list[Pose], size_mm: float, given: int, further: i
 
 def _ways(one: Survey, size_mm: float, share: float) -> list[dict[str, Any]]:
     """The fewest poses of a set-up at each distance, taken greedily, that reach the share, or all that it may have."""
-    from harness.vocabulary.path_names import camera_title, in_words
     from scenes.sensor.camera import camera_of
 
     ways, config = [], one.point.config

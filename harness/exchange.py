@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Frame, FrameSource, Lens, Reason, Region, invert, slopes_of
@@ -81,8 +82,6 @@ def in_turn(
 
 def quaternion_of(T_a_b: np.ndarray) -> tuple[float, float, float, float]:
     """Return (x, y, z, w) of a rigid transform's rotation, w >= 0, of unit length."""
-    from scipy.spatial.transform import Rotation
-
     x, y, z, w = Rotation.from_matrix(T_a_b[:3, :3]).as_quat(canonical=True).tolist()
     return x, y, z, w
 
@@ -112,8 +111,7 @@ def write_tum(folder: Path, views: Sequence[ExportedView]) -> None:
         "associations.txt": [],
     }
     for view in views:
-        pose = (*view.T_board_camera[:3, 3], *quaternion_of(view.T_board_camera))
-        place = " ".join(f"{value:.9g}" for value in pose)
+        place = " ".join(f"{value:.9g}" for value in (*view.T_board_camera[:3, 3], *quaternion_of(view.T_board_camera)))
         for stamp_ns, frame in view.exposures():
             assert frame.rgb is not None
             time = seconds_text(stamp_ns)
@@ -308,8 +306,7 @@ def coco_data(pictures: Sequence[dict[str, Any]], kinds: Sequence[str], about: d
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
     for number, picture in enumerate(pictures, start=1):
-        shape = {key: picture[key] for key in ("file_name", "width", "height")}
-        images.append({"id": number, **shape})
+        images.append({"id": number, **{key: picture[key] for key in ("file_name", "width", "height")}})
         for damage in picture["damages"]:
             mask = {"size": [picture["height"], picture["width"]], "counts": damage["run_lengths"]}
             facts = {"area": damage["pixels"], "bbox": damage["bbox"], "segmentation": mask, "iscrowd": 0}

@@ -268,8 +268,7 @@ class ClusterEngine:
             message = f"{where} does not see {self._probe.parent}, where this machine keeps renders"
             self._refuse(address, UserError(message, fix="name a folder with --out that all machines share"))
         else:
-            can_render = said.digests.get("renders") == self._digests.get("renders")
-            self._nodes[address] = _Node(address, said, can_render)
+            self._nodes[address] = _Node(address, said, said.digests.get("renders") == self._digests.get("renders"))
 
     def _refuse(self, address: str, why: UserError) -> None:
         self._refused[address] = why

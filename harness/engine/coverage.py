@@ -38,8 +38,7 @@ from scenes.target.truth import Damage, face_of
 BOARDS, LOOKS = 40, 3  # Damaged boards on which strength and hits are learnt, and averages in which each is inspected
 STEEPEST_DEG = 60.0  # Tilt about either axis of these boards, at most
 DRAWS, AROUND_PX, NEAR_PX = 2, 31, 15
-"""Averages from which noise is taken; the side of the square over which that of a pixel is, as far as boards move over
-the unit's pattern; and of that in which missing pixels count."""
+"""Averages from which noise is taken; sides of the squares over which that of a pixel, and missing pixels, are."""
 MOST_PATCHES = 3000
 SAME_MM = 1e-6  # Sizes that differ by less are one: then the size of damage is its depth
 ON_FACE_M = 5 * MM  # A patch is seen where the view's own z agrees with its z by this, or by two pixels along the slope
@@ -89,8 +88,7 @@ def survey(experiment: Experiment, poses: Sequence[Pose], cache: Path, folder: P
             blind = np.full(len(patches.areas_m2), np.inf)
             seen = _each(_part_seen, ((view,) for view in views), (task, group.seed, patches), engine)
             seen = [Seen(blind, np.ones(len(blind)), np.ones(len(blind))) if one is None else one for one in seen]
-            named = dict(zip(poses, seen, strict=True))
-            surveys.append(Survey(point, task, patches, findable(damages), named))
+            surveys.append(Survey(point, task, patches, findable(damages), dict(zip(poses, seen, strict=True))))
     return surveys
 
 
@@ -172,8 +170,7 @@ def _damages(boards: Sequence[Any], point: Point, looks: Mapping[tuple[str, int,
             sizes_mm = (damage.diameter_m / MM, damage.depth_m / MM)
             facts.append((*sizes_mm, *seen, max(float(square), 0.0) ** 0.5, sum(hits), len(hits)))
     plan_mm, depth_mm, *seen, strength, found, inspections = np.array(facts).T
-    by_depth = np.ptp(plan_mm) < SAME_MM < np.ptp(depth_mm)
-    word, size_mm = ("depth", depth_mm) if by_depth else (damage.size_of, plan_mm)
+    word, size_mm = ("depth", depth_mm) if np.ptp(plan_mm) < SAME_MM < np.ptp(depth_mm) else (damage.size_of, plan_mm)
     return Damages(word, size_mm, Seen(*seen), strength, found, inspections)
 
 

@@ -1,8 +1,7 @@
 """Noise of random units, and each damage's signature: the input of the ideal observer on a study's set-ups.
 
 Noise is what a unit's average shows, away from damage and rim, beyond what a camera without noise, unit errors and
-rounding shows, less a cubic of each field. The signature is what that noise-free camera shows near the damage beyond a
-cubic through the undamaged pixels."""
+rounding shows, less a cubic; the signature, what that camera shows near damage beyond a cubic through the rest."""
 
 from __future__ import annotations
 

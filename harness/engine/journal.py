@@ -41,9 +41,8 @@ class _Location(NamedTuple):
 
 
 class Journal:
-    """Entries in a folder, by key: the end of a trial, with the text of its record as value. Raises UserError where the
-    folder or a segment is a link, cannot be written, or was written by a newer tofpod. ``damaged``: lines that are torn
-    or altered, as file and byte, and segments of another version."""
+    """Entries in a folder, by key: the end of a trial, its record's text as value. Raises UserError for links, what
+    cannot be written, and a newer tofpod's. ``damaged``: torn or altered lines and segments of other versions."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -55,10 +54,6 @@ class Journal:
 
     def __len__(self) -> int:
         return sum(not key.startswith(THRESHOLDS) for key in self._known())
-
-    def trials(self) -> list[str]:
-        """Return the keys of all trials, sorted."""
-        return sorted(key for key in self._known() if not key.startswith(THRESHOLDS))
 
     def thresholds(self) -> list[str]:
         """Return the keys of stored thresholds, sorted."""

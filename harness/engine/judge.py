@@ -219,8 +219,7 @@ def _hole_row(
     kinds = ("extent", "model")
     if found is None or largest is None:
         blank = (*names, *(f"{kind}_{what}" for kind in kinds for what in ("offset", "error")))
-        sides = dict.fromkeys(("length_mm", "width_mm", "angle_deg"), np.nan)
-        row |= {f"{name}_mm": np.nan for name in blank} | sides
+        row |= {f"{name}_mm": np.nan for name in blank} | dict.fromkeys(("length_mm", "width_mm", "angle_deg"), np.nan)
         return row | {"score": np.nan, "points": 0, "model_note": ""}
     x, y, _ = known.T_board_cloud[:3, :3] @ found.along
     row |= {"length_mm": found.length_m / MM, "width_mm": found.width_m / MM}
@@ -271,8 +270,7 @@ def study_rows(known: KnownCloud, judged: JudgedCloud, radius_m: float, *, hole_
     for name, pixels in (*parts, ("", np.flatnonzero(known.undamaged.ravel()))):
         there = np.sort(flat[pixels][np.isfinite(flat[pixels])])
         above = (len(there) - np.searchsorted(there, thresholds, side="right")).tolist()
-        row = {"hole": name, "pixels": len(there), "threshold": thresholds.tolist(), "above": above}
-        tables["pixels"].append(row)
+        tables["pixels"].append({"hole": name, "pixels": len(there), "threshold": thresholds.tolist(), "above": above})
     return tables
 
 

@@ -1,5 +1,4 @@
-"""The pictures of a report, drawn again from their seeds: example clouds and maps of the first damaged repeat, and of a
-study the damages just below, at and above the limit."""
+"""A report's pictures, drawn again from their seeds: the first damaged repeat; of a study damages about the limit."""
 
 from __future__ import annotations
 

@@ -146,8 +146,7 @@ class Group:
         without: Collection[str] = (),
     ) -> Iterator[tuple[str, TrialTask]]:
         """Yield (journal key, task) of each trial of a batch, or of some ``repeats``. ``thresholds`` by point digest,
-        empty while calibrating; a point that got none is not judged, nor is one of those ``without``; None names trials
-        that cannot be judged."""
+        empty while calibrating; points without, or of ``without``, are not judged; None names trials all the same."""
         if batch.role == "learning":
             for number in range(len(self.learners)) if repeats is None else repeats:
                 learner = (point_task(self.learners[number], None, None),)
@@ -164,8 +163,7 @@ class Group:
         for repeat in range(count) if repeats is None else repeats:
             wanted = tuple(asked[point.digest] for point in points if repeat < self.repeats(batch, point))
             if wanted:
-                set_ups = batch.before(repeat)
-                task = TrialTask(set_ups, self.seed, batch.role, repeat, wanted, self.poses, batch.board)
+                task = TrialTask(batch.before(repeat), self.seed, batch.role, repeat, wanted, self.poses, batch.board)
                 yield self._key(batch, task), task
 
     def _key(self, batch: Batch, task: TrialTask) -> str:
@@ -203,11 +201,6 @@ class SweepPlan:
         """The distinct views, in the order in which trials need them."""
         jobs = {job.path: job for group in self.groups for batch in group.batches for job in batch.renders}
         return tuple(jobs.values())
-
-    @property
-    def trial_count(self) -> int:
-        """Trials of all roles."""
-        return sum(group.most_repeats(batch) for group in self.groups for batch in group.batches)
 
 
 def plan_of(experiment: Experiment, cache: Path, folder: Path | None = None) -> SweepPlan:
@@ -274,8 +267,7 @@ def batch_of(
     renders, set_ups, damaged = [], [], role == "damaged"
     for pose in poses:
         placed = target.model_copy(update={"pose": pose})
-        shown = placed if damaged else placed.hole_free()
-        renders.append(RenderJob(shown, source.camera, source.render, cache))
+        renders.append(RenderJob(placed if damaged else placed.hole_free(), source.camera, source.render, cache))
         set_ups.append(SetUpRef(str(renders[-1].path), source.camera, placed, damaged))
     return Batch(role, tuple(renders), tuple(set_ups), board, units)
 

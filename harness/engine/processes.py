@@ -1,12 +1,12 @@
 """Jobs in processes of this machine: a process that dies, hangs or needs too much memory fails its own job only.
 
-The standard library's executors give up all jobs when a process dies. Here a thread serves each process through a pipe,
-so that its job is known. A cluster's nodes use the same class."""
+The standard library's executors give up all jobs when a process dies; here a thread serves each through a pipe."""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
+import faulthandler
 import importlib
 import multiprocessing
 import os
@@ -317,8 +317,6 @@ def serve(pipe: Connection[Any, Any], name: str, stage: Stage, said: str, code: 
 
 def _prepare(said: str) -> IO[str]:
     """Ignore Ctrl-C, end without a driver, and write to the file ``said`` where a crash or a hang happens."""
-    import faulthandler
-
     # Linux ends this process with its driver, whatever it does; elsewhere it ends where it next hears or tells anything
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)

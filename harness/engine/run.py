@@ -208,8 +208,7 @@ def _draw(plan: SweepPlan, outcome: Outcome, engine: JobEngine, there: set[Path]
 
 def render_missing(jobs: Iterable[RenderJob], engine: JobEngine) -> list[Failure]:
     """Have views rendered that the cache lacks or holds damaged. Returns a failure for each that could not be."""
-    distinct = {job.path: job for job in jobs}
-    missing = [_render_job(job) for job in distinct.values() if read_view(job.path) is None]
+    missing = [_render_job(job) for job in {job.path: job for job in jobs}.values() if read_view(job.path) is None]
     ends = carried_out(missing, engine)
     return [_failure(_lost_view(job.name), ended) for job, ended in ends if ended.state != "done"]
 

@@ -91,16 +91,14 @@ def _at_once(capture: SimulatedCapture, counts: list[int], config: AverageConfig
         if totals is None and len(frames):
             return {}
         sums = sums + totals if sums and totals else sums or totals
-        before = tuple(left for number, left in left_out.items() if number < n)
-        cloud = _cloud(capture, sums, before) if sums else None
+        cloud = _cloud(capture, sums, tuple(left for number, left in left_out.items() if number < n)) if sums else None
         if cloud is not None and not (config.judge_frames and _disturbed(cloud, noise_m, config)):
             clouds[n] = cloud
     return clouds
 
 
 def _left_out(capture: SimulatedCapture, summer: AtOnce, config: AverageConfig, noise_m: float) -> dict[int, LeftOut]:
-    """The frames, by number, that `detectors.average` leaves out for a jump, by the displacement of each as it is: the
-    judge's own error, a sixth of the limit at most, is not drawn."""
+    """The frames, by number, left out for a jump as it is; the judge's error, a sixth of the limit, is not drawn."""
     sampled = summer.sure_pixels / -(-summer.sure_pixels // SAMPLED_PIXELS)
     error_m = 1.2533 * noise_m * np.sqrt(2.0 * CORRELATED_PIXELS / max(sampled, CORRELATED_PIXELS))
     limit_m = max(config.jump_sigmas * error_m, config.jump_mm * MM)
@@ -440,8 +438,7 @@ def _tenth_um(errors_m: np.ndarray) -> list[int | None]:
 
 def pair_noise(first_z_m: np.ndarray, second_z_m: np.ndarray, where: np.ndarray) -> dict[str, float]:
     """Return the standard deviation of one frame's temporal noise and its correlations from two frames' z (h, w),
-    metres. A displacement of a whole frame is taken out with the difference's median. Pixels count that are in
-    ``where`` (h, w) and valid in both; NaN where there are too few."""
+    metres, less the median difference. Pixels ``where`` (h, w) both are valid count; NaN where they are too few."""
     difference = (first_z_m.astype(float) - second_z_m.astype(float)) / np.sqrt(2)
     there = where & np.isfinite(difference)
     if there.sum() < FEWEST_PAIRS:

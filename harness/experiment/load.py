@@ -114,8 +114,7 @@ def lens_numbers(recording: Path, cameras: Iterable[str]) -> dict[str, Any]:
             legal="an Azure Kinect .mkv, or a folder of depth images with its intrinsics beside them",
         )
     for name in cameras:
-        known = name in camera_names() or is_camera_path(name)
-        nominal = load_camera(name).nominal_lens if known else lens
+        nominal = load_camera(name).nominal_lens if name in camera_names() or is_camera_path(name) else lens
         if (nominal.width, nominal.height) != (lens.width, lens.height):
             raise UserError(
                 f"{recording}: the calibration is of {lens.width} x {lens.height} pixels",

@@ -173,8 +173,7 @@ FARTHEST_M = 100.0  # Largest distance of two views of one target: poses in mill
 
 def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
     """Return ``T_first_view`` (4, 4) of each view, the first the identity, from poses to any common frame. Raises
-    UserError where the file cannot be read or is a newer version's, has another number of poses, or one not rigid or
-    too far."""
+    UserError where the file cannot be read, has another number of poses, or one that is not rigid or too far."""
     import numpy as np
 
     from harness.vocabulary.geometry import invert

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from pydantic import Field
 
+from detectors.marks.find import find_marks
+from detectors.marks.mark import CodedMarks
+from detectors.marks.pairing import kabsch
 from harness.evaluation.match import match
 from harness.tables.outputs import GAUGE_ROWS
 from harness.tables.schema import Column, Table
@@ -132,11 +134,6 @@ class GaugeSeen:
 
 def seen_on(gauge: Gauge, judged: Judged) -> GaugeSeen:
     """Find the boards in a judged capture by their marks, match findings to holes. Raises UserError without one."""
-    from dataclasses import replace
-
-    from detectors.marks.find import find_marks
-    from detectors.marks.mark import CodedMarks
-    from detectors.marks.pairing import kabsch
 
     cloud = judged.cloud
     if cloud.rgb is None and cloud.amplitude is not None:  # an infrared picture shows printed codes too
@@ -205,8 +202,3 @@ def _matched(
     for mark in board.marks:
         inside &= (np.abs(places - np.array([mark.x_mm, mark.y_mm]) * MM) > mark.side_mm * MM).any(axis=-1)
     return rows, int(inside.sum()) - sum(bool(inside[finding]) for finding in pairs.values())
-
-
-def csv_text(rows: Sequence[GaugeRow]) -> str:
-    """Return the table as harness.pod reads it."""
-    return str(HITS_AND_MISSES.frame(rows).to_csv(index=False, float_format="%.6g", lineterminator="\n"))

@@ -1,7 +1,6 @@
 """Files: read within limits, as strict JSON; written whole or not at all; locked by the system's own locks.
 
-A file may be made to fill the memory: most are refused by what they state, unread; libraries that believe what a file
-states run within `limited_memory`. All limits stand here."""
+A file may be made to fill the memory: most are refused unread; libraries run within `limited_memory`."""
 
 from __future__ import annotations
 
@@ -137,8 +136,7 @@ NOT_WRITABLE |= {errno.ENAMETOOLONG, errno.EINVAL}
 @contextmanager
 def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Yield a temporary path beside ``path`` (same suffix); rename it on success, delete it on failure. ``durable``:
-    the content is on the disk before the rename, against power failures. Raises UserError where the folder cannot be
-    written or the disk is full."""
+    on the disk before the rename. Raises UserError where the folder cannot be written or the disk is full."""
     path = Path(path)
 
     def make() -> str:

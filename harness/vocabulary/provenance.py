@@ -68,9 +68,8 @@ STAMP = re.compile(r"#\s*tofpod (\w+)(.*)")
 def check_version(
     found: object, known: int, path: Path, what: str, *, oldest: int | None = None, again: str | None = None
 ) -> int:
-    """The version of a file that can be read: from ``oldest`` (default: ``known``) to ``known``. ``what`` the file is,
-    with its article ("a record"). ``again``: what makes an older one anew, for the message. Raises UserError where it
-    is newer, older, missing or no version at all."""
+    """The version of a file that can be read: from ``oldest`` (default: ``known``) to ``known``. ``what`` the file is:
+    "a record". ``again``: what makes an older one anew. Raises UserError where it is newer, older, missing or none."""
     first = known if oldest is None else oldest
     legal, fix = f"version {known}" if first == known else f"versions {first} to {known}", again
     if isinstance(found, bool) or not isinstance(found, int) or found < 0:
