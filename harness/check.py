@@ -54,7 +54,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.evaluation.study.verdict import ALPHA, compare_studies, fewest_boards
     from harness.experiment.load import load_experiment
     from harness.report.compare import compare_parts
-    from harness.tables.text import show
+    from harness.tables.text import many, show
 
     experiment = load_experiment(options.experiment, options.overrides)
     study, set_ups = experiment.config.study, len(experiment.points)
@@ -62,11 +62,9 @@ def main(options: argparse.Namespace, command: str) -> int:
         raise UserError(f"{options.experiment}: has no `study`", fix="name an experiment with one: it measures limits")
     needed = fewest_boards(set_ups)
     if study.boards < needed:  # no loss could ever be told from chance, and the gate would pass everything
-        raise UserError(
-            f"with {study.boards} boards no loss can be told from chance at {100 * ALPHA:g} %: it could not fail",
-            legal=f"at least {needed} boards for {set_ups} set-up{'s' * (set_ups > 1)}",
-            fix="raise study.boards: 24 are needed to see a threshold of 1.2 times as much",
-        )
+        said = f"with {study.boards} boards no loss can be told from chance at {100 * ALPHA:g} %: it could not fail"
+        fix = "raise study.boards: 24 are needed to see a threshold of 1.2 times as much"
+        raise UserError(said, legal=f"at least {needed} boards for {many(set_ups, 'set-up')}", fix=fix)
     asked = engine_options(options)
     if not asked.shard.is_whole:
         raise UserError("--shard: a check needs the whole study", fix="run harness.sweep in shards, merge, then check")
@@ -96,10 +94,9 @@ def main(options: argparse.Namespace, command: str) -> int:
         print("the check fails: if this is meant, run it again with --update and commit the baseline", file=sys.stderr)
         return 1
     if apart := comparison.marked("not comparable"):
-        raise UserError(
-            f"{path}: cannot be compared with: {'; '.join(f'{row.label}: {row.why}' for row in apart)}",
-            fix="run the check again with --update and commit the baseline",
-        )
+        said = "; ".join(f"{row.label}: {row.why}" for row in apart)
+        fix = "run the check again with --update and commit the baseline"
+        raise UserError(f"{path}: cannot be compared with: {said}", fix=fix)
     return 0
 
 

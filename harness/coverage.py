@@ -18,8 +18,7 @@ from harness.vocabulary.program import program, whole_number
 if TYPE_CHECKING:
     from harness.engine.coverage import Pose, Survey
 
-TILTS_DEG, GOAL_TILTS_DEG = (-40.0, -20.0, 0.0, 20.0, 40.0), (-30.0, 0.0, 30.0)
-"""Tilts about x and about y among which poses are suggested, and among which a goal is sought."""
+TILTS_DEG, GOAL_TILTS_DEG = (-40.0, -20.0, 0.0, 20.0, 40.0), (-30.0, 0.0, 30.0)  # to suggest; to seek a goal among
 GOAL_DISTANCES = (0.7, 1.0, 1.4)  # Distances, over the experiment's own, at which a goal is sought
 MOST_POSES, MOVE_S = 6, 10.0  # Poses of one way to a goal at most, and seconds to move the camera between two of them
 

@@ -16,11 +16,9 @@ from scipy.spatial.transform import Rotation
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Frame, FrameSource, Lens, Reason, Region, invert, slopes_of
 
-START_NS = 1_000_000_000 * 10**9
-"""Time of the first frame: a round number in 2001, because 0 means "the latest" to ROS' tf."""
+START_NS = 1_000_000_000 * 10**9  # time of the first frame, in 2001: 0 means "the latest" to ROS' tf
 PAUSE_NS = 10**9  # time between the last frame of a view and the first of the next, in which the camera is carried on
-BOARD_FRAME = "board"
-"""Name of the world's frame: x along the row of holes, y up the face, z out of it, origin at its centre."""
+BOARD_FRAME = "board"  # the world: x along the row of holes, y up the face, z out of it, origin at its centre
 
 
 @dataclass(frozen=True)
@@ -163,8 +161,7 @@ def calibration_text(lens: Lens) -> str:
 POINTS_TOPIC = "/points2"
 INFO_TOPIC = "/depth/camera_info"
 POSE_TOPIC = "/tf_static"
-BAG_VERSION: Literal[8] = 8
-"""Version of metadata.yaml: the oldest that the library writes; later ROS distributions read it too."""
+BAG_VERSION: Literal[8] = 8  # of metadata.yaml: the oldest that the library writes, read by later ROS too
 FLOAT32 = 7  # sensor_msgs/PointField's code
 POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4"), ("intensity", "<f4")])
 """``rgb`` holds the bytes of 0x00RRGGBB; by ROS' convention its field is declared as a float of these bytes."""

@@ -21,10 +21,8 @@ if TYPE_CHECKING:
 
 ALBEDO = 0.6  # Albedo of the planes; beyond the range of the camera, darker and brighter planes stand for distance
 DARKEST = 0.02
-MEASURED, PER_OCTAVE = 2, 16
-"""Brightnesses that are measured in each octave, and entries of the table, between which it takes the nearest."""
-FRAMES, FRAMES_OF_CORRELATION = 40, 100
-"""Frames of 3,000 pixels whose noise is common in squares of 25: they give a deviation to 1 %."""
+MEASURED, PER_OCTAVE = 2, 16  # Brightnesses measured in each octave; entries of the table, of which the nearest counts
+FRAMES, FRAMES_OF_CORRELATION = 40, 100  # Frames of 3,000 pixels give a deviation to 1 %
 LONGEST_LAG = 12  # Pixels to which the correlation of neighbours is followed
 
 

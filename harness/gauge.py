@@ -19,10 +19,8 @@ if TYPE_CHECKING:
     from harness.inspection.gauge import Gauge
 
 DICTIONARY, CODES = "DICT_6X6_50", 50
-MARK_MM, DRILLS_MM, SEED = 32.0, 0.5, 1
-"""Side of a mark, step of the drills that there are, and the seed of which size goes where."""
-CLEAR_MM, EDGE_MM = 6.0, 18.0
-"""White around a mark, without which a code cannot be read; least distance of a hole's rim from the board's edge."""
+MARK_MM, DRILLS_MM, SEED = 32.0, 0.5, 1  # Side of a mark, step of the drills, seed of which size goes where
+CLEAR_MM, EDGE_MM = 6.0, 18.0  # White around a mark, for its code; from a hole's rim to the board's edge at least
 HIT_SHARE = 0.4  # Hit radius as a share of the distance between holes, so that no finding can count for two
 
 

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from scenes.target.drawn import DrawnTargetConfig
 
 DAMAGES = ("through", "blind", "dent", "pressed_dent", "pressed_bump", "protrusion", "slot")
-MOST_AT_ONCE, FILLED = 8, 0.25
-"""Damages of one placement at most, and the share of the scan that discs as wide as they are apart may cover."""
+MOST_AT_ONCE, FILLED = 8, 0.25  # Damages of one placement; share of the scan within half of --apart from them
 COMPARED = (
     "virtual damage may be harder to find than real damage: on the one drilled plate where both were compared 7 of 23"
     " virtual holes were found, and 26 of 26 real ones that looked as wide; check the limit with a gauge board"

@@ -61,8 +61,7 @@ def check_detector(
 
 STRONGEST = 5  # findings of one cloud that are looked at one by one
 CENTRE_MARGIN_M = 0.02  # distance outside the cloud's extent up to which the centre of a finding may lie
-SCORE_TOLERANCE = 0.01
-"""Share of the highest score: robust fits stop at a tolerance of their own; sums in another order round otherwise."""
+SCORE_TOLERANCE = 0.01  # share of the highest score: robust fits stop early, sums in another order round otherwise
 CROP_TOLERANCE = 0.01  # share of the pixels: a crop may come to another decision at the target's rim
 PLACE_TOLERANCE_M = 1e-4
 SHIFT_M = 0.037
@@ -265,8 +264,7 @@ def learns_plain_arrays(make: Make, cloud: Cloud) -> None:
     if not isinstance(detector, Calibratable):
         return
     before, clouds = Look.at(make(), cloud).everything(), [plane(seed=seed, damage=()) for seed in range(8)]
-    given = [_with_arrays(one, _read_only) for one in clouds]
-    learned, again = (dict(detector.calibrate(given)) for _ in range(2))
+    learned, again = (dict(detector.calibrate([_with_arrays(one, _read_only) for one in clouds])) for _ in range(2))
     require(_same(learned, again), "the second time the same clouds taught something else")
     file = io.BytesIO()
     np.savez(file, **learned)  # type: ignore[arg-type]

@@ -37,8 +37,7 @@ from scenes.target.truth import Damage, face_of
 
 BOARDS, LOOKS = 40, 3  # Damaged boards on which strength and hits are learnt, and averages in which each is inspected
 STEEPEST_DEG = 60.0  # Tilt about either axis of these boards, at most
-DRAWS, AROUND_PX, NEAR_PX = 2, 31, 15
-"""Averages from which noise is taken; sides of the squares over which that of a pixel, and missing pixels, are."""
+DRAWS, AROUND_PX, NEAR_PX = 2, 31, 15  # Averages for noise; sides of squares for a pixel's noise, for missing pixels
 MOST_PATCHES = 3000
 SAME_MM = 1e-6  # Sizes that differ by less are one: then the size of damage is its depth
 ON_FACE_M = 5 * MM  # A patch is seen where the view's own z agrees with its z by this, or by two pixels along the slope
@@ -155,7 +154,9 @@ def _each(
     """The values of a function of batches, None where its detector can judge nothing; a bug is raised."""
     jobs = [Job(str(n), "trials", act, (*some, *further)) for n, some in enumerate(asked)]
     ends = {job.name: ended for job, ended in carried_out(jobs, engine)}
-    return [end.result() if end.state == "done" or end.is_bug else None for end in (ends[job.name] for job in jobs)]
+    if bug := next((end.why for end in ends.values() if end.is_bug), None):
+        raise RuntimeError(bug)
+    return [ends[job.name].value for job in jobs]
 
 
 def _damages(boards: Sequence[Any], point: Point, looks: Mapping[tuple[str, int, int, str], Sequence[bool]]) -> Damages:

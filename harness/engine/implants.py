@@ -35,8 +35,7 @@ from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig, Purpose
 from scenes.target.truth import truth_of
 
-MOST_HOLE_FREE, MOST_SETTING = 20, 5
-"""Averages of the undamaged recording on which false calls are counted, and that set a threshold, at most."""
+MOST_HOLE_FREE, MOST_SETTING = 20, 5  # Undamaged averages, at most, that count false calls; that set a threshold
 MOST_EMPTY = 200  # Placements in a row without a place for any damage, after which there is none
 NORMAL_PX = 4  # Half the side of the square of the surface whose plane is taken as the tangent plane
 TELLING_DEG = 5.0  # Steeper by so much than where damage is placed, the rim of what is judged has a limit of its own

@@ -22,11 +22,9 @@ from harness.vocabulary.provenance import check_version, stamp_of, stamped
 from harness.vocabulary.seeds import canonical_json
 
 JOURNAL_VERSION = 6
-"""Raised by every change to the records' content or to what a trial computes. Segments of older versions are passed
-over, so that their trials run again; so are the files of versions before 6, which held one trial each."""
+"""Raised by every change to records or to what a trial computes: trials in segments of older versions run again."""
 SEGMENT_NAME = re.compile(r"[0-9]{6}-[0-9a-f]{8}\.jsonl")
-THRESHOLDS = "thresholds-"
-"""Begins the keys of entries that hold no trial, but the thresholds at which trials were judged."""
+THRESHOLDS = "thresholds-"  # begins keys of entries that hold the thresholds at which trials were judged
 NOTHING = "null"  # stands in the place of the record of a trial that is not done
 KEPT = ("state", "why", "is_bug", "seconds", "peak_mb", "worker")
 

@@ -26,10 +26,8 @@ Rows = dict[str, list[dict[str, Any]]]  # rows by table
 STUDY_TABLES = ("sites", "findings", "operating", "pixels")
 SMEARED_PX = 2  # Pixels by which an outline is grown before findings are laid over it: half of a camera's window
 STEPS_PER_OCTAVE = 4
-FINDING_OCTAVES = (-2, 3)
-"""Other thresholds for findings, about the one in use: under a quarter of it most of a noisy face is one finding."""
-PIXEL_OCTAVES = (-6, 4)
-"""Other thresholds for pixels: reaches down to where a third of the undamaged face and more lies above."""
+FINDING_OCTAVES = (-2, 3)  # Other thresholds for findings: below, most of a noisy face is one finding
+PIXEL_OCTAVES = (-6, 4)  # Other thresholds for pixels, down to where a third of the undamaged face lies above
 
 
 @dataclass(frozen=True)
@@ -285,8 +283,7 @@ def grid(threshold: float, octaves: tuple[int, int]) -> np.ndarray:
 def _without_return(
     known: KnownCloud, judged: JudgedCloud, radius_m: float, *, hole_free: bool
 ) -> tuple[frozenset[int], int]:
-    """Damages (indices) that a finding without return hits, and how many such findings are false calls: they hit none
-    and are no part of a finding by depth. None for detectors that test the harness."""
+    """Damages (indices) that findings without return hit, and how many of these hit none and are no part by depth."""
     tests = getattr(judged.detector, "tests_the_harness", False)
     missing = None if tests else missing_returns(known.cloud, judged.evidence)
     if missing is None or not missing.detections:

@@ -23,8 +23,7 @@ from harness.vocabulary.seeds import canonical_json
 from scenes.target.truth import Damage, face_of
 
 MOST_POINTS = 60_000  # points of a merged cloud in a picture
-SHARES: dict[Where, float] = {"below": 0.75, "at": 1.0, "above": 1.25}
-"""Sizes of damage in a study's pictures, as shares of the limit."""
+SHARES: dict[Where, float] = {"below": 0.75, "at": 1.0, "above": 1.25}  # pictured damage over the limit
 MOST_SET_UPS = 6
 ROOM_MM = 12.0  # room around the largest of a set-up's damages in their pictures, which all have one size
 GREY = 160

@@ -31,8 +31,7 @@ CODE = "harness.engine.learning"
 PACKAGES = (
     "numpy", "scipy", "numba", "opencv-python-headless", "open3d-cpu" if sys.platform == "linux" else "open3d",
 )  # fmt: skip
-"""The task, all sources that this module and the detector's reach, and the versions of these packages decide a trial: a
-change of any makes it count as not done. Mitsuba's version is in the names of the rendered views."""
+"""A trial counts as not done after a change of its task, of sources that it reaches, or of a version of these."""
 MOST_REPEATS = 256  # repeats of a part of a plan, which is looked up and queued as one
 
 
@@ -111,11 +110,6 @@ class Group:
         """Files, by point digest, of what detectors learn: each has the name of its trial in the journal."""
         trials = (trial for batch in self.learning for trial in self.trials(batch, None))
         return {task.points[0].digest: str(self.folder / f"{key}.npz") for key, task in trials}
-
-    @property
-    def is_study(self) -> bool:
-        """Return whether its boards are drawn at random."""
-        return self.then[0].board is not None
 
     @property
     def damaged(self) -> Batch:

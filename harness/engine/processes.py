@@ -36,8 +36,7 @@ LOOKS_S = 1.0  # interval at which a driver looks at the clock
 START_S = 300.0  # time for a process to load what it needs: seconds, but from a network's disk more
 DUMP_S = 0.3  # time that a hanging process gets to write its traceback; its signal handler needs a millisecond
 STOPPED_S = 2.0  # a wait of `LOOKS_S` that takes so much longer was no waiting: Ctrl-Z, or a suspended machine
-IDLE_S: dict[Stage, float] = {"trials": 300.0, "renders": 10.0}
-"""Processes without a job for so long end: those that render hold 2 GB."""
+IDLE_S: dict[Stage, float] = {"trials": 300.0, "renders": 10.0}  # idle processes end then; renderers hold 2 GB
 FALSE_STARTS = 3  # processes in a row that died before they could take a job: then none will start
 _SPAWNING = threading.Lock()
 

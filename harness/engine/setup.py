@@ -23,13 +23,10 @@ from scenes.target.custom import TargetConfig
 from scenes.target.flaws import from_line_m
 from scenes.target.truth import Damage, Face, face_of, truth_of
 
-INTACT_MARGIN_PX = 8
-"""Pixels nearer than this to damage or to the board's rim do not count as undamaged: twice the engine's window."""
+INTACT_MARGIN_PX = 8  # Nearer to damage or rim nothing counts as undamaged: twice the engine's window
 FEWEST_PROBES = 100
-PROBES = 500
-"""Pixels on which temporal noise and systematic error are followed over repeats: known to 0.5 % with 50 repeats."""
-FACE_STEPS = 8
-"""Fixed-point steps to where a line of sight meets a curved face; each shrinks the error by the face's slope."""
+PROBES = 500  # Pixels followed over repeats for noise and systematic error: known to 0.5 % with 50 repeats
+FACE_STEPS = 8  # Fixed-point steps to a curved face; each shrinks the error by the face's slope
 FACE_ONLY_M = 50 * MM  # points this far behind the face are nearest to no place on it
 
 
@@ -160,8 +157,7 @@ def met_on_face(points_m: np.ndarray, directions: np.ndarray, face: Face) -> np.
     return np.asarray(place)
 
 
-KEPT, KEPT_BYTES = 32, 200_000_000
-"""Most set-ups that a worker keeps, and bytes of their views: three near views of a lidar with 31 frequencies."""
+KEPT, KEPT_BYTES = 32, 200_000_000  # Set-ups kept, and bytes of views: three of a lidar with 31 frequencies
 _kept: OrderedDict[SetUpRef, SetUp] = OrderedDict()
 
 
@@ -251,8 +247,7 @@ def known_map(first: SetUp, cloud: Cloud, T_reference_cloud: np.ndarray, *, hole
 def far_from(truth: Sequence[Damage], places_m: np.ndarray, margin_m: float) -> np.ndarray:
     """Return (h, w) bool: places (h, w, 2) farther than a margin from all damage."""
     x, y = (np.ascontiguousarray(places_m[..., axis]) for axis in (0, 1))
-    near = [damage.within(x, y, margin_m) for damage in truth]
-    return ~np.any([np.zeros(x.shape, bool), *near], axis=0)
+    return ~np.any([np.zeros(x.shape, bool), *(damage.within(x, y, margin_m) for damage in truth)], axis=0)
 
 
 def board_places_m(cloud: Cloud, T_board_cloud: np.ndarray) -> np.ndarray:

@@ -192,9 +192,9 @@ def _counts(outcome: Outcome) -> dict[str, int]:
 def _tell_failures(outcome: Outcome) -> None:
     if counts := _counts(outcome):
         said = ", ".join(f"{count} {state}" for state, count in counts.items())
-        again = "the same command, with --retry-failed, runs them again" if set(counts) - {"skipped"} else ""
-        print(f"{said}: {_reasons(outcome)}", file=sys.stderr)
-        print(again or "the same command runs again what was skipped", file=sys.stderr)
+        again = "the same command, with --retry-failed, runs them again"
+        again = again if set(counts) - {"skipped"} else "the same command runs again what was skipped"
+        print(f"{said}: {_reasons(outcome)}\n{again}", file=sys.stderr)
 
 
 def _provenance(
@@ -226,8 +226,7 @@ def _provenance(
     }
 
 
-SIMULATION = ("scenes.sensor.source",)
-"""Modules that decide frames, with all that they import: a change of any makes frames count as different."""
+SIMULATION = ("scenes.sensor.source",)  # modules that decide frames, with all that they import
 INSPECTED = {
     "board": int, "hole": str, "repeat": int, "true_diameter_mm": float, "true_depth_mm": float, "true_x_mm": float,
     "true_y_mm": float, "signal": float,

@@ -37,12 +37,10 @@ from scenes.sensor.source import SimulatedCapture, SimulatedUnit
 from scenes.sensor.unit import FrameTotals
 
 FEWEST_FRAMES = 20
-"""Fewer frames cost less than the sorting of a view's pixels, which takes as long as some 10 frames of a bare board
-and 25 of one with holes before a far wall. By number only, so that no result hangs on what was sorted before."""
+"""Fewer frames cost less than sorting a view's pixels. By number only: no result hangs on what was sorted before."""
 FLAT_ALBEDO = 0.6  # of a flat field's plane: painted wood or paper, as the boards of the experiments
 MOST_DISTURBED = 0.5
-"""Share of `AverageConfig.disturbed_fraction` that pixels' own noise may disturb. A frame's own share scatters about
-the mean by a thousandth, and the judge allows 1.5 times what it finds usual on top."""
+"""Share of `AverageConfig.disturbed_fraction` that pixels' own noise may disturb; it scatters by a thousandth."""
 
 
 def averages_of(
@@ -154,8 +152,8 @@ BOARD_STEPS = 9  # places along each side of the board at which a registration's
 
 
 class MapMaker:
-    """Maps of one trial: ``clouds`` by view, then by number of frames. ``poses``: the views' declaration; ``labels`` of
-    this trial's random errors of the poses. ``truth`` and ``guesses``: T_reference_view."""
+    """Maps of one trial: ``clouds`` by view, then frames. ``poses``: the views' declaration; ``labels`` of the trial's
+    random errors of the poses. ``truth``, ``guesses``: T_reference_view."""
 
     def __init__(
         self, set_ups: Sequence[SetUp], clouds: Sequence[Clouds], poses: AnyViews, labels: Sequence[str | int]
@@ -236,9 +234,10 @@ class MapMaker:
         both = (registration.T_reference_view, self.guesses[number])
         (in_plane, across), guessed = (registration_error_m(T, self.truth[number], places_m, normal) for T in both)
         predicted = predicted_error_m(registration, places_m, normal)
+        told = ("method", "overlap", "pairs", "iterations", "converged", "seconds", "failure")
         return {
             "view": number,
-            "method": registration.method,
+            **{name: getattr(registration, name) for name in told},
             "tre_mm": float(np.hypot(in_plane, across)) / MM,
             "tre_in_plane_mm": in_plane / MM,
             "tre_across_mm": across / MM,
@@ -246,13 +245,7 @@ class MapMaker:
             "predicted_across_mm": predicted[1] / MM,
             "guess_tre_mm": float(np.hypot(*guessed)) / MM,
             "residual_mm": registration.residual_m / MM,
-            "overlap": registration.overlap,
-            "pairs": registration.pairs,
             "marks": len(view.marks.trusted),
-            "iterations": registration.iterations,
-            "converged": registration.converged,
-            "seconds": registration.seconds,
-            "failure": registration.failure,
         }
 
 

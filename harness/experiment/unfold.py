@@ -113,8 +113,7 @@ MAX_POINTS = 10_000  # More than a machine works through in a week; beyond it an
 MAX_SHOWN = 20  # Problems of combinations are found one point at a time and look alike
 FRAMES = "capture.frames"
 SWITCHES = "switches"  # Key of the file that names a mapping of switches
-FIXED = ("name", "title", "repeats", "study", "sweep", "draws", SWITCHES, "sensitivity")
-"""Keys that are the same for all points."""
+FIXED = ("name", "title", "repeats", "study", "sweep", "draws", SWITCHES, "sensitivity")  # the same for all points
 
 
 @dataclass(frozen=True)
@@ -247,8 +246,7 @@ def _path_problems(path: str, place: Place | None, source: Source, fixed: Iterab
 
 
 def _resolved(draft: Draft, source: Source, all_told: bool) -> tuple[ExperimentConfig | None, list[Problem]]:
-    """Return the declaration of one point, or what is wrong with it: at the wrong value, else (``all_told``) at its
-    name."""
+    """Return a point's declaration, or what is wrong with it: at the wrong value, else (``all_told``) at its name."""
     place = source.place_of(draft.named_at)
     located = replace(source, data={k: v for k, v in source.data.items() if k not in ("sweep", "sensitivity")})
     try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
@@ -13,6 +13,7 @@ from detectors.marks.find import find_marks
 from detectors.marks.mark import CodedMarks
 from detectors.marks.pairing import kabsch
 from harness.evaluation.match import match
+from harness.report.findings import Judged
 from harness.tables.outputs import GAUGE_ROWS
 from harness.tables.schema import Column, Table
 from harness.vocabulary.config import Config
@@ -22,14 +23,10 @@ from harness.vocabulary.files import RECORD_BYTES, bounded_bytes, strict_json
 from harness.vocabulary.geometry import MM, invert, transform_points
 from harness.vocabulary.provenance import check_version
 
-if TYPE_CHECKING:
-    from harness.report.findings import Judged
-
 GAUGE_VERSION = 1
 FEWEST_MARKS = 3
 SIDES = 8  # Directions around a hole in which judged points must lie: else a miss says nothing of its size
-WORST_FIT_MM = 2.0
-"""Root mean square distance of marks from where the board has them, beyond which the board's place is doubtful."""
+WORST_FIT_MM = 2.0  # Root mean square distance of marks from their places, beyond which the fit is doubtful
 Length = Annotated[float, Field(gt=0, le=5e3)]
 CoordinateMm = Annotated[float, Field(ge=-5e3, le=5e3)]
 

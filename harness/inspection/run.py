@@ -43,10 +43,8 @@ if TYPE_CHECKING:
     from detectors.recordings import Recording
     from detectors.registration.registered import Registration
 
-DEFAULT_K = 5.0
-"""Robust standard deviations, where the capture cannot tell better; of a million normal pixels 0.6 lie beyond."""
-FAINT_CALLS = 0.05
-"""Expected false calls as strong as a finding, in the capture, from which on noise explains the finding."""
+DEFAULT_K = 5.0  # Robust standard deviations, where the capture cannot tell; 0.6 of a million normal pixels lie beyond
+FAINT_CALLS = 0.05  # Expected false calls as strong as a finding, from which on noise explains the finding
 FAINT_PEAKS = 20  # peaks below which their number does not tell how fast it falls with the score
 THRESHOLDS = ("threshold", "quiet_capture", "false_calls")  # arguments of which each sets the threshold
 
@@ -165,8 +163,7 @@ def _calls(expected: float) -> str:
     return f"{expected:.1f}" if expected >= 0.1 else f"{expected:.1g}" if expected >= 1e-4 else "0"
 
 
-START_FROM_MARKS = ("icp", "cpd")
-"""Methods that need a place to start from; `joint` finds its own, `odometry` goes from view to view."""
+START_FROM_MARKS = ("icp", "cpd")  # methods that need a start; `joint` finds its own, `odometry` goes view to view
 
 
 @dataclass(frozen=True)
@@ -268,9 +265,8 @@ def _mistakes_named(view: View | None) -> Iterator[None]:
     try:
         yield
     except UserError as mistake:
-        if view is None:
-            raise
-        raise UserError(f"view {view.name}: {mistake.message}", legal=mistake.legal, fix=mistake.fix) from mistake
+        named = "" if view is None else f"view {view.name}: "
+        raise UserError(f"{named}{mistake.message}", legal=mistake.legal, fix=mistake.fix) from mistake
 
 
 def _merged(

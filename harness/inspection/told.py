@@ -10,21 +10,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from detectors.crop import AutoCrop, Choice, choice_of, described_text
-from harness.report.findings import save_targets
+from harness.report.findings import Finding, Judged, save_targets
 from harness.report.view3d import Circle3d, Scene3d
 from harness.tables.text import Grid, show
-from harness.vocabulary.geometry import MM
+from harness.vocabulary.geometry import MM, Cloud
 
 if TYPE_CHECKING:
     from detectors.interface import Evidence
     from detectors.mapping.merge import Mapped
     from detectors.recordings import Recording
     from detectors.views import PreparedView
-    from harness.report.findings import Finding, Judged
-    from harness.vocabulary.geometry import Cloud
 
-WIDEST_NATIVE_PX = 6.5
-"""The widest filter of a known camera's own image averages 5 pixels; a measured reach scatters by one."""
+WIDEST_NATIVE_PX = 6.5  # Known cameras' own filters average 5 pixels at most; a measured reach scatters by one
 
 
 def mm(metres: float) -> str:

@@ -59,8 +59,7 @@ def record(command: str) -> dict[str, Any]:
     return {"command": command, "commit": commit, "dirty": dirty, "versions": versions(), "machine": machine}
 
 
-RESULTS_VERSION = 1
-"""Stands in every file of a result folder that has no version of its own; raised when the tables' meaning changes."""
+RESULTS_VERSION = 1  # Of files without a version of their own; raised when the tables' meaning changes
 GENERATOR = f"tofpod results {RESULTS_VERSION}"  # Stands in pages
 STAMP = re.compile(r"#\s*tofpod (\w+)(.*)")
 
