@@ -434,8 +434,8 @@ def _write(run: Inspection, facts: dict[str, Any]) -> None:
     subject = f"{len(mapped.merged.views_used)} views" if mapped else run.recordings[0].name
     title = f"{subject}: {count} findings beyond {limit}"
     if run.seen is not None:
-        gauge, form = HITS_AND_MISSES.frame(run.seen.rows), {"float_format": "%.6g", "lineterminator": "\n"}
-        beside[GAUGE_ROWS.name] = lambda path: gauge.to_csv(path, index=False, **form)
+        table = HITS_AND_MISSES.frame(run.seen.rows).to_csv(index=False, float_format="%.6g", lineterminator="\n")
+        beside[GAUGE_ROWS.name] = lambda path: path.write_text(table, encoding="utf-8")
     if mapped is None:
         beside |= told.pictures(run.choices[0])
     else:
