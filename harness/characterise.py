@@ -83,8 +83,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     known = options.like
     with suppress(UserError):  # none is as large, or it sees nothing of the surfaces
         known = known or camera_of_size(captures[0].lens)
-        other = simulated(with_lens(known, captures[0].lens), found, options.albedo)
-        sources[KNOWN] = characteristics(other, poses)
+        sources[KNOWN] = characteristics(simulated(with_lens(known, captures[0].lens), found, options.albedo), poses)
     rows = beside(found, twin, sources.get(KNOWN))
     noise = ", ".join(f"{one.temporal.value:.3g} mm at {one.distance_m:.2f} m" for one in found.surfaces[:3])
     answer = f"Temporal noise of single pixels: {noise}." if noise else "No flat surface was found."

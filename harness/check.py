@@ -2,15 +2,13 @@
 
 The study is run and compared with a baseline that lies in the repository, by `harness.evaluation.study.verdict`: a
 set-up fails if its a90 or its rate of false calls has grown, or its signals over what is needed have fallen, by more
-than 10 % and the tests say that it is not by chance (0.1 % for the whole check); or if it has no limit any more, more
-failed trials, or is missing.
+than 10 % and not by chance, as the tests say (0.1 % for the whole check); or if its limit is gone, more trials failed,
+or it is missing. With the same seed and code nothing fails that is the same.
 
 Of 25 checks each with 1.2 and 1.4 times the camera's noise and with 1.2 times the threshold all fail; with another
 draw of all noise alone 1 of 500 (95 %: 0.005 to 1.1 %; `tests/validation/gate_power.py`, boards as of regression.yaml).
 The diameter of through-holes hardly follows noise and threshold, the depth of blind holes does in proportion. Where
-both thresholds were calibrated anew, a90 must grow by more than two standard errors of that above the 10 %
-(`harness.evaluation.study.verdict.limit_margin`). With the same seed and code nothing fails that is the same.
-"""
+both thresholds were calibrated anew, a90 must grow by two standard errors more (`verdict.limit_margin`)."""
 
 from __future__ import annotations
 
@@ -21,7 +19,7 @@ from typing import TYPE_CHECKING
 
 from harness.engine.work import add_engine_options, engine_options
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.files import shipped
+from harness.vocabulary.files import shipped, write_text
 from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
@@ -56,8 +54,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.evaluation.study.verdict import ALPHA, compare_studies, fewest_boards
     from harness.experiment.load import load_experiment
     from harness.report.compare import compare_parts
-    from harness.tables.text import show
-    from harness.vocabulary.files import write_text
+    from harness.tables.text import many, show
 
     experiment = load_experiment(options.experiment, options.overrides)
     study, set_ups = experiment.config.study, len(experiment.points)
@@ -65,11 +62,9 @@ def main(options: argparse.Namespace, command: str) -> int:
         raise UserError(f"{options.experiment}: has no `study`", fix="name an experiment with one: it measures limits")
     needed = fewest_boards(set_ups)
     if study.boards < needed:  # no loss could ever be told from chance, and the gate would pass everything
-        raise UserError(
-            f"with {study.boards} boards no loss can be told from chance at {100 * ALPHA:g} %: it could not fail",
-            legal=f"at least {needed} boards for {set_ups} set-up{'s' * (set_ups > 1)}",
-            fix="raise study.boards: 24 are needed to see a threshold of 1.2 times as much",
-        )
+        said = f"with {study.boards} boards no loss can be told from chance at {100 * ALPHA:g} %: it could not fail"
+        fix = "raise study.boards: 24 are needed to see a threshold of 1.2 times as much"
+        raise UserError(said, legal=f"at least {needed} boards for {many(set_ups, 'set-up')}", fix=fix)
     asked = engine_options(options)
     if not asked.shard.is_whole:
         raise UserError("--shard: a check needs the whole study", fix="run harness.sweep in shards, merge, then check")
@@ -99,10 +94,9 @@ def main(options: argparse.Namespace, command: str) -> int:
         print("the check fails: if this is meant, run it again with --update and commit the baseline", file=sys.stderr)
         return 1
     if apart := comparison.marked("not comparable"):
-        raise UserError(
-            f"{path}: cannot be compared with: {'; '.join(f'{row.label}: {row.why}' for row in apart)}",
-            fix="run the check again with --update and commit the baseline",
-        )
+        said = "; ".join(f"{row.label}: {row.why}" for row in apart)
+        fix = "run the check again with --update and commit the baseline"
+        raise UserError(f"{path}: cannot be compared with: {said}", fix=fix)
     return 0
 
 

@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import size_text
 from harness.vocabulary.program import program
 
 
@@ -42,7 +43,6 @@ def main(options: argparse.Namespace, command: str) -> int:
 def _clean_cache(options: argparse.Namespace) -> int:
     from harness.listing import bytes_of, cache_removal, refuse_links
     from harness.tables.text import many
-    from harness.vocabulary.files import size_text
     from scenes.render.cache import alone, removed
 
     limit = None if options.limit is None else bytes_of(options.limit)
@@ -68,7 +68,6 @@ def _clean_cache(options: argparse.Namespace) -> int:
 def _clean_results(options: argparse.Namespace) -> int:
     from harness.listing import chosen_results, removable, remove_results
     from harness.tables.text import many
-    from harness.vocabulary.files import size_text
 
     folders = chosen_results(options.out, options.name)
     if not options.dry_run:
@@ -116,7 +115,6 @@ def _agreed(options: argparse.Namespace, what: str, count: int) -> bool:
 
 def _concluded(gone: int, wanted: int, freed_bytes: int) -> int:
     from harness.tables.text import many
-    from harness.vocabulary.files import size_text
 
     print(f"removed {many(gone, 'file')}, {size_text(freed_bytes)}")
     if gone < wanted:

@@ -63,8 +63,7 @@ def write_comparison(comparison: Comparison, folder: Path, command: str) -> None
     from harness.report.compare import compare_data, compare_html
     from harness.vocabulary.files import write_text
 
-    data = json.dumps(compare_data(comparison), indent=2, allow_nan=False)
-    write_text(folder / FILES[0], data + "\n")
+    write_text(folder / FILES[0], json.dumps(compare_data(comparison), indent=2, allow_nan=False) + "\n")
     write_text(folder / FILES[1], compare_html(comparison, command))
 
 

@@ -12,13 +12,13 @@ import numpy as np
 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM
+from harness.vocabulary.path_names import camera_title, in_words
 from harness.vocabulary.program import program, whole_number
 
 if TYPE_CHECKING:
     from harness.engine.coverage import Pose, Survey
 
-TILTS_DEG, GOAL_TILTS_DEG = (-40.0, -20.0, 0.0, 20.0, 40.0), (-30.0, 0.0, 30.0)
-"""Tilts about x and about y among which poses are suggested, and among which a goal is sought."""
+TILTS_DEG, GOAL_TILTS_DEG = (-40.0, -20.0, 0.0, 20.0, 40.0), (-30.0, 0.0, 30.0)  # to suggest; to seek a goal among
 GOAL_DISTANCES = (0.7, 1.0, 1.4)  # Distances, over the experiment's own, at which a goal is sought
 MOST_POSES, MOVE_S = 6, 10.0  # Poses of one way to a goal at most, and seconds to move the camera between two of them
 
@@ -72,7 +72,6 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.tables.outputs import COVERAGE_PAGE, EXPERIMENT
     from harness.tables.text import many, show
     from harness.vocabulary.files import write_text
-    from harness.vocabulary.path_names import camera_title
     from harness.vocabulary.provenance import RESULTS_VERSION, record
     from scenes.render.cache import in_use
 
@@ -160,7 +159,6 @@ def _rows(one: Survey, poses: list[Pose], size_mm: float, given: int, further: i
 
 def _ways(one: Survey, size_mm: float, share: float) -> list[dict[str, Any]]:
     """The fewest poses of a set-up at each distance, taken greedily, that reach the share, or all that it may have."""
-    from harness.vocabulary.path_names import camera_title, in_words
     from scenes.sensor.camera import camera_of
 
     ways, config = [], one.point.config

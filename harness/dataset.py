@@ -9,12 +9,13 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from harness.engine.work import EngineOptions, Job, JobEngine, Outcome, StageCounts, engine_of, locked
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import write_text
 from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
     from harness.engine.boards import Sample
-    from harness.engine.work import Job, JobEngine
     from harness.experiment.schema import Experiment
 
 MOST = 10_000
@@ -44,9 +45,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
 def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0, 1 where boards failed, 2 on a mistake of the user, 130 after Ctrl-C."""
     from harness.engine.boards import FEWEST, INDEX, read_index, samples_of
-    from harness.engine.work import EngineOptions, engine_of, locked
     from harness.experiment.load import load_experiment, resolved_yaml
-    from harness.vocabulary.files import write_text
     from scenes.render.cache import in_use
 
     if not FEWEST <= options.boards <= MOST or options.jobs < 1:
@@ -113,7 +112,6 @@ def _written(out: Path, samples: list[Sample], engine: JobEngine) -> list[str]:
     from harness.engine.boards import TRUTH, joined, seen_region, write_board
     from harness.engine.estimate import progress_display
     from harness.engine.run import carried_out
-    from harness.engine.work import Job, Outcome, StageCounts
 
     outcome, failures = Outcome(), list[str]()
     renders = {sample.render.path: sample.render for sample in samples}
@@ -149,7 +147,6 @@ def _finish(out: Path, samples: list[Sample], about: dict[str, Any]) -> None:
     from harness.engine.boards import INDEX, INSET_PX, SPLITS, read_truth
     from harness.exchange import coco_data
     from harness.report.blocks import template
-    from harness.vocabulary.files import write_text
 
     truths = {sample.name: read_truth(out, sample.name) for sample in samples}
     kinds = sorted({damage["kind"] for truth in truths.values() for damage in truth["damages"]})

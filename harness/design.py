@@ -41,8 +41,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, metavar="DIR", help=f"write {', '.join(FILES)} there as well")
 
 
+# a curve, where it is from, sizes to choose from; face of a hole-free board in m2, None if not known
 Guess = tuple["PodCurve", str, tuple[float, float], float | None]
-"""A curve, where it is from, sizes to choose from; face of a hole-free board in m2, None if not known."""
 
 
 @program(

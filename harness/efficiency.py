@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from harness.engine.work import add_engine_options, engine_options
+from harness.engine.work import add_engine_options, engine_of, engine_options, locked
 from harness.tables.outputs import EFFICIENCY_PAGE, EXPERIMENT, STUDY
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
@@ -31,7 +31,6 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.engine.ideal import ideal_of_set_ups
     from harness.engine.plan import plan_of
     from harness.engine.tables import write_tables
-    from harness.engine.work import engine_of, locked
     from harness.evaluation.study.efficiency import efficiency_of, warnings_of
     from harness.evaluation.study.limit import limit_of
     from harness.evaluation.study.record import read_record

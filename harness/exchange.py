@@ -11,15 +11,14 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Frame, FrameSource, Lens, Reason, Region, invert, slopes_of
 
-START_NS = 1_000_000_000 * 10**9
-"""Time of the first frame: a round number in 2001, because 0 means "the latest" to ROS' tf."""
+START_NS = 1_000_000_000 * 10**9  # time of the first frame, in 2001: 0 means "the latest" to ROS' tf
 PAUSE_NS = 10**9  # time between the last frame of a view and the first of the next, in which the camera is carried on
-BOARD_FRAME = "board"
-"""Name of the world's frame: x along the row of holes, y up the face, z out of it, origin at its centre."""
+BOARD_FRAME = "board"  # the world: x along the row of holes, y up the face, z out of it, origin at its centre
 
 
 @dataclass(frozen=True)
@@ -81,8 +80,6 @@ def in_turn(
 
 def quaternion_of(T_a_b: np.ndarray) -> tuple[float, float, float, float]:
     """Return (x, y, z, w) of a rigid transform's rotation, w >= 0, of unit length."""
-    from scipy.spatial.transform import Rotation
-
     x, y, z, w = Rotation.from_matrix(T_a_b[:3, :3]).as_quat(canonical=True).tolist()
     return x, y, z, w
 
@@ -112,8 +109,7 @@ def write_tum(folder: Path, views: Sequence[ExportedView]) -> None:
         "associations.txt": [],
     }
     for view in views:
-        pose = (*view.T_board_camera[:3, 3], *quaternion_of(view.T_board_camera))
-        place = " ".join(f"{value:.9g}" for value in pose)
+        place = " ".join(f"{value:.9g}" for value in (*view.T_board_camera[:3, 3], *quaternion_of(view.T_board_camera)))
         for stamp_ns, frame in view.exposures():
             assert frame.rgb is not None
             time = seconds_text(stamp_ns)
@@ -165,8 +161,7 @@ def calibration_text(lens: Lens) -> str:
 POINTS_TOPIC = "/points2"
 INFO_TOPIC = "/depth/camera_info"
 POSE_TOPIC = "/tf_static"
-BAG_VERSION: Literal[8] = 8
-"""Version of metadata.yaml: the oldest that the library writes; later ROS distributions read it too."""
+BAG_VERSION: Literal[8] = 8  # of metadata.yaml: the oldest that the library writes, read by later ROS too
 FLOAT32 = 7  # sensor_msgs/PointField's code
 POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4"), ("intensity", "<f4")])
 """``rgb`` holds the bytes of 0x00RRGGBB; by ROS' convention its field is declared as a float of these bytes."""
@@ -308,8 +303,7 @@ def coco_data(pictures: Sequence[dict[str, Any]], kinds: Sequence[str], about: d
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
     for number, picture in enumerate(pictures, start=1):
-        shape = {key: picture[key] for key in ("file_name", "width", "height")}
-        images.append({"id": number, **shape})
+        images.append({"id": number, **{key: picture[key] for key in ("file_name", "width", "height")}})
         for damage in picture["damages"]:
             mask = {"size": [picture["height"], picture["width"]], "counts": damage["run_lengths"]}
             facts = {"area": damage["pixels"], "bbox": damage["bbox"], "segmentation": mask, "iscrowd": 0}

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import atomic_folder, write_text
 from harness.vocabulary.program import program, whole_number
 
 if TYPE_CHECKING:
@@ -47,7 +48,6 @@ def main(arguments: argparse.Namespace, command: str) -> int:
     from harness.engine.plan import batch_of
     from harness.exchange import in_turn, write_bag, write_tum
     from harness.experiment.load import load_experiment
-    from harness.vocabulary.files import atomic_folder
     from scenes.render.cache import cached_view
     from scenes.sensor.camera import camera_of
     from scenes.sensor.source import SimulatedUnit
@@ -97,7 +97,6 @@ def _write_beside(
 
     from harness.experiment.load import resolved_yaml
     from harness.inspection.arguments import POSES_KEY
-    from harness.vocabulary.files import write_text
     from harness.vocabulary.provenance import RESULTS_VERSION, record
     from scenes.perspectives import guessed_T_reference_view
     from scenes.target.truth import truth_of

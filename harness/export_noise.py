@@ -1,9 +1,8 @@
 """``python -m harness.export_noise CAMERA --out DIR``: a camera's noise as a table and one file of code.
 
 For simulators that render ideal depth (Isaac Sim, Gazebo, MuJoCo, BlenderProc): ``NAME.npz`` with the table, and
-``depth_noise.py`` (NumPy, or torch), a copy of `scenes.sensor.tabled`, which says what is not modelled. The table is
-measured on the full model before planes of many brightnesses: deviation, chance of a return, correlation of neighbours,
-fixed pattern."""
+``depth_noise.py`` (NumPy, or torch), a copy of `scenes.sensor.tabled`, which says what is not modelled. The full model
+is measured before planes of many brightnesses: deviation, returns, correlation of neighbours, fixed pattern."""
 
 from __future__ import annotations
 
@@ -22,10 +21,8 @@ if TYPE_CHECKING:
 
 ALBEDO = 0.6  # Albedo of the planes; beyond the range of the camera, darker and brighter planes stand for distance
 DARKEST = 0.02
-MEASURED, PER_OCTAVE = 2, 16
-"""Brightnesses that are measured in each octave, and entries of the table, between which it takes the nearest."""
-FRAMES, FRAMES_OF_CORRELATION = 40, 100
-"""Frames of 3,000 pixels whose noise is common in squares of 25: they give a deviation to 1 %."""
+MEASURED, PER_OCTAVE = 2, 16  # Brightnesses measured in each octave; entries of the table, of which the nearest counts
+FRAMES, FRAMES_OF_CORRELATION = 40, 100  # Frames of 3,000 pixels give a deviation to 1 %
 LONGEST_LAG = 12  # Pixels to which the correlation of neighbours is followed
 
 
@@ -62,12 +59,10 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def noise_table(camera: AnyCamera) -> dict[str, np.ndarray]:
-    """Return the arrays that `scenes.sensor.tabled.DepthNoise` takes.
-
-    ``sigma_m``, ``seen`` (n,): deviation and chance of a return at log2 of intensity / range^2, from ``first`` on,
-    ``per_octave`` entries each; filters ``rows``, ``columns`` of the noise, ``pattern_rows``, ``pattern_columns`` of
-    the pattern, whose deviation is ``pattern_m``; ``slopes`` (h, w, 2); ``falloff`` (h, w): each pixel's light relative
-    to the axis; ``step_m``, ``nearest_m``, ``farthest_m``."""
+    """Return the arrays that `scenes.sensor.tabled.DepthNoise` takes: ``sigma_m``, ``seen`` (n,), deviation and chance
+    of a return at log2 of intensity / range^2, from ``first`` on, ``per_octave`` entries each; filters of the noise and
+    of the pattern, whose deviation is ``pattern_m``; ``slopes`` (h, w, 2); ``falloff`` (h, w): each pixel's light
+    relative to the axis; ``step_m``, ``nearest_m``, ``farthest_m``."""
     from scenes.sensor.calibration import with_number
 
     optics, fine = camera.optics, with_number(camera, "engine", "output_step_mm", 1e-3)  # the table rounds by itself

@@ -9,16 +9,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import MM, Lens
 from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
-    import numpy as np
     from matplotlib.figure import Figure
 
     from detectors.flat_captures import FlatCapture
     from detectors.recordings import Recording
-    from harness.vocabulary.geometry import Lens
 
 SHOWN_SIGMAS = 3.0
 
@@ -79,8 +80,6 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 def _draw(figure: Figure, error_m: np.ndarray, title: str) -> None:
     import numpy as np
-
-    from harness.vocabulary.geometry import MM
 
     axes, limit = figure.subplots(), SHOWN_SIGMAS * float(np.nanstd(error_m)) / MM
     shown = axes.imshow(error_m / MM, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")

@@ -8,27 +8,23 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from harness.implant import span
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from harness.evaluation.pod.curve import PodCurve
     from harness.inspection.gauge import Gauge
 
 DICTIONARY, CODES = "DICT_6X6_50", 50
-MARK_MM, DRILLS_MM, SEED = 32.0, 0.5, 1
-"""Side of a mark, step of the drills that there are, and the seed of which size goes where."""
-CLEAR_MM, EDGE_MM = 6.0, 18.0
-"""White around a mark, without which a code cannot be read, and between marks and holes; and least distance of a hole's
-rim from the board's edge, for which the automatic crop would take it."""
+MARK_MM, DRILLS_MM, SEED = 32.0, 0.5, 1  # Side of a mark, step of the drills, seed of which size goes where
+CLEAR_MM, EDGE_MM = 6.0, 18.0  # White around a mark, for its code; from a hole's rim to the board's edge at least
 HIT_SHARE = 0.4  # Hit radius as a share of the distance between holes, so that no finding can count for two
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
-    from harness.implant import span
-
     add = parser.add_argument
     add("--diameters", required=True, type=span, metavar="FROM:TO", help="range of the drills, mm")
     add("--depths", type=span, metavar="FROM:TO", help="of blind holes, mm (default: all go through)")

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness.inspection.arguments import DEFAULT_DETECTOR, DEFAULT_FALSE_CALLS, LEGAL_CROP
+import numpy as np
+
+from harness.inspection.arguments import DEFAULT_DETECTOR, DEFAULT_FALSE_CALLS, LEGAL_CROP, detector_of, opened
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import MM
 from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
@@ -17,8 +21,7 @@ if TYPE_CHECKING:
     from scenes.target.drawn import DrawnTargetConfig
 
 DAMAGES = ("through", "blind", "dent", "pressed_dent", "pressed_bump", "protrusion", "slot")
-MOST_AT_ONCE, FILLED = 8, 0.25
-"""Damages of one placement at most, and the share of the scan that discs as wide as they are apart may cover."""
+MOST_AT_ONCE, FILLED = 8, 0.25  # Damages of one placement; share of the scan within half of --apart from them
 COMPARED = (
     "virtual damage may be harder to find than real damage: on the one drilled plate where both were compared 7 of 23"
     " virtual holes were found, and 26 of 26 real ones that looked as wide; check the limit with a gauge board"
@@ -77,7 +80,6 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.engine.tables import write_tables
     from harness.evaluation.study.record import StudyRecord, record_text
     from harness.evaluation.study.result import evaluate_study
-    from harness.inspection.arguments import detector_of, opened
     from harness.inspection.run import analysed, refuse_thresholds, threshold_of
     from harness.report.study_page import study_html, study_parts
     from harness.tables.outputs import PROVENANCE, REPORT, STUDY
@@ -85,7 +87,6 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.tables.text import show
     from harness.vocabulary.declaration.yaml_source import to_yaml
     from harness.vocabulary.files import write_text
-    from harness.vocabulary.geometry import MM
     from harness.vocabulary.provenance import RESULTS_VERSION, record
     from harness.vocabulary.seeds import canonical_json, digest
     from scenes.render.scene import load_mitsuba
@@ -151,10 +152,8 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 def _family(options: argparse.Namespace, scans: list[Scan]) -> DrawnTargetConfig:
     """Return the damage as a family of boards as large as the largest scan. Raises UserError for what is not legal."""
-    import math
 
     from harness.vocabulary.declaration.diagnose import settings_of
-    from harness.vocabulary.geometry import MM
     from scenes.sensor.camera import CameraConfig, camera_of
     from scenes.target.drawn import DrawnTargetConfig
 
@@ -187,7 +186,6 @@ def _family(options: argparse.Namespace, scans: list[Scan]) -> DrawnTargetConfig
 
 def _shares(options: argparse.Namespace, said: str, peaks_mm: list[float]) -> list[str]:
     """Return sentences on what is measured and simulated, and for what the limit holds; ``peaks_mm``: depths shown."""
-    import numpy as np
 
     low, middle, high = np.quantile(peaks_mm, (0.1, 0.5, 0.9))
     return [

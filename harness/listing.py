@@ -355,8 +355,7 @@ def point_to(run: Path) -> None:
 
 
 OURS = b"# tofpod experiment "  # first words of an experiment.yaml that a sweep wrote
-UNFINISHED_NAME = re.compile(r"\.(?P<stem>.+)\.\w{8}\.part(?P<suffix>\.\w+)")
-"""A file that a killed process was writing (`harness.vocabulary.files.atomic_path`)."""
+UNFINISHED_NAME = re.compile(r"\.(?P<stem>.+)\.\w{8}\.part(?P<suffix>\.\w+)")  # what a killed process was writing
 
 
 def refuse_links(*paths: Path) -> None:

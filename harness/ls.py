@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import size_text
 from harness.vocabulary.program import program
 
 DAY_S = 86_400.0
@@ -37,8 +40,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
         print(reference())
         return 0
-    lists = {"results": _list_results, "cache": _list_cache}
-    return lists.get(options.what, _list_offers)(options)
+    return {"results": _list_results, "cache": _list_cache}.get(options.what, _list_offers)(options)
 
 
 def _list_offers(options: argparse.Namespace) -> int:
@@ -78,7 +80,6 @@ def _list_results(options: argparse.Namespace) -> int:
     """List every folder of results with state, limit, differences. Raises UserError for an unknown experiment."""
     from harness.listing import differs_text, limit_text, result_folders
     from harness.tables.text import Grid
-    from harness.vocabulary.files import size_text
 
     folders = result_folders(options.out, options.name)
     if options.name is not None and not folders:
@@ -107,7 +108,6 @@ def _list_results(options: argparse.Namespace) -> int:
 
 
 def _list_cache(options: argparse.Namespace) -> int:
-    import time
 
     from harness.vocabulary.files import size_text
     from scenes.render.cache import leftovers, stored_renders
@@ -130,7 +130,6 @@ def _list_cache(options: argparse.Namespace) -> int:
 
 
 def _print_json(value: Any) -> int:
-    import json
 
     print(json.dumps(value, indent=2, ensure_ascii=False))
     return 0

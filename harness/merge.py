@@ -7,13 +7,13 @@ import sys
 from collections import Counter
 from math import isclose
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from harness.engine.journal import THRESHOLDS, Journal
+from harness.engine.work import locked
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, write_bytes
 from harness.vocabulary.program import program
-
-if TYPE_CHECKING:
-    from harness.engine.journal import Journal
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -30,10 +30,6 @@ def _options(parser: argparse.ArgumentParser) -> None:
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0, 1 where two journals give different results for one trial, 2 on a mistake of the user."""
-    from harness.engine.journal import Journal
-    from harness.engine.work import locked
-    from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, write_bytes
-
     folders, into = options.folders, options.into
     _refuse_others(folders, into)
     declared = next((path for folder in folders if (path := folder / "experiment.yaml").is_file()), None)
@@ -70,8 +66,6 @@ def main(options: argparse.Namespace, command: str) -> int:
 def merge_into(into: Journal, other: Journal, counts: Counter[str]) -> list[str]:
     """Copy what ``into`` lacks or has not done; count trials copied, known, and of these alike but for last digits.
     Returns the keys of those that differ. Raises UserError where a newer tofpod wrote either."""
-    from harness.engine.journal import THRESHOLDS
-
     different = []
     for key, entry in other.entries():
         known = into.read(key)

@@ -5,8 +5,7 @@ boards of ``validation``; pixels above it that steps of at most `LINK_M` join ar
 experiment's rule (`harness.engine.judge.matched`); limits follow from ``test``. Only inspected pixels count.
 
 AU-PRO is the area under the mean overlap of damages against the share of false pixels, up to `PRO_LIMIT` and divided by
-it (Bergmann et al., International Journal of Computer Vision 129 (2021), 1038), with each damage as a region.
-"""
+it (Bergmann et al., International Journal of Computer Vision 129 (2021), 1038), with each damage as a region."""
 
 from __future__ import annotations
 
@@ -162,10 +161,9 @@ def _judged(
     from harness.engine.boards import read_arrays, read_truth
     from harness.engine.judge import matched_places, smeared
     from harness.engine.setup import highest_within, pixel_areas
-    from harness.engine.study import judged_facts
+    from harness.engine.study import set_up_of
     from harness.evaluation.intervals import threshold_for_rate
     from harness.evaluation.study.limit import limit_of
-    from harness.evaluation.study.record import SetUpRecord
 
     def boards(split: str) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray, float]]:
         """Boards of a split: name, scores (NaN where not inspected), places, damage, area inspected."""
@@ -205,17 +203,15 @@ def _judged(
 
     if not holes:
         raise UserError(f"{options.dataset}: {category} has no damage in view, so that there is no limit to state")
-    record = SetUpRecord(
+    record = set_up_of(
+        pd.DataFrame(holes),
+        pd.DataFrame(runs),
         variant=category,
         frames=index["categories"][category]["frames"],
-        axes={},
         detector=options.name,
-        detector_version=0,
         calibration_runs=len(highest),
-        failed=0,
         targets_digest=digest(truths),
         frames_digest=digest([index["content"], category]),
-        **judged_facts(pd.DataFrame(holes), pd.DataFrame(runs)),
     )
     scores, of = np.concatenate(pixels), np.unique(np.concatenate(regions), return_inverse=True)[1]
     damaged, (top, is_flawed) = (of > 0) * 1.0, np.array(tops, float).T

@@ -7,8 +7,7 @@
     def test_my_detector_keeps_the_contract():
         check_detector(AcmeDetector, settings={"window_px": 7})
 
-Every check is a function of its own in `harness.testing`, listed in `CHECKS`.
-"""
+Every check is a function of its own, listed in `CHECKS`."""
 
 from __future__ import annotations
 
@@ -36,13 +35,10 @@ def check_detector(
     clouds: Sequence[Cloud] | None = None,
 ) -> None:
     """Run every check on every cloud. Raises AssertionError where the contract of `detectors.interface` is broken; what
-    the detector itself raises is passed on. A note on the exception names the check.
-
-    ``make``: a detector's class, whose ``settings`` (plain data, as YAML holds it) its ``settings_type`` validates; or
-    a function that makes a detector anew at each call. ``clouds``: what it is checked on, by default
-    `harness.synthetic_clouds`: three clouds 0.7 m before the camera, each with damage of centimetres, some of which
-    must be found at some threshold. Not checked: whether the detector is any good, which a study measures.
-    """
+    the detector itself raises is passed on. A note on the exception names the check. ``make``: a detector's class,
+    whose ``settings`` (plain data, as YAML holds it) its ``settings_type`` validates; or a function that makes a
+    detector anew at each call. ``clouds``: by default `harness.synthetic_clouds`, three clouds 0.7 m before the camera,
+    each with damage of centimetres, some of which must be found at some threshold. A study measures how good it is."""
     settings_type, build = getattr(make, "settings_type", None), cast("Callable[..., Detector]", make)
     if settings_type is None and settings is not None:
         raise TypeError("`settings` belong to a detector's class with a `settings_type`, not to a function")
@@ -65,8 +61,7 @@ def check_detector(
 
 STRONGEST = 5  # findings of one cloud that are looked at one by one
 CENTRE_MARGIN_M = 0.02  # distance outside the cloud's extent up to which the centre of a finding may lie
-SCORE_TOLERANCE = 0.01
-"""Share of the highest score: robust fits stop at a tolerance of their own; sums in another order round otherwise."""
+SCORE_TOLERANCE = 0.01  # share of the highest score: robust fits stop early, sums in another order round otherwise
 CROP_TOLERANCE = 0.01  # share of the pixels: a crop may come to another decision at the target's rim
 PLACE_TOLERANCE_M = 1e-4
 SHIFT_M = 0.037
@@ -118,8 +113,7 @@ class Look:
         diameter, centre = found.extent_diameter_m, np.asarray(found.extent_centre_m)
         require(np.isfinite(diameter) and diameter >= 0, f"`extent_diameter_m` is {diameter:g}")
         require(centre.shape == (3,) and np.isfinite(centre).all(), "`extent_centre_m` is no (3,) finite numbers")
-        told = f"`measure` says score {found.score:g} of a finding of {finding.score:g}"
-        require(found.score == finding.score, told)
+        require(found.score == finding.score, f"`measure` says score {found.score:g} of a finding of {finding.score:g}")
         require(found.points >= 1, f"`measure` says {found.points} points")
         return found
 
@@ -261,8 +255,7 @@ def survives_pickling(make: Make, cloud: Cloud) -> None:
     result = Look.at(detector, cloud).everything()
     require(_same(sent(result), result), "a result that was pickled is not the same")
     for arrived in (unused, sent(detector)):
-        there = Look.at(arrived, cloud).everything()
-        require(_same(there, result), "a detector that was pickled gave another result")
+        require(_same(Look.at(arrived, cloud).everything(), result), "a detector that was pickled gave another result")
 
 
 def learns_plain_arrays(make: Make, cloud: Cloud) -> None:
@@ -271,8 +264,7 @@ def learns_plain_arrays(make: Make, cloud: Cloud) -> None:
     if not isinstance(detector, Calibratable):
         return
     before, clouds = Look.at(make(), cloud).everything(), [plane(seed=seed, damage=()) for seed in range(8)]
-    given = [_with_arrays(one, _read_only) for one in clouds]
-    learned, again = (dict(detector.calibrate(given)) for _ in range(2))
+    learned, again = (dict(detector.calibrate([_with_arrays(one, _read_only) for one in clouds])) for _ in range(2))
     require(_same(learned, again), "the second time the same clouds taught something else")
     file = io.BytesIO()
     np.savez(file, **learned)  # type: ignore[arg-type]

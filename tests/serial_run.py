@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from harness.engine.journal import Journal
+from harness.engine.journal import THRESHOLDS, Journal
 from harness.engine.plan import SweepPlan
 from harness.engine.processes import SerialEngine
 from harness.engine.run import run_plan
@@ -22,3 +22,13 @@ def records_of(folder: Path, outcome: Outcome) -> list[dict[str, Any]]:
     """Of all finished trials, in order of their keys."""
     entries = [Journal(folder).read(key) for key in outcome.finished]
     return [entry.record for entry in entries if entry is not None and entry.record is not None]
+
+
+def trial_count(plan: SweepPlan) -> int:
+    """Trials of all roles."""
+    return sum(group.most_repeats(batch) for group in plan.groups for batch in group.batches)
+
+
+def trial_keys(journal: Journal) -> list[str]:
+    """Keys of all trials, sorted."""
+    return sorted(key for key, _ in journal.entries() if not key.startswith(THRESHOLDS))

@@ -36,7 +36,7 @@ from cluster_processes import (
     threads,
     until,
 )
-from serial_run import records_of, run_serially
+from serial_run import records_of, run_serially, trial_keys
 from tiny_sweep import TINY
 
 from harness.engine.cluster import ClusterEngine
@@ -320,7 +320,7 @@ def test_ctrl_c_leaves_and_says_how_to_go_on(cluster, experiment, tiny_out, tmp_
 
     def ended() -> list[str]:
         journals = [Journal(folder) for folder in tmp_path.glob("out/tiny/[0-9a-f]*/journal")]
-        return [key for journal in journals for key in journal.trials() if key.startswith("damaged")]
+        return [key for journal in journals for key in trial_keys(journal) if key.startswith("damaged")]
 
     until(lambda: len(ended()) > 2 or process.poll() is not None, 2 * HOLD)
     process.send_signal(signal.SIGINT)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import faulty_jobs
 import pytest
-from serial_run import run_serially
+from serial_run import run_serially, trial_keys
 from tiny_sweep import ROOT, TINY, content, results, sweep_command
 
 from harness.engine.journal import JOURNAL_VERSION, Journal
@@ -81,7 +81,7 @@ def run(home: Path, out: str, *arguments: str, faults: tuple[str, ...] = ()) -> 
 
 def judged_in(out: Path) -> list[str]:
     """Keys of the judged trials that are in the journal by now."""
-    keys = [key for folder in out.glob("tiny/[0-9a-f]*/journal") for key in Journal(folder).trials()]
+    keys = [key for folder in out.glob("tiny/[0-9a-f]*/journal") for key in trial_keys(Journal(folder))]
     return [key for key in keys if key.startswith("damaged")]
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from learning_detector import LearningDetector
-from serial_run import records_of, run_serially
+from serial_run import records_of, run_serially, trial_keys
 
 import detectors
 from harness import merge
@@ -106,7 +106,7 @@ def test_every_judge_uses_what_was_learned(learned, study_out):
     assert scales_m.shape == (LEARNING_BOARDS,)
     (set_up,) = record.set_ups
     assert set_up.threshold_mm / set_up.threshold == pytest.approx(1e3 * np.median(scales_m), rel=1e-12)
-    assert file.stem in Journal(folder / "journal").trials()
+    assert file.stem in trial_keys(Journal(folder / "journal"))
 
 
 def test_resumed_and_sharded_runs_give_the_same_record(learned, study_out, tmp_path):
@@ -125,7 +125,7 @@ def test_resumed_and_sharded_runs_give_the_same_record(learned, study_out, tmp_p
 
 
 def test_what_was_learned_is_merged_as_text_that_need_not_be_equal(learned):
-    key = next(key for key in Journal(learned[0] / "journal").trials() if key.startswith("learning"))
+    key = next(key for key in trial_keys(Journal(learned[0] / "journal")) if key.startswith("learning"))
     entry = Journal(learned[0] / "journal").read(key)
     assert entry is not None and entry.record is not None
     other = {**entry.record, "learned": [{"arrays": "other last digits"}]}

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from serial_run import trial_count
 from tiny_sweep import STUDY, TINY
 
 from harness.engine import run as engine_run
@@ -113,9 +114,9 @@ def test_every_trial_and_picture_is_begun_once_in_any_order(plan, tmp_path):
         engine = Pretended(seed)
         outcome = go(plan, tmp_path / str(seed), engine)
         assert set(engine.begun.values()) == {1}
-        assert outcome.failures == [] and len(outcome.finished) == plan.trial_count == outcome.trials.done
+        assert outcome.failures == [] and len(outcome.finished) == trial_count(plan) == outcome.trials.done
         assert outcome.renders.done == len(plan.renders)
-        pictures = [f"pictures of set-up {n}" for n, group in enumerate(plan.groups) if not group.is_study]
+        pictures = [f"pictures of set-up {n}" for n, group in enumerate(plan.groups) if group.damaged.board is None]
         assert outcome.examples == pictures
         found = (records(tmp_path / str(seed)), outcome.thresholds, outcome.finished)
         assert expected is None or found == expected
@@ -140,12 +141,13 @@ def test_resuming_from_any_state_ends_the_same(plan, tmp_path):
                 journal.write(key, Ended(rng.choice((*STATES, "skipped")), why="before"))
         engine = Pretended(number)
         outcome = go(plan, folder, engine, retry_failed=True)
-        assert (outcome.trials.found, outcome.trials.over) == (kept, plan.trial_count)
+        assert (outcome.trials.found, outcome.trials.over) == (kept, trial_count(plan))
         assert outcome.failures == [] and outcome.finished == whole.finished
         assert outcome.examples == whole.examples, "pictures are made again, though every trial may be there"
         assert records(folder) == records(tmp_path / "whole")
         if number == 0:
-            shown = {job.path.name for group in plan.groups if not group.is_study for job in group.damaged.renders}
+            simple = [group for group in plan.groups if group.damaged.board is None]
+            shown = {job.path.name for group in simple for job in group.damaged.renders}
             assert {name for name in engine.begun if name.endswith(".npz")} == shown
 
 
@@ -163,7 +165,7 @@ def test_whatever_fails_is_told_and_nothing_hangs(plan, tmp_path):
         assert outcome.trials.failed <= len(outcome.failures)
         assert {one.why for one in outcome.failures} <= {"a fault", *(f.why for f in outcome.failures)}
         mended = go(plan, folder, Pretended(seed), retry_failed=True)
-        assert mended.failures == [] and len(mended.finished) == plan.trial_count
+        assert mended.failures == [] and len(mended.finished) == trial_count(plan)
 
 
 def test_a_render_whose_process_dies_is_tried_once_more(plan, tmp_path):
@@ -217,8 +219,8 @@ def test_shards_that_finish_each_others_calibration(plan, tmp_path):
             assert outcome.failures == [] and outcome.trials.over == outcome.trials.total
             total += outcome.trials.over
         joined = go(plan, folder, Pretended())
-        assert (joined.trials.done, joined.trials.found) == (0, plan.trial_count)
-        assert total >= plan.trial_count
+        assert (joined.trials.done, joined.trials.found) == (0, trial_count(plan))
+        assert total >= trial_count(plan)
 
 
 def shards_of_unlike_machines(plan: SweepPlan, home: Path, factor: float) -> Path:
@@ -236,7 +238,7 @@ def test_shards_of_unlike_machines_lose_no_work(plan, tmp_path):
     whole = go(plan, tmp_path / "whole", Pretended())
     into = shards_of_unlike_machines(plan, tmp_path, 1 + 1e-9)
     joined = go(plan, into, Pretended())
-    assert (joined.trials.done, joined.trials.found, joined.failures) == (0, plan.trial_count, [])
+    assert (joined.trials.done, joined.trials.found, joined.failures) == (0, trial_count(plan), [])
     assert joined.thresholds == pytest.approx(whole.thresholds, rel=1e-8)
     journal = Journal(into)
     for key in joined.finished:
@@ -256,7 +258,7 @@ def test_shards_whose_thresholds_differ_by_more_are_judged_anew(plan, tmp_path):
     both = [group for group, first, second in groups if first and second and group.first]
     calibrates = any(point.config.threshold.calibrate is not None for group in both for point in group.points)
     assert (joined.trials.done > 0) == calibrates
-    assert joined.failures == [] and joined.trials.over == plan.trial_count
+    assert joined.failures == [] and joined.trials.over == trial_count(plan)
 
 
 def test_work_ahead_is_bounded(tmp_path, monkeypatch):

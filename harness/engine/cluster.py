@@ -31,8 +31,7 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import write_text
 from harness.vocabulary.provenance import source_digest
 
-BUNDLE_S = 0.25
-"""Work in a bundle, for each process of a node: calling a node takes some 10 ms, of it 2 ms of the driver's time."""
+BUNDLE_S = 0.25  # work in a bundle, for each process of a node; calling a node takes some 10 ms
 MOST_IN_BUNDLE = 32  # jobs in a bundle, for each process of a node
 WITH_NODE = 2  # bundles at a node: its processes work on one while the other waits
 LOOKS_S = 1.0  # interval at which the driver looks which nodes are there
@@ -41,8 +40,7 @@ TRIES = 5
 ANSWERS_S = 5  # a scheduler that is there answers a connection in milliseconds
 EXAMINED_S = 60.0  # time for a node to say what it is: it reads the sources, from a network's disk perhaps
 CLOSES_S = 1.0
-NAMES = ("SLURM", "PBS", "LSF", "SGE", "HTCondor", "OAR", "Moab", "Local")
-KINDS = {name.lower(): f"{name}Cluster" for name in NAMES}
+KINDS = {name.lower(): f"{name}Cluster" for name in ["SLURM", "PBS", "LSF", "SGE", "HTCondor", "OAR", "Moab", "Local"]}
 """Classes of dask-jobqueue, each in a module of the kind's name; "local" starts its jobs on this machine."""
 
 
@@ -56,8 +54,7 @@ class Bundle:
 
 @dataclass(frozen=True)
 class NodeFacts:
-    """A node's own account of itself. ``digests``: of code and packages by stage, without those that are not installed;
-    ``processes``: jobs at once; ``sees``: content of the file that it was asked for."""
+    """A node's own account. ``digests``: of installed code by stage; ``sees``: content of the file it was asked for."""
 
     python: str
     digests: Mapping[Stage, str]
@@ -268,8 +265,7 @@ class ClusterEngine:
             message = f"{where} does not see {self._probe.parent}, where this machine keeps renders"
             self._refuse(address, UserError(message, fix="name a folder with --out that all machines share"))
         else:
-            can_render = said.digests.get("renders") == self._digests.get("renders")
-            self._nodes[address] = _Node(address, said, can_render)
+            self._nodes[address] = _Node(address, said, said.digests.get("renders") == self._digests.get("renders"))
 
     def _refuse(self, address: str, why: UserError) -> None:
         self._refused[address] = why

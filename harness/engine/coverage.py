@@ -37,9 +37,7 @@ from scenes.target.truth import Damage, face_of
 
 BOARDS, LOOKS = 40, 3  # Damaged boards on which strength and hits are learnt, and averages in which each is inspected
 STEEPEST_DEG = 60.0  # Tilt about either axis of these boards, at most
-DRAWS, AROUND_PX, NEAR_PX = 2, 31, 15
-"""Averages from which noise is taken; the side of the square over which that of a pixel is, as far as boards move over
-the unit's pattern; and of that in which missing pixels count."""
+DRAWS, AROUND_PX, NEAR_PX = 2, 31, 15  # Averages for noise; sides of squares for a pixel's noise, for missing pixels
 MOST_PATCHES = 3000
 SAME_MM = 1e-6  # Sizes that differ by less are one: then the size of damage is its depth
 ON_FACE_M = 5 * MM  # A patch is seen where the view's own z agrees with its z by this, or by two pixels along the slope
@@ -89,8 +87,7 @@ def survey(experiment: Experiment, poses: Sequence[Pose], cache: Path, folder: P
             blind = np.full(len(patches.areas_m2), np.inf)
             seen = _each(_part_seen, ((view,) for view in views), (task, group.seed, patches), engine)
             seen = [Seen(blind, np.ones(len(blind)), np.ones(len(blind))) if one is None else one for one in seen]
-            named = dict(zip(poses, seen, strict=True))
-            surveys.append(Survey(point, task, patches, findable(damages), named))
+            surveys.append(Survey(point, task, patches, findable(damages), dict(zip(poses, seen, strict=True))))
     return surveys
 
 
@@ -157,7 +154,9 @@ def _each(
     """The values of a function of batches, None where its detector can judge nothing; a bug is raised."""
     jobs = [Job(str(n), "trials", act, (*some, *further)) for n, some in enumerate(asked)]
     ends = {job.name: ended for job, ended in carried_out(jobs, engine)}
-    return [end.result() if end.state == "done" or end.is_bug else None for end in (ends[job.name] for job in jobs)]
+    if bug := next((end.why for end in ends.values() if end.is_bug), None):
+        raise RuntimeError(bug)
+    return [ends[job.name].value for job in jobs]
 
 
 def _damages(boards: Sequence[Any], point: Point, looks: Mapping[tuple[str, int, int, str], Sequence[bool]]) -> Damages:
@@ -172,8 +171,7 @@ def _damages(boards: Sequence[Any], point: Point, looks: Mapping[tuple[str, int,
             sizes_mm = (damage.diameter_m / MM, damage.depth_m / MM)
             facts.append((*sizes_mm, *seen, max(float(square), 0.0) ** 0.5, sum(hits), len(hits)))
     plan_mm, depth_mm, *seen, strength, found, inspections = np.array(facts).T
-    by_depth = np.ptp(plan_mm) < SAME_MM < np.ptp(depth_mm)
-    word, size_mm = ("depth", depth_mm) if by_depth else (damage.size_of, plan_mm)
+    word, size_mm = ("depth", depth_mm) if np.ptp(plan_mm) < SAME_MM < np.ptp(depth_mm) else (damage.size_of, plan_mm)
     return Damages(word, size_mm, Seen(*seen), strength, found, inspections)
 
 

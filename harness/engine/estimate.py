@@ -10,14 +10,16 @@ from datetime import timedelta
 from pathlib import Path
 from typing import TextIO
 
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+
 from harness.engine.journal import Journal
 from harness.engine.plan import parts_of, plan_of
 from harness.engine.work import EngineOptions, Outcome
 from harness.experiment.schema import CaptureSource, Experiment
 from harness.tables.text import many
 
-PLAIN_EVERY_S = 10.0
-"""Seconds between lines where there is no terminal: enough to see life in a log, too few to fill it."""
+PLAIN_EVERY_S = 10.0  # seconds between lines where there is no terminal: some life in a log, and not too much
 WINDOW_S = 60.0  # rates are those of the last minute: work of unlike set-ups goes at unlike rates
 
 
@@ -26,9 +28,6 @@ def progress_display(
     stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic
 ) -> Iterator[Callable[[Outcome], None]]:
     """Yield a function that shows on ``stream`` (None: stderr) how far a run is; work found done is not in the rate."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn
-
     stream = sys.stderr if stream is None else stream
     names = ("counts", "rate", "failed", "left")
     columns = [TextColumn(f"{'[bold red]' * (name == 'failed')}{{task.fields[{name}]}}") for name in names]

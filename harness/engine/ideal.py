@@ -1,8 +1,7 @@
 """Noise of random units, and each damage's signature: the input of the ideal observer on a study's set-ups.
 
 Noise is what a unit's average shows, away from damage and rim, beyond what a camera without noise, unit errors and
-rounding shows, less a cubic of each field. The signature is what that noise-free camera shows near the damage beyond a
-cubic through the undamaged pixels."""
+rounding shows, less a cubic; the signature, what that camera shows near damage beyond a cubic through the rest."""
 
 from __future__ import annotations
 
@@ -28,8 +27,7 @@ SMOOTHED_PX = 61  # Side of the square over which a pixel's variance is averaged
 DEGREE = 3  # Degree of the undamaged surface, as the thesis fits it
 FEWEST_PIXELS = 1000  # Undamaged pixels without which a board tells too little of the noise
 FINE_MM = 1e-4  # Rounding step of the noise-free camera
-REACH_PX = 8
-"""Pixels beyond a damage's outline to which its signature reaches: what the camera's window and rims smear out."""
+REACH_PX = 8  # Pixels beyond a damage's outline to which camera window and rims smear its signature
 
 
 def ideal_of_set_ups(plan: SweepPlan, engine: JobEngine, calls_per_m2: float) -> dict[tuple[str, int], IdealDamages]:
@@ -127,8 +125,7 @@ def _deviation_m(noise_m: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 def _signatures_m(set_up: SetUp, clear_z_m: np.ndarray, surface: np.ndarray, intact: np.ndarray) -> np.ndarray:
     """(n, h, w): each damage's residual to the surface, 0 away from it."""
-    basis = surface[:, intact].T
-    fitted = np.tensordot(np.linalg.lstsq(basis, clear_z_m[intact], rcond=None)[0], surface, 1)
+    fitted = np.tensordot(np.linalg.lstsq(surface[:, intact].T, clear_z_m[intact], rcond=None)[0], surface, 1)
     residual_m, pitch_m = clear_z_m - fitted, max(set_up.pitch_mm) * MM
     signals = []
     for damage in set_up.truth:

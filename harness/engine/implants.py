@@ -21,8 +21,8 @@ from detectors.average import AverageConfig, average
 from detectors.noise import REACH_FRAMES, noise_reach_px
 from detectors.recordings import Recording
 from harness.engine.judge import STUDY_TABLES, Rows, detector_of, judge, study_rows
-from harness.engine.setup import INTACT_MARGIN_PX, KnownCloud, outlined, pixel_areas
-from harness.engine.study import judged_facts
+from harness.engine.setup import INTACT_MARGIN_PX, KnownCloud, far_from, outlined, pixel_areas
+from harness.engine.study import set_up_of
 from harness.engine.tables import columns_of
 from harness.evaluation.study.record import SetUpRecord
 from harness.tables.trials import ResultTables
@@ -35,8 +35,7 @@ from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig, Purpose
 from scenes.target.truth import truth_of
 
-MOST_HOLE_FREE, MOST_SETTING = 20, 5
-"""Averages of the undamaged recording on which false calls are counted, and that set a threshold, at most."""
+MOST_HOLE_FREE, MOST_SETTING = 20, 5  # Undamaged averages, at most, that count false calls; that set a threshold
 MOST_EMPTY = 200  # Placements in a row without a place for any damage, after which there is none
 NORMAL_PX = 4  # Half the side of the square of the surface whose plane is taken as the tangent plane
 TELLING_DEG = 5.0  # Steeper by so much than where damage is placed, the rim of what is judged has a limit of its own
@@ -99,8 +98,7 @@ class Scan:
         """(h, w, 2) where each pixel's ray meets the plane, NaN where nothing is judged."""
         normal, centre = self.T_camera_board[:3, 2], self.T_camera_board[:3, 3]
         met = self.rays * ((centre @ normal) / (self.rays @ normal))[..., None]
-        places = transform_points(invert(self.T_camera_board), met)[..., :2]
-        return np.where(self.judged[..., None], places, np.nan)
+        return np.where(self.judged[..., None], transform_points(invert(self.T_camera_board), met)[..., :2], np.nan)
 
     @cached_property
     def depth_px(self) -> np.ndarray:
@@ -110,8 +108,7 @@ class Scan:
     @cached_property
     def area_m2(self) -> float:
         """Judged area of the surface in plan."""
-        areas = pixel_areas(self.places_m)
-        return float(np.nansum(areas[self.judged]))
+        return float(np.nansum(pixel_areas(self.places_m)[self.judged]))
 
     @property
     def pitch_m(self) -> float:
@@ -121,15 +118,13 @@ class Scan:
     @cached_property
     def angle_deg(self) -> np.ndarray:
         """(h, w) angle between each judged pixel's ray and the fitted surface's normal, NaN elsewhere."""
-        points = self.rays * self.surface_z_m[..., None]
-        down, across = np.gradient(points, axis=(0, 1))
+        down, across = np.gradient(self.rays * self.surface_z_m[..., None], axis=(0, 1))
         normal = np.cross(down, across)
         along = (normal * self.rays).sum(-1) / (np.linalg.norm(normal, axis=-1) * np.linalg.norm(self.rays, axis=-1))
         return np.asarray(np.degrees(np.arccos(np.clip(np.abs(along), 0, 1))))
 
     def rim_px(self, family: DrawnTargetConfig) -> float:
-        """Return how far inside of what is judged a damage's centre lies at least; as far for the smallest as for the
-        largest, so that size and place are independent."""
+        """Return how far inside of what is judged a damage's centre lies at least, whatever the damage's size."""
         return family.damage.widest_mm * MM / 2 / self.pitch_m + BEYOND_PX + self.reach_px
 
     def left_out(self, family: DrawnTargetConfig) -> str:
@@ -150,9 +145,8 @@ class Scan:
         return replace(cloud, projection="central", noise_reach_px=getattr(self, "reach_px", 0.0))
 
     def place(self, x_m: float, y_m: float, rim_px: float) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the point (3,) of the surface in the camera's frame above a place of the plane, and the unit normal
-        (3,) to the camera there; None where less than ``rim_px`` of judged surface lie around it, or where the
-        undamaged recording has a finding within the hit radius."""
+        """Return the point (3,) of the surface above a place of the plane, and the normal (3,) to the camera, in its
+        frame; None with less than ``rim_px`` of judged surface around it, or a finding within the hit radius."""
         if (np.linalg.norm(self.taken_m - [x_m, y_m], axis=1) < self.free_m).any():
             return None
         point = transform_points(self.T_camera_board, np.array([x_m, y_m, 0.0]))
@@ -174,9 +168,10 @@ class Scan:
     def known(self, cloud: Cloud, target: TargetConfig) -> KnownCloud:
         """Return a cloud of this scan with the truth of the damages that were put into it."""
         truth = truth_of(target, self.T_camera_board)
-        outlines, intact = outlined(truth, self.places_m, self.judged, INTACT_MARGIN_PX * self.pitch_m)
+        intact = self.judged & far_from(truth, self.places_m, INTACT_MARGIN_PX * self.pitch_m)
+        of_truth = (target, truth, outlined(truth, self.places_m), self.places_m)
         depths = {damage.id: damage.depth_m for damage in truth}
-        return KnownCloud(cloud, invert(self.T_camera_board), target, truth, outlines, self.places_m, intact, depths)
+        return KnownCloud(cloud, invert(self.T_camera_board), *of_truth, intact, depths)
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,9 +233,8 @@ def judge_scans(
     frames: Sequence[int],
 ) -> tuple[ResultTables, tuple[SetUpRecord, ...], tuple[str, ...]]:  # fmt: skip
     """Set a threshold for each number of frames, count false calls on the undamaged frames, and judge all placements;
-    return tables, a set-up for each number of frames, and warnings.
-    Where a recording has two groups of so many frames or more, every second sets the threshold and the others are
-    judged; else the same frames do both, and a warning says so."""
+    return tables, a set-up for each number of frames, and warnings. Where a recording has two groups of so many frames
+    or more, every second sets the threshold; else the same frames do both, and a warning says so."""
     rows: Rows = {name: [] for name in ("runs", "holes", *STUDY_TABLES)}
     warnings, calibrated = [said for scan in scans if (said := scan.left_out(family))], {}
     for count in frames:
@@ -278,17 +272,16 @@ def judge_scans(
     for count in frames:
         holes, runs = (of[of["frames"] == count] for of in (tables.holes, tables.runs))
         set_ups.append(
-            SetUpRecord(
+            set_up_of(
+                holes,
+                runs,
                 variant=VARIANT,
                 frames=count,
-                axes={},
                 detector=detector.name,
                 detector_version=detector.version,
                 calibration_runs=calibrated[count],
-                failed=0,
                 targets_digest=digest([placement.target.to_data() for placement in made]),
                 frames_digest=digest([camera_data, count, *files]),
-                **judged_facts(holes, runs),
             )
         )
     return tables, tuple(set_ups), tuple(warnings)

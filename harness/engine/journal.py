@@ -22,11 +22,9 @@ from harness.vocabulary.provenance import check_version, stamp_of, stamped
 from harness.vocabulary.seeds import canonical_json
 
 JOURNAL_VERSION = 6
-"""Raised by every change to the records' content or to what a trial computes. Segments of older versions are passed
-over, so that their trials run again; so are the files of versions before 6, which held one trial each."""
+"""Raised by every change to records or to what a trial computes: trials in segments of older versions run again."""
 SEGMENT_NAME = re.compile(r"[0-9]{6}-[0-9a-f]{8}\.jsonl")
-THRESHOLDS = "thresholds-"
-"""Begins the keys of entries that hold no trial, but the thresholds at which trials were judged."""
+THRESHOLDS = "thresholds-"  # begins keys of entries that hold the thresholds at which trials were judged
 NOTHING = "null"  # stands in the place of the record of a trial that is not done
 KEPT = ("state", "why", "is_bug", "seconds", "peak_mb", "worker")
 
@@ -41,9 +39,8 @@ class _Location(NamedTuple):
 
 
 class Journal:
-    """Entries in a folder, by key: the end of a trial, with the text of its record as value. Raises UserError where the
-    folder or a segment is a link, cannot be written, or was written by a newer tofpod. ``damaged``: lines that are torn
-    or altered, as file and byte, and segments of another version."""
+    """Entries in a folder, by key: the end of a trial, its record's text as value. Raises UserError for links, what
+    cannot be written, and a newer tofpod's. ``damaged``: torn or altered lines and segments of other versions."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -55,10 +52,6 @@ class Journal:
 
     def __len__(self) -> int:
         return sum(not key.startswith(THRESHOLDS) for key in self._known())
-
-    def trials(self) -> list[str]:
-        """Return the keys of all trials, sorted."""
-        return sorted(key for key in self._known() if not key.startswith(THRESHOLDS))
 
     def thresholds(self) -> list[str]:
         """Return the keys of stored thresholds, sorted."""

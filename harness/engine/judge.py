@@ -26,10 +26,8 @@ Rows = dict[str, list[dict[str, Any]]]  # rows by table
 STUDY_TABLES = ("sites", "findings", "operating", "pixels")
 SMEARED_PX = 2  # Pixels by which an outline is grown before findings are laid over it: half of a camera's window
 STEPS_PER_OCTAVE = 4
-FINDING_OCTAVES = (-2, 3)
-"""Other thresholds for findings, about the one in use: under a quarter of it most of a noisy face is one finding."""
-PIXEL_OCTAVES = (-6, 4)
-"""Other thresholds for pixels: reaches down to where a third of the undamaged face and more lies above."""
+FINDING_OCTAVES = (-2, 3)  # Other thresholds for findings: below, most of a noisy face is one finding
+PIXEL_OCTAVES = (-6, 4)  # Other thresholds for pixels, down to where a third of the undamaged face lies above
 
 
 @dataclass(frozen=True)
@@ -219,8 +217,7 @@ def _hole_row(
     kinds = ("extent", "model")
     if found is None or largest is None:
         blank = (*names, *(f"{kind}_{what}" for kind in kinds for what in ("offset", "error")))
-        sides = dict.fromkeys(("length_mm", "width_mm", "angle_deg"), np.nan)
-        row |= {f"{name}_mm": np.nan for name in blank} | sides
+        row |= {f"{name}_mm": np.nan for name in blank} | dict.fromkeys(("length_mm", "width_mm", "angle_deg"), np.nan)
         return row | {"score": np.nan, "points": 0, "model_note": ""}
     x, y, _ = known.T_board_cloud[:3, :3] @ found.along
     row |= {"length_mm": found.length_m / MM, "width_mm": found.width_m / MM}
@@ -271,8 +268,7 @@ def study_rows(known: KnownCloud, judged: JudgedCloud, radius_m: float, *, hole_
     for name, pixels in (*parts, ("", np.flatnonzero(known.undamaged.ravel()))):
         there = np.sort(flat[pixels][np.isfinite(flat[pixels])])
         above = (len(there) - np.searchsorted(there, thresholds, side="right")).tolist()
-        row = {"hole": name, "pixels": len(there), "threshold": thresholds.tolist(), "above": above}
-        tables["pixels"].append(row)
+        tables["pixels"].append({"hole": name, "pixels": len(there), "threshold": thresholds.tolist(), "above": above})
     return tables
 
 
@@ -287,8 +283,7 @@ def grid(threshold: float, octaves: tuple[int, int]) -> np.ndarray:
 def _without_return(
     known: KnownCloud, judged: JudgedCloud, radius_m: float, *, hole_free: bool
 ) -> tuple[frozenset[int], int]:
-    """Damages (indices) that a finding without return hits, and how many such findings are false calls: they hit none
-    and are no part of a finding by depth. None for detectors that test the harness."""
+    """Damages (indices) that findings without return hit, and how many of these hit none and are no part by depth."""
     tests = getattr(judged.detector, "tests_the_harness", False)
     missing = None if tests else missing_returns(known.cloud, judged.evidence)
     if missing is None or not missing.detections:

@@ -1,7 +1,6 @@
 """Hole-free boards on which a detector (`detectors.interface.Calibratable`) learns before its threshold is set.
 
-What it has learned is stored in the journal, for resuming and for shards, and in a file of the same name, from which
-trials read it."""
+What it has learned stands in the journal, for resuming and shards, and in a file of that name, which trials read."""
 
 from __future__ import annotations
 
@@ -17,8 +16,7 @@ from harness.engine.judge import Rows, detector_of
 from harness.engine.trial import TrialTask, cloud_of
 from harness.vocabulary.seeds import canonical_json
 
-LEARNING_BOARDS = 8
-"""Boards to learn on, and for nothing else: 200,000 pixels each at 0.7 m make a spectrum good to a few per cent."""
+LEARNING_BOARDS = 8  # Boards to learn on: 200,000 pixels each at 0.7 m give a spectrum to a few per cent
 
 
 def learns(detector: str, settings: dict[str, object]) -> bool:

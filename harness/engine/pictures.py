@@ -1,5 +1,4 @@
-"""The pictures of a report, drawn again from their seeds: example clouds and maps of the first damaged repeat, and of a
-study the damages just below, at and above the limit."""
+"""A report's pictures, drawn again from their seeds: the first damaged repeat; of a study damages about the limit."""
 
 from __future__ import annotations
 
@@ -24,8 +23,7 @@ from harness.vocabulary.seeds import canonical_json
 from scenes.target.truth import Damage, face_of
 
 MOST_POINTS = 60_000  # points of a merged cloud in a picture
-SHARES: dict[Where, float] = {"below": 0.75, "at": 1.0, "above": 1.25}
-"""Sizes of damage in a study's pictures, as shares of the limit."""
+SHARES: dict[Where, float] = {"below": 0.75, "at": 1.0, "above": 1.25}  # pictured damage over the limit
 MOST_SET_UPS = 6
 ROOM_MM = 12.0  # room around the largest of a set-up's damages in their pictures, which all have one size
 GREY = 160

@@ -31,8 +31,7 @@ CODE = "harness.engine.learning"
 PACKAGES = (
     "numpy", "scipy", "numba", "opencv-python-headless", "open3d-cpu" if sys.platform == "linux" else "open3d",
 )  # fmt: skip
-"""The task, all sources that this module and the detector's reach, and the versions of these packages decide a trial: a
-change of any makes it count as not done. Mitsuba's version is in the names of the rendered views."""
+"""A trial counts as not done after a change of its task, of sources that it reaches, or of a version of these."""
 MOST_REPEATS = 256  # repeats of a part of a plan, which is looked up and queued as one
 
 
@@ -113,11 +112,6 @@ class Group:
         return {task.points[0].digest: str(self.folder / f"{key}.npz") for key, task in trials}
 
     @property
-    def is_study(self) -> bool:
-        """Return whether its boards are drawn at random."""
-        return self.then[0].board is not None
-
-    @property
     def damaged(self) -> Batch:
         """The first batch before a damaged target."""
         return next(batch for batch in self.then if batch.role == "damaged")
@@ -146,8 +140,7 @@ class Group:
         without: Collection[str] = (),
     ) -> Iterator[tuple[str, TrialTask]]:
         """Yield (journal key, task) of each trial of a batch, or of some ``repeats``. ``thresholds`` by point digest,
-        empty while calibrating; a point that got none is not judged, nor is one of those ``without``; None names trials
-        that cannot be judged."""
+        empty while calibrating; points without, or of ``without``, are not judged; None names trials all the same."""
         if batch.role == "learning":
             for number in range(len(self.learners)) if repeats is None else repeats:
                 learner = (point_task(self.learners[number], None, None),)
@@ -164,8 +157,7 @@ class Group:
         for repeat in range(count) if repeats is None else repeats:
             wanted = tuple(asked[point.digest] for point in points if repeat < self.repeats(batch, point))
             if wanted:
-                set_ups = batch.before(repeat)
-                task = TrialTask(set_ups, self.seed, batch.role, repeat, wanted, self.poses, batch.board)
+                task = TrialTask(batch.before(repeat), self.seed, batch.role, repeat, wanted, self.poses, batch.board)
                 yield self._key(batch, task), task
 
     def _key(self, batch: Batch, task: TrialTask) -> str:
@@ -203,11 +195,6 @@ class SweepPlan:
         """The distinct views, in the order in which trials need them."""
         jobs = {job.path: job for group in self.groups for batch in group.batches for job in batch.renders}
         return tuple(jobs.values())
-
-    @property
-    def trial_count(self) -> int:
-        """Trials of all roles."""
-        return sum(group.most_repeats(batch) for group in self.groups for batch in group.batches)
 
 
 def plan_of(experiment: Experiment, cache: Path, folder: Path | None = None) -> SweepPlan:
@@ -274,8 +261,7 @@ def batch_of(
     renders, set_ups, damaged = [], [], role == "damaged"
     for pose in poses:
         placed = target.model_copy(update={"pose": pose})
-        shown = placed if damaged else placed.hole_free()
-        renders.append(RenderJob(shown, source.camera, source.render, cache))
+        renders.append(RenderJob(placed if damaged else placed.hole_free(), source.camera, source.render, cache))
         set_ups.append(SetUpRef(str(renders[-1].path), source.camera, placed, damaged))
     return Batch(role, tuple(renders), tuple(set_ups), board, units)
 

@@ -1,12 +1,12 @@
 """Jobs in processes of this machine: a process that dies, hangs or needs too much memory fails its own job only.
 
-The standard library's executors give up all jobs when a process dies. Here a thread serves each process through a pipe,
-so that its job is known. A cluster's nodes use the same class."""
+The standard library's executors give up all jobs when a process dies; here a thread serves each through a pipe."""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
+import faulthandler
 import importlib
 import multiprocessing
 import os
@@ -36,8 +36,7 @@ LOOKS_S = 1.0  # interval at which a driver looks at the clock
 START_S = 300.0  # time for a process to load what it needs: seconds, but from a network's disk more
 DUMP_S = 0.3  # time that a hanging process gets to write its traceback; its signal handler needs a millisecond
 STOPPED_S = 2.0  # a wait of `LOOKS_S` that takes so much longer was no waiting: Ctrl-Z, or a suspended machine
-IDLE_S: dict[Stage, float] = {"trials": 300.0, "renders": 10.0}
-"""Processes without a job for so long end: those that render hold 2 GB."""
+IDLE_S: dict[Stage, float] = {"trials": 300.0, "renders": 10.0}  # idle processes end then; renderers hold 2 GB
 FALSE_STARTS = 3  # processes in a row that died before they could take a job: then none will start
 _SPAWNING = threading.Lock()
 
@@ -317,8 +316,6 @@ def serve(pipe: Connection[Any, Any], name: str, stage: Stage, said: str, code: 
 
 def _prepare(said: str) -> IO[str]:
     """Ignore Ctrl-C, end without a driver, and write to the file ``said`` where a crash or a hang happens."""
-    import faulthandler
-
     # Linux ends this process with its driver, whatever it does; elsewhere it ends where it next hears or tells anything
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)

@@ -33,8 +33,7 @@ from scenes.render.cache import read_view
 
 NOTHING = 0.1  # share of a board's face that is judged, up to which a camera that allows no threshold sees nothing
 AGREES = 1e-3
-"""Relative difference up to which two thresholds count as equal: a tenth or less of the standard error that a threshold
-from some twenty boards has, and a thousand times what unlike processors were seen to differ by."""
+"""Relative difference of equal thresholds: under a tenth of the standard error that one from twenty boards has."""
 
 
 class Calibration:
@@ -44,8 +43,8 @@ class Calibration:
         self._group = group
         self.unlearned: set[str] = set()
         """Points whose detector should have learned and did not: they have no threshold, not even a given one."""
+        # quiet threshold and judged area in m2, by point, then by trial
         self._quiet: dict[str, dict[str, tuple[float, float]]] = {}
-        """Quiet threshold and judged area in m2, by point, then by trial."""
 
     def add(self, key: str, runs: Sequence[Mapping[str, Any]]) -> None:
         """Add the rows ``runs`` of one trial."""
@@ -142,8 +141,7 @@ def threshold_of(point: Point, quiet: Iterable[tuple[float, float]]) -> float | 
 
 
 Report = Callable[[Outcome], None]
-AHEAD = 4096
-"""Trials that may wait to be run: enough for a thousand workers, and a few megabytes whatever the plan's size."""
+AHEAD = 4096  # Trials that may wait to be run: enough for a thousand workers, and a few megabytes
 TRIES = 2  # Tries of a render (two may have been too much for the memory), and of trials that set a threshold
 PARTS_AT_ONCE = 200  # parts that are looked up in the journal before the engine is asked again: some 0.1 s
 TOLD_WHOLE = 200  # failures whose traceback is kept in memory; of the others the journal has it
@@ -187,7 +185,7 @@ def run_plan(
 
 def _draw(plan: SweepPlan, outcome: Outcome, engine: JobEngine, there: set[Path]) -> None:
     """Add the pictures of all groups that were judged, but for studies, whose limits decide what is shown."""
-    groups = [group for group in plan.groups if not group.is_study]
+    groups = [group for group in plan.groups if group.damaged.board is None]
     groups = [group for group in groups if any(point.digest in outcome.thresholds for point in group.points)]
     missing = (job for group in groups for job in group.damaged.renders if job.path not in there)
     failures = render_missing(missing, engine)
@@ -208,8 +206,7 @@ def _draw(plan: SweepPlan, outcome: Outcome, engine: JobEngine, there: set[Path]
 
 def render_missing(jobs: Iterable[RenderJob], engine: JobEngine) -> list[Failure]:
     """Have views rendered that the cache lacks or holds damaged. Returns a failure for each that could not be."""
-    distinct = {job.path: job for job in jobs}
-    missing = [_render_job(job) for job in distinct.values() if read_view(job.path) is None]
+    missing = [_render_job(job) for job in {job.path: job for job in jobs}.values() if read_view(job.path) is None]
     ends = carried_out(missing, engine)
     return [_failure(_lost_view(job.name), ended) for job, ended in ends if ended.state != "done"]
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numba
 import numpy as np
+from scipy.spatial import cKDTree
 
 from detectors.clusters import PLAIN
 from harness.vocabulary.errors import UserError
@@ -22,13 +23,10 @@ from scenes.target.custom import TargetConfig
 from scenes.target.flaws import from_line_m
 from scenes.target.truth import Damage, Face, face_of, truth_of
 
-INTACT_MARGIN_PX = 8
-"""Pixels nearer than this to damage or to the board's rim do not count as undamaged: twice the engine's window."""
+INTACT_MARGIN_PX = 8  # Nearer to damage or rim nothing counts as undamaged: twice the engine's window
 FEWEST_PROBES = 100
-PROBES = 500
-"""Pixels on which temporal noise and systematic error are followed over repeats: known to 0.5 % with 50 repeats."""
-FACE_STEPS = 8
-"""Fixed-point steps to where a line of sight meets a curved face; each shrinks the error by the face's slope."""
+PROBES = 500  # Pixels followed over repeats for noise and systematic error: known to 0.5 % with 50 repeats
+FACE_STEPS = 8  # Fixed-point steps to a curved face; each shrinks the error by the face's slope
 FACE_ONLY_M = 50 * MM  # points this far behind the face are nearest to no place on it
 
 
@@ -68,11 +66,6 @@ class SetUp:
         return np.where((over & np.isfinite(z))[..., None], met, np.nan)
 
     @property
-    def light_bytes(self) -> int:
-        """Bytes of its view's light."""
-        return self.unit.view.phasor.nbytes
-
-    @property
     def board_xy_m(self) -> np.ndarray:
         """(h, w, 2): the same, along the face in plan."""
         return self.on_face_m[..., :2]
@@ -86,12 +79,7 @@ class SetUp:
     @cached_property
     def outlines(self) -> dict[int, np.ndarray]:
         """Flat indices of the pixels whose central ray enters each damage; at least the nearest pixel."""
-        x, y = (np.ascontiguousarray(self.board_xy_m[..., axis]).ravel() for axis in (0, 1))
-        inside = {}
-        for damage in self.truth:
-            within = np.flatnonzero(damage.within(x, y))
-            inside[damage.id] = within if within.size else nearest_place(x, y, damage)
-        return inside
+        return outlined(self.truth, self.board_xy_m)
 
     @cached_property
     def seen_depth_m(self) -> dict[int, float]:
@@ -104,8 +92,7 @@ class SetUp:
             inside = depth_m[self.outlines[damage.id]]
             sign = -1.0 if damage.raised else 1.0
             known = sign * inside[np.isfinite(inside)]
-            middle = np.median(known[known > known.max() - 1 * MM]) if known.size else np.nan
-            found[damage.id] = sign * float(middle)
+            found[damage.id] = sign * float(np.median(known[known > known.max() - 1 * MM]) if known.size else np.nan)
         return found
 
     @cached_property
@@ -141,17 +128,21 @@ class SetUp:
         return intact[:: max(1, len(intact) // PROBES)][:PROBES]
 
 
-def nearest_place(x_m: np.ndarray, y_m: np.ndarray, damage: Damage) -> np.ndarray:
-    """Return the flat index (1,) of the place nearest to a damage's centre."""
-    apart = (x_m - damage.centre_board_m[0]) ** 2 + (y_m - damage.centre_board_m[1]) ** 2
-    return np.array([int(np.nanargmin(apart))])
+def outlined(truth: Sequence[Damage], places_m: np.ndarray) -> dict[int, np.ndarray]:
+    """Return the flat indices of the places (h, w, 2) inside each damage by its id; the nearest where none is."""
+    x, y = (np.ascontiguousarray(places_m[..., axis]).ravel() for axis in (0, 1))
+    found = {damage.id: np.flatnonzero(damage.within(x, y)) for damage in truth}
+    for damage in truth:
+        if not found[damage.id].size:
+            apart = (x - damage.centre_board_m[0]) ** 2 + (y - damage.centre_board_m[1]) ** 2
+            found[damage.id] = np.array([int(np.nanargmin(apart))])
+    return found
 
 
 def _eroded(mask: np.ndarray) -> np.ndarray:
     """A mask less a rim of `INTACT_MARGIN_PX`."""
     square = np.ones((2 * INTACT_MARGIN_PX + 1,) * 2, np.uint8)
-    left = cv2.erode(mask.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    return np.asarray(left > 0)
+    return np.asarray(cv2.erode(mask.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0)
 
 
 def met_on_face(points_m: np.ndarray, directions: np.ndarray, face: Face) -> np.ndarray:
@@ -166,8 +157,7 @@ def met_on_face(points_m: np.ndarray, directions: np.ndarray, face: Face) -> np.
     return np.asarray(place)
 
 
-KEPT, KEPT_BYTES = 32, 200_000_000
-"""Most set-ups that a worker keeps, and bytes of their views: three near views of a lidar with 31 frequencies."""
+KEPT, KEPT_BYTES = 32, 200_000_000  # Set-ups kept, and bytes of views: three of a lidar with 31 frequencies
 _kept: OrderedDict[SetUpRef, SetUp] = OrderedDict()
 
 
@@ -183,20 +173,19 @@ def load_set_up(ref: SetUpRef) -> SetUp:
         seen = tuple(damage for damage, there in zip(truth, in_view, strict=True) if there)
         _kept[ref] = SetUp(unit, ref.damaged, seen, ref.target, T_camera_board)
     _kept.move_to_end(ref)
-    while len(_kept) > 1 and (len(_kept) > KEPT or sum(kept.light_bytes for kept in _kept.values()) > KEPT_BYTES):
+    while len(_kept) > 1 and (
+        len(_kept) > KEPT or sum(kept.unit.view.phasor.nbytes for kept in _kept.values()) > KEPT_BYTES
+    ):
         _kept.popitem(last=False)
     return _kept[ref]
 
 
 @dataclass(frozen=True)
 class KnownCloud:
-    """A cloud and where the truth lies in it.
-
-    ``T_board_cloud`` (4, 4): the cloud's frame to the board's, true. ``outlines``: by damage the flat indices of the
-    pixels (cells, points) that see into it, at least one. ``places_m`` (h, w, 2): where each lies on the face in plan,
-    NaN off the board. ``undamaged`` (h, w) bool: face well away from damage and rim. ``seen_depth_m``: by damage, how
-    far behind the face a view of it ends.
-    """
+    """A cloud and where the truth lies in it. ``T_board_cloud`` (4, 4): the cloud's frame to the board's, true.
+    ``outlines``: by damage the flat indices of the pixels (cells, points) that see into it, at least one. ``places_m``
+    (h, w, 2): where each lies on the face in plan, NaN off the board. ``undamaged`` (h, w) bool: face well away from
+    damage and rim. ``seen_depth_m``: by damage, how far behind the face a view of it ends."""
 
     cloud: Cloud
     T_board_cloud: np.ndarray
@@ -249,23 +238,16 @@ def known_map(first: SetUp, cloud: Cloud, T_reference_cloud: np.ndarray, *, hole
     half = np.array([first.target.board.width_mm, first.target.board.height_mm]) / 2 * MM - margin_m
     with np.errstate(invalid="ignore"):
         bare = (np.abs(place) < half).all(axis=-1)
-    outlines, intact = outlined(first.truth, place, bare, margin_m)
+    intact = bare & far_from(first.truth, place, margin_m)
+    of_truth = (first.target, first.truth, outlined(first.truth, place), place)
     undamaged = bare if hole_free and not intact.any() else intact
-    return KnownCloud(cloud, T_board_cloud, first.target, first.truth, outlines, place, undamaged, first.seen_depth_m)
+    return KnownCloud(cloud, T_board_cloud, *of_truth, undamaged, first.seen_depth_m)
 
 
-def outlined(
-    truth: Sequence[Damage], places_m: np.ndarray, bare: np.ndarray, margin_m: float
-) -> tuple[dict[int, np.ndarray], np.ndarray]:
-    """Return the flat indices of the places (h, w, 2) inside each damage by its id, the nearest where none is; and
-    what of ``bare`` (h, w) bool is farther than a margin from all."""
-    outlines, intact = {}, bare.copy()
-    x, y = np.ascontiguousarray(places_m[..., 0]), np.ascontiguousarray(places_m[..., 1])
-    for damage in truth:
-        intact &= ~damage.within(x, y, margin_m)
-        within = np.flatnonzero(damage.within(x, y).ravel())
-        outlines[damage.id] = within if within.size else nearest_place(x, y, damage)
-    return outlines, intact
+def far_from(truth: Sequence[Damage], places_m: np.ndarray, margin_m: float) -> np.ndarray:
+    """Return (h, w) bool: places (h, w, 2) farther than a margin from all damage."""
+    x, y = (np.ascontiguousarray(places_m[..., axis]) for axis in (0, 1))
+    return ~np.any([np.zeros(x.shape, bool), *(damage.within(x, y, margin_m) for damage in truth)], axis=0)
 
 
 def board_places_m(cloud: Cloud, T_board_cloud: np.ndarray) -> np.ndarray:
@@ -292,14 +274,11 @@ def _ticks(places: np.ndarray) -> np.ndarray:
 def face_errors_m(known: KnownCloud, places_m: np.ndarray) -> np.ndarray:
     """Return (p,) how far behind the true face the cloud's point nearest to each place (p, 2) of the board lies, along
     the board's normal; NaN where the nearest lies more than three of the cloud's mean spacings aside."""
-    from scipy.spatial import cKDTree
-
     points = transform_points(known.T_board_cloud, known.cloud.points_m[known.cloud.valid])
     points = points[np.abs(points[:, 2]) < FACE_ONLY_M]
     if not len(points):
         return np.full(len(places_m), np.nan)
-    tree = cKDTree(points[:, :2], balanced_tree=False, compact_nodes=False)
-    distance, nearest = tree.query(places_m)
+    distance, nearest = cKDTree(points[:, :2], balanced_tree=False, compact_nodes=False).query(places_m)
     spacing_m = float(np.sqrt(np.prod(np.ptp(points[:, :2], axis=0)) / len(points)))
     error = face_of(known.target.board).height_m(points[nearest, 0], points[nearest, 1]) - points[nearest, 2]
     return np.asarray(np.where(distance <= 3 * spacing_m, error, np.nan))
@@ -344,6 +323,5 @@ def pixel_areas(places_m: np.ndarray) -> np.ndarray:
             left, right = max(u - 1, 0), min(u + 1, w - 1)
             ax, ay = places_m[v, right, 0] - places_m[v, left, 0], places_m[v, right, 1] - places_m[v, left, 1]
             bx, by = places_m[down, u, 0] - places_m[up, u, 0], places_m[down, u, 1] - places_m[up, u, 1]
-            area = abs(ax * by - ay * bx)
-            areas[v, u] = area / ((right - left) * (down - up))
+            areas[v, u] = abs(ax * by - ay * bx) / ((right - left) * (down - up))
     return areas

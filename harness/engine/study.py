@@ -15,15 +15,22 @@ import pandas as pd
 
 from harness.engine.estimate import progress_display
 from harness.engine.journal import Journal
+from harness.engine.pictures import shown_in, study_example
 from harness.engine.plan import PACKAGES, Group, SweepPlan, plan_of
 from harness.engine.run import render_missing, run_plan
 from harness.engine.tables import tables_of, write_tables
 from harness.engine.work import STATES, EngineOptions, Failure, JobEngine, Outcome, engine_of, locked
-from harness.evaluation.study.record import Calibrated, Inspected, SetUpRecord, StudyRecord, Unflawed
+from harness.evaluation.study.record import Calibrated, Inspected, SetUpRecord, StudyRecord, Unflawed, record_text
+from harness.evaluation.study.result import evaluate_study
 from harness.experiment.load import resolved_yaml
 from harness.experiment.schema import Experiment, Point, detector_version
 from harness.listing import point_to
+from harness.report.page import write_report
+from harness.report.sections import final_tables
+from harness.report.study_page import study_html, study_parts
+from harness.report.summaries import as_files, is_thesis, summaries
 from harness.tables.outputs import EXPERIMENT, PROVENANCE, REPORT, STUDY
+from harness.tables.study import study_tables
 from harness.tables.text import Grid, show
 from harness.tables.trials import ResultTables
 from harness.vocabulary.errors import UserError
@@ -117,12 +124,6 @@ def _write_study(
     engine: JobEngine,
 ) -> list[str | Grid]:
     """Write a study's record, tables and report. Returns what a terminal shows of it."""
-    from harness.engine.pictures import shown_in, study_example
-    from harness.evaluation.study.record import record_text
-    from harness.evaluation.study.result import evaluate_study
-    from harness.report.study_page import study_html, study_parts
-    from harness.tables.study import study_tables
-
     failed = failures_by_point(plan, outcome.failures, outcome.thresholds)
     study = record_of(experiment, plan, tables, failed, provenance)
     if not study.set_ups:
@@ -152,10 +153,6 @@ def _write_report(
     folder: Path, experiment: Experiment, outcome: Outcome, tables: ResultTables, provenance: dict[str, Any]
 ) -> list[str | Grid]:
     """Write the summaries and the report of what is no study. Returns what a terminal shows of it."""
-    from harness.report.page import write_report
-    from harness.report.sections import final_tables
-    from harness.report.summaries import as_files, is_thesis, summaries
-
     facts = experiment.data
     found = summaries(tables, outcome.examples, with_claims=is_thesis(facts))
     write_tables(folder, as_files(found), provenance)
@@ -195,21 +192,19 @@ def _counts(outcome: Outcome) -> dict[str, int]:
 def _tell_failures(outcome: Outcome) -> None:
     if counts := _counts(outcome):
         said = ", ".join(f"{count} {state}" for state, count in counts.items())
-        again = "the same command, with --retry-failed, runs them again" if set(counts) - {"skipped"} else ""
-        print(f"{said}: {_reasons(outcome)}", file=sys.stderr)
-        print(again or "the same command runs again what was skipped", file=sys.stderr)
+        again = "the same command, with --retry-failed, runs them again"
+        again = again if set(counts) - {"skipped"} else "the same command runs again what was skipped"
+        print(f"{said}: {_reasons(outcome)}\n{again}", file=sys.stderr)
 
 
 def _provenance(
     experiment: Experiment, plan: SweepPlan, outcome: Outcome, tables: ResultTables, origin: dict[str, Any]
 ) -> dict[str, Any]:
     """Everything that a reader needs to repeat the numbers or to doubt them."""
-    views = (read_view(job.path) for job in plan.renders)
-    variant = next((view.variant for view in views if view is not None), None)
+    variant = next((view.variant for view in (read_view(job.path) for job in plan.renders) if view is not None), None)
     runs, renders, trials = tables.runs, outcome.renders, outcome.trials
-    sources = [point.config.simulated.camera for point in experiment.points]
-    cameras = {source.name: camera_of(source) for source in sources}
-    guesses = map(guessed_precision, cameras.values())
+    sources = {point.config.simulated.camera.name: point.config.simulated.camera for point in experiment.points}
+    guesses = (guessed_precision(camera_of(source)) for source in sources.values())
     return {
         "results_version": RESULTS_VERSION,
         **origin,
@@ -231,8 +226,7 @@ def _provenance(
     }
 
 
-SIMULATION = ("scenes.sensor.source",)
-"""Modules that decide frames, with all that they import: a change of any makes frames count as different."""
+SIMULATION = ("scenes.sensor.source",)  # modules that decide frames, with all that they import
 INSPECTED = {
     "board": int, "hole": str, "repeat": int, "true_diameter_mm": float, "true_depth_mm": float, "true_x_mm": float,
     "true_y_mm": float, "signal": float,
@@ -281,7 +275,9 @@ def _set_up(point: Point, group: Group, tables: ResultTables, failed: int) -> Se
     # equal where every frame of every judged board is
     decided_by = [source_digest(SIMULATION, PACKAGES), *renders, point.frames_key, config.capture.to_data()]
     study = config.study
-    return SetUpRecord(
+    return set_up_of(
+        holes,
+        runs,
         variant=point.variant,
         frames=frames,
         axes=dict(point.axes),
@@ -300,12 +296,11 @@ def _set_up(point: Point, group: Group, tables: ResultTables, failed: int) -> Se
             score=loudest["quiet_threshold"].to_numpy(float),
             **{name: loudest[f"loudest_{name}"].to_numpy(float) for name in ("x_mm", "y_mm", "u_px", "v_px")},
         ),
-        **judged_facts(holes, runs),
     )
 
 
-def judged_facts(holes: pd.DataFrame, runs: pd.DataFrame) -> dict[str, Any]:
-    """Return what the tables of one set-up's judged boards put into its record: threshold, hits, false calls."""
+def set_up_of(holes: pd.DataFrame, runs: pd.DataFrame, **named: Any) -> SetUpRecord:
+    """Return a set-up's record: threshold, hits and false calls by the tables of its judged boards, and ``named``."""
     judged = runs[runs["threshold"].notna()]
     threshold = float(judged["threshold"].iloc[0])
     by_depth, by_no_return = holes["detected"].to_numpy(bool), holes["no_return"].to_numpy(bool)
@@ -321,19 +316,20 @@ def judged_facts(holes: pd.DataFrame, runs: pd.DataFrame) -> dict[str, Any]:
             no_return_calls=no_return,
         )
 
-    return {
-        "threshold": threshold,
-        "threshold_mm": threshold * float(judged["scale_mm"].mean()),
-        "inspected": Inspected(
+    return SetUpRecord(
+        threshold=threshold,
+        threshold_mm=threshold * float(judged["scale_mm"].mean()),
+        inspected=Inspected(
             **{name.removeprefix("true_"): holes[name].to_numpy(kind) for name, kind in INSPECTED.items()},
             hit=by_depth | by_no_return,
             by_depth=by_depth,
             by_no_return=by_no_return,
             size_of=str(holes["size_of"].iloc[0]),
         ),
-        "unflawed": false_calls("hole_free"),
-        "beside": false_calls("damaged"),
-    }
+        unflawed=false_calls("hole_free"),
+        beside=false_calls("damaged"),
+        **{"axes": {}, "detector_version": 0, "failed": 0, **named},
+    )
 
 
 def failures_by_point(

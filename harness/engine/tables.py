@@ -77,8 +77,7 @@ def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> t
 
 
 def columns_of(rows: Sequence[Mapping[str, Any]], grids: dict[tuple[float, ...], np.ndarray]) -> dict[str, Any]:
-    """Rows as columns, each apart: those that JSON filled with None hold numbers with NaN; lists of counts are lists
-    still, and those of thresholds one of ``grids``, which takes in new ones."""
+    """Rows as columns: of None and numbers floats with NaN; lists of thresholds one of ``grids``, which takes new."""
     found = {}
     for name, column in pd.DataFrame(rows).items():
         if isinstance(column.iloc[0], list):
@@ -97,8 +96,7 @@ def columns_of(rows: Sequence[Mapping[str, Any]], grids: dict[tuple[float, ...],
 
 
 def _probes(rows: list[dict[str, Any]]) -> pd.DataFrame:
-    """Mean error and temporal deviation of each probe over the hole-free repeats; what a repeat's median error differs
-    from the median repeat's is told as ``displacement_std_mm`` and taken out of the other two."""
+    """Mean error and temporal deviation of each probe over hole-free repeats, less each repeat's own displacement."""
     grouped: dict[tuple[str, int], list[np.ndarray]] = {}
     for row in sorted(rows, key=lambda row: (row["variant"], row["frames"], row["repeat"])):
         grouped.setdefault((row["variant"], row["frames"]), []).append(row["error_tenth_um"])

@@ -37,12 +37,10 @@ from scenes.sensor.source import SimulatedCapture, SimulatedUnit
 from scenes.sensor.unit import FrameTotals
 
 FEWEST_FRAMES = 20
-"""Fewer frames cost less than the sorting of a view's pixels, which takes as long as some 10 frames of a bare board
-and 25 of one with holes before a far wall. By number only, so that no result hangs on what was sorted before."""
+"""Fewer frames cost less than sorting a view's pixels. By number only: no result hangs on what was sorted before."""
 FLAT_ALBEDO = 0.6  # of a flat field's plane: painted wood or paper, as the boards of the experiments
 MOST_DISTURBED = 0.5
-"""Share of `AverageConfig.disturbed_fraction` that pixels' own noise may disturb. A frame's own share scatters about
-the mean by a thousandth, and the judge allows 1.5 times what it finds usual on top."""
+"""Share of `AverageConfig.disturbed_fraction` that pixels' own noise may disturb; it scatters by a thousandth."""
 
 
 def averages_of(
@@ -91,16 +89,14 @@ def _at_once(capture: SimulatedCapture, counts: list[int], config: AverageConfig
         if totals is None and len(frames):
             return {}
         sums = sums + totals if sums and totals else sums or totals
-        before = tuple(left for number, left in left_out.items() if number < n)
-        cloud = _cloud(capture, sums, before) if sums else None
+        cloud = _cloud(capture, sums, tuple(left for number, left in left_out.items() if number < n)) if sums else None
         if cloud is not None and not (config.judge_frames and _disturbed(cloud, noise_m, config)):
             clouds[n] = cloud
     return clouds
 
 
 def _left_out(capture: SimulatedCapture, summer: AtOnce, config: AverageConfig, noise_m: float) -> dict[int, LeftOut]:
-    """The frames, by number, that `detectors.average` leaves out for a jump, by the displacement of each as it is: the
-    judge's own error, a sixth of the limit at most, is not drawn."""
+    """The frames, by number, left out for a jump as it is; the judge's error, a sixth of the limit, is not drawn."""
     sampled = summer.sure_pixels / -(-summer.sure_pixels // SAMPLED_PIXELS)
     error_m = 1.2533 * noise_m * np.sqrt(2.0 * CORRELATED_PIXELS / max(sampled, CORRELATED_PIXELS))
     limit_m = max(config.jump_sigmas * error_m, config.jump_mm * MM)
@@ -156,8 +152,8 @@ BOARD_STEPS = 9  # places along each side of the board at which a registration's
 
 
 class MapMaker:
-    """Maps of one trial: ``clouds`` by view, then by number of frames. ``poses``: the views' declaration; ``labels`` of
-    this trial's random errors of the poses. ``truth`` and ``guesses``: T_reference_view."""
+    """Maps of one trial: ``clouds`` by view, then frames. ``poses``: the views' declaration; ``labels`` of the trial's
+    random errors of the poses. ``truth``, ``guesses``: T_reference_view."""
 
     def __init__(
         self, set_ups: Sequence[SetUp], clouds: Sequence[Clouds], poses: AnyViews, labels: Sequence[str | int]
@@ -238,9 +234,10 @@ class MapMaker:
         both = (registration.T_reference_view, self.guesses[number])
         (in_plane, across), guessed = (registration_error_m(T, self.truth[number], places_m, normal) for T in both)
         predicted = predicted_error_m(registration, places_m, normal)
+        told = ("method", "overlap", "pairs", "iterations", "converged", "seconds", "failure")
         return {
             "view": number,
-            "method": registration.method,
+            **{name: getattr(registration, name) for name in told},
             "tre_mm": float(np.hypot(in_plane, across)) / MM,
             "tre_in_plane_mm": in_plane / MM,
             "tre_across_mm": across / MM,
@@ -248,13 +245,7 @@ class MapMaker:
             "predicted_across_mm": predicted[1] / MM,
             "guess_tre_mm": float(np.hypot(*guessed)) / MM,
             "residual_mm": registration.residual_m / MM,
-            "overlap": registration.overlap,
-            "pairs": registration.pairs,
             "marks": len(view.marks.trusted),
-            "iterations": registration.iterations,
-            "converged": registration.converged,
-            "seconds": registration.seconds,
-            "failure": registration.failure,
         }
 
 
@@ -440,8 +431,7 @@ def _tenth_um(errors_m: np.ndarray) -> list[int | None]:
 
 def pair_noise(first_z_m: np.ndarray, second_z_m: np.ndarray, where: np.ndarray) -> dict[str, float]:
     """Return the standard deviation of one frame's temporal noise and its correlations from two frames' z (h, w),
-    metres. A displacement of a whole frame is taken out with the difference's median. Pixels count that are in
-    ``where`` (h, w) and valid in both; NaN where there are too few."""
+    metres, less the median difference. Pixels ``where`` (h, w) both are valid count; NaN where they are too few."""
     difference = (first_z_m.astype(float) - second_z_m.astype(float)) / np.sqrt(2)
     there = where & np.isfinite(difference)
     if there.sum() < FEWEST_PAIRS:

@@ -27,8 +27,7 @@ State = Literal["done", "failed", "crashed", "timed out", "skipped"]
 """The ends of a job. Failed: it raised; crashed: its process died; skipped: what it needs is not there."""
 STATES: tuple[State, ...] = get_args(State)
 Stage = Literal["renders", "trials"]  # renders load Mitsuba and some 2 GB; everything else runs where trials run
-Code = tuple[tuple[str, ...], tuple[str, ...]]
-"""Modules and packages that decide the numbers of a stage: the arguments of `source_digest`."""
+Code = tuple[tuple[str, ...], tuple[str, ...]]  # modules and packages: the arguments of `source_digest`
 TRACEBACK_CHARACTERS = 4000
 
 
@@ -60,12 +59,6 @@ class Ended:
     def record(self) -> dict[str, Any] | None:
         """Rows by table of a trial that is done."""
         return None if self.value is None else json.loads(self.value)
-
-    def result(self) -> Any:
-        """Return the value; where there is none, raise the mistake or the bug here."""
-        if self.state == "done":
-            return self.value
-        raise (RuntimeError if self.is_bug else UserError)(f"{self.state}: {self.why}")
 
 
 class JobEngine(Protocol):
@@ -234,8 +227,7 @@ def _held(path: Path, *, shared: bool) -> Iterator[None]:
 # ---------------------------------------------------------------- options
 
 
-DEFAULT_LIMITS = Limits(seconds=900.0, memory_mb=4000)
-"""A trial takes seconds at most, and a hang should not take a night; 300 MB, maps of many views up to 2 GB."""
+DEFAULT_LIMITS = Limits(seconds=900.0, memory_mb=4000)  # a trial takes seconds and 300 MB; maps of many views 2 GB
 LEAST_MEMORY_GB = 0.5  # a process that has loaded what trials need holds 0.2 GB
 
 

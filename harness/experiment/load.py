@@ -109,17 +109,13 @@ def lens_numbers(recording: Path, cameras: Iterable[str]) -> dict[str, Any]:
     elif not recording.is_file():
         raise UserError(f"--calibration {recording}: no such file or folder")
     if lens is None:
-        raise UserError(
-            f"--calibration {recording}: holds no calibration of a lens",
-            legal="an Azure Kinect .mkv, or a folder of depth images with its intrinsics beside them",
-        )
+        legal = "an Azure Kinect .mkv, or a folder of depth images with its intrinsics beside them"
+        raise UserError(f"--calibration {recording}: holds no calibration of a lens", legal=legal)
     for name in cameras:
-        known = name in camera_names() or is_camera_path(name)
-        nominal = load_camera(name).nominal_lens if known else lens
+        nominal = load_camera(name).nominal_lens if name in camera_names() or is_camera_path(name) else lens
         if (nominal.width, nominal.height) != (lens.width, lens.height):
-            raise UserError(
-                f"{recording}: the calibration is of {lens.width} x {lens.height} pixels",
-                legal=f"{nominal.width} x {nominal.height}, as {name} has",
-                fix="name a recording of the same camera in the same mode, or choose another source.camera.name",
-            )
+            legal = f"{nominal.width} x {nominal.height}, as {name} has"
+            fix = "name a recording of the same camera in the same mode, or choose another source.camera.name"
+            said = f"{recording}: the calibration is of {lens.width} x {lens.height} pixels"
+            raise UserError(said, legal=legal, fix=fix)
     return numbers_of_lens(lens)

@@ -94,8 +94,7 @@ class DetectorConfig(Config):
 
 class CalibrateConfig(Config):
     """A threshold from hole-free runs: the lowest k that gives no false cluster in so many ``repeats`` of the same
-    set-up; or, in a study, the lowest whose rate of false calls on so many ``boards`` of their own is the one wanted
-    (`harness.evaluation.intervals.threshold_for_rate`)."""
+    set-up; or, in a study, the lowest with the wanted rate of false calls on so many ``boards`` of their own."""
 
     repeats: Repeats | None = None
     boards: Boards | None = Field(None, description="of a study: boards of their own, never judged")
@@ -173,9 +172,7 @@ class SensitivityConfig(Config):
 class StudyConfig(Config):
     """A study of the probability of detection on random boards: ``boards`` with damage, and ``hole_free_boards`` on
     which false calls are counted; every point is judged on the same, and ``repeats`` draw the noise anew on each.
-
-    ``units`` draws cameras with patterns of their own: every damaged board is inspected by all, every other by its own.
-    """
+    ``units`` draws cameras with own patterns: every damaged board is inspected by all, every other by its own."""
 
     boards: Boards
     hole_free_boards: Boards
@@ -294,8 +291,7 @@ def point_of(label: str, variant: str, values: Mapping[str, Any], config: Experi
     numbers |= {"source": frames, "detector_version": detector_version(config)}
     offer = DETECTORS.offer(config.detector.name)
     numbers |= {} if offer.built_in else {"detector_from": offer.origin}
-    frames_key = digest({"source": frames, "seed": config.seed})
-    return Point(label, variant, values, config, digest(numbers), frames_key)
+    return Point(label, variant, values, config, digest(numbers), digest({"source": frames, "seed": config.seed}))
 
 
 def detector_version(config: ExperimentConfig) -> int:

@@ -36,10 +36,9 @@ def key_path(text: str) -> KeyPath:
 
 
 def set_path(data: Any, path: KeyPath, value: Any, declared: shape.Declared | None = None, above: KeyPath = ()) -> Any:
-    """Return ``data`` with the value at ``path`` replaced or added; the argument stays unchanged. With ``declared``, a
-    mapping missing on the way is filled with its defaults, so that one key leaves the others as they would have been,
-    and a new kind of a mapping (``merge.kind``) leaves out what only the former has. ``above``: where ``data`` stands.
-    Raises PathError where the way is barred."""
+    """Return a copy of ``data`` with the value at ``path`` replaced or added. With ``declared``, a mapping missing on
+    the way is filled with its defaults, and a new kind of a mapping (``merge.kind``) leaves out what only the former
+    has. ``above``: where ``data`` stands. Raises PathError where the way is barred."""
     if not path:
         return value
     key, rest = _index(data, path[0], above), path[1:]
@@ -114,8 +113,7 @@ MAX_POINTS = 10_000  # More than a machine works through in a week; beyond it an
 MAX_SHOWN = 20  # Problems of combinations are found one point at a time and look alike
 FRAMES = "capture.frames"
 SWITCHES = "switches"  # Key of the file that names a mapping of switches
-FIXED = ("name", "title", "repeats", "study", "sweep", "draws", SWITCHES, "sensitivity")
-"""Keys that are the same for all points."""
+FIXED = ("name", "title", "repeats", "study", "sweep", "draws", SWITCHES, "sensitivity")  # the same for all points
 
 
 @dataclass(frozen=True)
@@ -220,8 +218,7 @@ def _switch_axis(config: ExperimentConfig, source: Source) -> tuple[list[Setting
         return few.get(len(on), f"all but {''.join(whole - on)}").replace("_", " ")
 
     chosen = dict.fromkeys([frozenset[str](), *alone, *(whole - one for one in alone), whole])
-    settings = [Setting(path, {name: name in on for name in names}, (SWITCHES,), label(on)) for on in chosen]
-    return settings, problems
+    return [Setting(path, {name: name in on for name in names}, (SWITCHES,), label(on)) for on in chosen], problems
 
 
 def _variation_problems(variations: list[Draft], axes: list[list[Setting]], source: Source) -> Iterator[Problem]:
@@ -249,8 +246,7 @@ def _path_problems(path: str, place: Place | None, source: Source, fixed: Iterab
 
 
 def _resolved(draft: Draft, source: Source, all_told: bool) -> tuple[ExperimentConfig | None, list[Problem]]:
-    """Return the declaration of one point, its values set and no axes left, or what is wrong with it: at the value that
-    is itself wrong, else (``all_told``) under the point's name."""
+    """Return a point's declaration, or what is wrong with it: at the wrong value, else (``all_told``) at its name."""
     place = source.place_of(draft.named_at)
     located = replace(source, data={k: v for k, v in source.data.items() if k not in ("sweep", "sensitivity")})
     try:

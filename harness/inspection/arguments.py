@@ -26,8 +26,7 @@ MARKS = ("colour", "red", "coded")
 WHOLE_CAPTURES = (".mcap", ".db3", ".mkv", ".npy", ".npz", ".mat", ".tif", ".tiff", ".pfm")
 DEFAULT_FALSE_CALLS = 1.0  # expected false calls in the capture
 DEFAULT_DETECTOR = "matched"
-PREFIX = "mapping."
-"""Start of the --set keys that concern the way from views to one cloud; all others are the detector's."""
+PREFIX = "mapping."  # begins the --set keys from views to one cloud; all others are the detector's
 STATED_SURFACE = ("surface=", "surface.degree", "surface.method", "surface.drop")
 """Settings that state a polynomial: without any of them the surface's shape is chosen by evidence."""
 LEGAL_CROP = "auto, none, box:x0,x1,y0,y1,z0,z1 (mm, camera frame), polygon:u,v,u,v,u,v.. (pixels)"
@@ -173,8 +172,7 @@ FARTHEST_M = 100.0  # Largest distance of two views of one target: poses in mill
 
 def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
     """Return ``T_first_view`` (4, 4) of each view, the first the identity, from poses to any common frame. Raises
-    UserError where the file cannot be read or is a newer version's, has another number of poses, or one not rigid or
-    too far."""
+    UserError where the file cannot be read, has another number of poses, or one that is not rigid or too far."""
     import numpy as np
 
     from harness.vocabulary.geometry import invert

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
 
+from detectors.marks.find import find_marks
+from detectors.marks.mark import CodedMarks
+from detectors.marks.pairing import kabsch
 from harness.evaluation.match import match
+from harness.report.findings import Judged
 from harness.tables.outputs import GAUGE_ROWS
 from harness.tables.schema import Column, Table
 from harness.vocabulary.config import Config
@@ -20,14 +23,10 @@ from harness.vocabulary.files import RECORD_BYTES, bounded_bytes, strict_json
 from harness.vocabulary.geometry import MM, invert, transform_points
 from harness.vocabulary.provenance import check_version
 
-if TYPE_CHECKING:
-    from harness.report.findings import Judged
-
 GAUGE_VERSION = 1
 FEWEST_MARKS = 3
 SIDES = 8  # Directions around a hole in which judged points must lie: else a miss says nothing of its size
-WORST_FIT_MM = 2.0
-"""Root mean square distance of marks from where the board has them, beyond which the board's place is doubtful."""
+WORST_FIT_MM = 2.0  # Root mean square distance of marks from their places, beyond which the fit is doubtful
 Length = Annotated[float, Field(gt=0, le=5e3)]
 CoordinateMm = Annotated[float, Field(ge=-5e3, le=5e3)]
 
@@ -132,11 +131,6 @@ class GaugeSeen:
 
 def seen_on(gauge: Gauge, judged: Judged) -> GaugeSeen:
     """Find the boards in a judged capture by their marks, match findings to holes. Raises UserError without one."""
-    from dataclasses import replace
-
-    from detectors.marks.find import find_marks
-    from detectors.marks.mark import CodedMarks
-    from detectors.marks.pairing import kabsch
 
     cloud = judged.cloud
     if cloud.rgb is None and cloud.amplitude is not None:  # an infrared picture shows printed codes too
@@ -205,8 +199,3 @@ def _matched(
     for mark in board.marks:
         inside &= (np.abs(places - np.array([mark.x_mm, mark.y_mm]) * MM) > mark.side_mm * MM).any(axis=-1)
     return rows, int(inside.sum()) - sum(bool(inside[finding]) for finding in pairs.values())
-
-
-def csv_text(rows: Sequence[GaugeRow]) -> str:
-    """Return the table as harness.pod reads it."""
-    return str(HITS_AND_MISSES.frame(rows).to_csv(index=False, float_format="%.6g", lineterminator="\n"))

@@ -16,38 +16,41 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from detectors.average import AverageConfig, average
+from detectors.background import misfit
+from detectors.crop import Choice
+from detectors.flat_field import FlatField, corrected, doubts, load_flat_field
+from detectors.interface import Detection, Detector, Evidence, Measurement
+from detectors.masks import grown, holes_filled
+from detectors.measure import measure_extents
+from detectors.missing import measure_missing, missing_returns, one_damage_once
+from detectors.noise import REACH_FRAMES, noise_reach_px
+from detectors.null import each_object_once, own_threshold
+from detectors.views import PreparedView, View
 from harness.inspection import arguments as asked
 from harness.inspection import told
+from harness.inspection.gauge import HITS_AND_MISSES, GaugeSeen, read_gauge, seen_on
+from harness.report.findings import Judged, plain_json, write_findings
+from harness.tables.outputs import GAUGE_ROWS
+from harness.tables.text import show
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import MM
-from harness.vocabulary.provenance import RESULTS_VERSION
+from harness.vocabulary.geometry import MM, Cloud
+from harness.vocabulary.provenance import RESULTS_VERSION, record
 
 if TYPE_CHECKING:
-    from detectors.crop import Choice
-    from detectors.flat_field import FlatField
-    from detectors.interface import Detection, Detector, Evidence, Measurement
     from detectors.mapping.merge import Mapped
     from detectors.mapping.settings import MappingConfig
     from detectors.recordings import Recording
     from detectors.registration.registered import Registration
-    from detectors.views import PreparedView, View
-    from harness.inspection.gauge import GaugeSeen
-    from harness.report.findings import Judged
-    from harness.vocabulary.geometry import Cloud
 
-DEFAULT_K = 5.0
-"""Robust standard deviations, where the capture cannot tell better; of a million normal pixels 0.6 lie beyond."""
-FAINT_CALLS = 0.05
-"""Expected false calls as strong as a finding, in the capture, from which on noise explains the finding."""
+DEFAULT_K = 5.0  # Robust standard deviations, where the capture cannot tell; 0.6 of a million normal pixels lie beyond
+FAINT_CALLS = 0.05  # Expected false calls as strong as a finding, from which on noise explains the finding
 FAINT_PEAKS = 20  # peaks below which their number does not tell how fast it falls with the score
 THRESHOLDS = ("threshold", "quiet_capture", "false_calls")  # arguments of which each sets the threshold
 
 
 def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: float) -> Judged:
     """Find damage beyond a threshold and missing returns, each damage and each object once, and measure them."""
-    from detectors.measure import measure_extents
-    from detectors.missing import measure_missing, missing_returns, one_damage_once
-    from detectors.null import each_object_once
     from harness.report.findings import Judged
 
     missing = missing_returns(cloud, evidence)
@@ -65,7 +68,6 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
 
 def analysed(detector: Detector, cloud: Cloud) -> Evidence:
     """Return the detector's evidence, with a warning where it fitted a stated surface that does not fit."""
-    from detectors.background import misfit
 
     evidence = detector.analyse(cloud)
     doubt = "" if "misfit_share" in evidence.notes else misfit(cloud, evidence.residual_m, "the stated surface")
@@ -92,7 +94,6 @@ def threshold_of(
     """Return the threshold, its origin, and the evidence to search with it: given, calibrated on a quiet capture
     (``quiet`` does it), the detector's own, or by the peaks of the capture towards the camera, which may leave out a
     rim that cannot be judged; where these cannot be trusted, a fallback with warnings."""
-    from detectors.null import own_threshold
 
     if arguments.threshold is not None:
         return arguments.threshold, "given", evidence
@@ -143,8 +144,6 @@ def with_faint_told(judged: Judged, threshold: float) -> Judged:
 
 def with_cut_told(judged: Judged) -> Judged:
     """Add a warning where findings reach the rim of what is judged: the rest of them was not seen."""
-    from detectors.masks import grown, holes_filled
-
     if not judged.cloud.organised:
         return judged
     outside = np.pad(~holes_filled(np.isfinite(judged.evidence.residual_m)), 1, constant_values=True)
@@ -164,8 +163,7 @@ def _calls(expected: float) -> str:
     return f"{expected:.1f}" if expected >= 0.1 else f"{expected:.1g}" if expected >= 1e-4 else "0"
 
 
-START_FROM_MARKS = ("icp", "cpd")
-"""Methods that need a place to start from; `joint` finds its own, `odometry` goes from view to view."""
+START_FROM_MARKS = ("icp", "cpd")  # methods that need a start; `joint` finds its own, `odometry` goes view to view
 
 
 @dataclass(frozen=True)
@@ -194,9 +192,7 @@ class Inspection:
 
 def inspect(arguments: argparse.Namespace) -> int:
     """Open, average, register and merge views, judge, print, and write with --out. Returns 0. Raises UserError."""
-    from detectors.flat_field import doubts, load_flat_field
     from detectors.views import View
-    from harness.inspection.gauge import read_gauge, seen_on
 
     config = asked.mapping_of(arguments) if arguments.register is not None else None
     paths = arguments.paths[: config.views] if config else arguments.paths
@@ -256,9 +252,6 @@ def _opened(arguments: argparse.Namespace, paths: Sequence[Path]) -> Recording:
 
 
 def _averaged(arguments: argparse.Namespace, recording: Recording, field: FlatField | None) -> Cloud:
-    from detectors.average import AverageConfig, average
-    from detectors.flat_field import corrected
-    from detectors.noise import REACH_FRAMES, noise_reach_px
 
     cloud = average(recording, AverageConfig(method=arguments.average))
     reach_px = noise_reach_px(list(islice(recording.frames(), REACH_FRAMES))) if cloud.organised else 0.0
@@ -272,9 +265,8 @@ def _mistakes_named(view: View | None) -> Iterator[None]:
     try:
         yield
     except UserError as mistake:
-        if view is None:
-            raise
-        raise UserError(f"view {view.name}: {mistake.message}", legal=mistake.legal, fix=mistake.fix) from mistake
+        named = "" if view is None else f"view {view.name}: "
+        raise UserError(f"{named}{mistake.message}", legal=mistake.legal, fix=mistake.fix) from mistake
 
 
 def _merged(
@@ -290,10 +282,10 @@ def _merged(
     from detectors.registration.by_marks import register_by_marks
     from detectors.registration.register import register
 
-    pairs = list(zip(recordings, views, choices, strict=True))
-    told.print_warnings(f"view {view.name}: {why}" for _, view, choice in pairs if choice for why in choice.warnings)
+    for view, choice in zip(views, choices, strict=True):
+        told.print_warnings(f"view {view.name}: {why}" for why in (choice.warnings if choice else ()))
     prepared: list[PreparedView] = []
-    for recording, view, choice in pairs:
+    for recording, view, choice in zip(recordings, views, choices, strict=True):
         with _mistakes_named(view):
             ready = prepare(view, config)
         told.print_choice(choice)
@@ -324,8 +316,7 @@ def _merged(
 
 
 def _registration_data(mapped: Mapped) -> dict[str, Any]:
-    """Return the registrations as plain data (metres in matrices, millimetres elsewhere) with checks that need no
-    truth: marks held out, and errors predicted over the reference's target."""
+    """Return registrations as plain data (metres in matrices, else millimetres), and checks that need no truth."""
     from detectors.registration.by_marks import held_out_error_m
     from detectors.registration.registered import plane_through, predicted_error_m, thinned
 
@@ -394,9 +385,6 @@ def _print(run: Inspection) -> None:
     print(f"threshold: {told.threshold_text(run.threshold, evidence)} ({run.origin})")
     told.print_findings(run.result.findings, grid="px" if run.cell_m is None else "cell")
     if run.seen is not None:
-        from harness.inspection.gauge import HITS_AND_MISSES
-        from harness.tables.text import show
-
         told.print_notes(run.seen.notes)
         show([HITS_AND_MISSES.grid(run.seen.rows, terminal=True)])
         print(run.seen.answer)
@@ -404,7 +392,6 @@ def _print(run: Inspection) -> None:
 
 def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
     """Return the facts that the JSON holds beside the findings, with the origin and digests of all files read."""
-    from harness.vocabulary.provenance import record
 
     evidence, arguments = run.result.evidence, run.arguments
     settings: dict[str, Any] = {"average": arguments.average, "unit": arguments.unit}
@@ -441,25 +428,20 @@ def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
 
 
 def _write(run: Inspection, facts: dict[str, Any]) -> None:
-    from harness.report.findings import plain_json, write_findings
 
     mapped, beside = run.mapped, dict[str, Callable[[Path], object]]()
     count, limit = len(run.result.detections), told.threshold_text(run.threshold, run.result.evidence)
     subject = f"{len(mapped.merged.views_used)} views" if mapped else run.recordings[0].name
     title = f"{subject}: {count} findings beyond {limit}"
     if run.seen is not None:
-        from harness.inspection.gauge import csv_text
-        from harness.tables.outputs import GAUGE_ROWS
-
-        rows = run.seen.rows
-        beside[GAUGE_ROWS.name] = lambda path: path.write_text(csv_text(rows), encoding="utf-8")
+        table = HITS_AND_MISSES.frame(run.seen.rows).to_csv(index=False, float_format="%.6g", lineterminator="\n")
+        beside[GAUGE_ROWS.name] = lambda path: path.write_text(table, encoding="utf-8")
     if mapped is None:
         beside |= told.pictures(run.choices[0])
     else:
-        from harness.inspection.told import scene_of
         from harness.report.view3d import write_view3d
 
-        scene = scene_of(mapped, run.result)
+        scene = told.scene_of(mapped, run.result)
         beside["registrations.json"] = lambda path: path.write_text(plain_json(run.registrations), encoding="utf-8")
         beside["view3d.html"] = lambda path: write_view3d(path, scene, title)
         for number, choice in enumerate(run.choices, start=1):

@@ -9,21 +9,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from detectors.crop import AutoCrop, Choice, choice_of, described_text
+from harness.report.findings import Finding, Judged, save_targets
 from harness.report.view3d import Circle3d, Scene3d
 from harness.tables.text import Grid, show
-from harness.vocabulary.geometry import MM
+from harness.vocabulary.geometry import MM, Cloud
 
 if TYPE_CHECKING:
-    from detectors.crop import Choice
     from detectors.interface import Evidence
     from detectors.mapping.merge import Mapped
     from detectors.recordings import Recording
     from detectors.views import PreparedView
-    from harness.report.findings import Finding, Judged
-    from harness.vocabulary.geometry import Cloud
 
-WIDEST_NATIVE_PX = 6.5
-"""The widest filter of a known camera's own image averages 5 pixels; a measured reach scatters by one."""
+WIDEST_NATIVE_PX = 6.5  # Known cameras' own filters average 5 pixels at most; a measured reach scatters by one
 
 
 def mm(metres: float) -> str:
@@ -89,16 +87,12 @@ def capture_facts(recording: Recording, cloud: Cloud) -> dict[str, Any]:
 
 def choice_by(settings: object, cloud: Cloud) -> Choice | None:
     """Return the automatic crop's choice by settings; None with another crop. Raises UserError as the crop does."""
-    from detectors.crop import AutoCrop, choice_of
-
     config = getattr(settings, "crop", None)
     return choice_of(cloud, config) if isinstance(config, AutoCrop) and cloud.valid.any() else None
 
 
 def print_choice(choice: Choice | None) -> None:
     """Print the surface that was taken, and a line for each other candidate, with the option that takes it."""
-    from detectors.crop import described_text
-
     if choice is None or not choice.candidates:
         return
     texts = list(map(described_text, choice.candidates))
@@ -130,9 +124,6 @@ def choice_facts(choice: Choice | None) -> dict[str, Any] | None:
 
 def pictures(choice: Choice | None, name: str = "targets.png") -> dict[str, Callable[[Path], object]]:
     """Return the writer of the candidates' numbered picture by its name, for `report.findings.write_findings`."""
-    from detectors.crop import described_text
-    from harness.report.findings import save_targets
-
     if choice is None or not choice.candidates:
         return {}
     outlines = [candidate.outline for candidate in choice.candidates]

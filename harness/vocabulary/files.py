@@ -1,7 +1,6 @@
 """Files: read within limits, as strict JSON; written whole or not at all; locked by the system's own locks.
 
-A file may be made to fill the memory: most are refused by what they state, unread; libraries that believe what a file
-states run within `limited_memory`. All limits stand here."""
+A file may be made to fill the memory: most are refused unread; libraries run within `limited_memory`."""
 
 from __future__ import annotations
 
@@ -22,17 +21,12 @@ from typing import IO, Any, Literal
 
 from harness.vocabulary.errors import DiskFull, UserError
 
-FRAME_PIXELS = 64_000_000
-"""Pixels of one frame or picture, points of one cloud: sixty times the largest depth sensor; 1.5 GB as points."""
-ARRAYS_BYTES = 4 << 30
-"""All arrays that are unpacked from one ``.npz`` or ``.mat``: 5,800 frames of an Azure Kinect in 16 bits."""
-READING_BYTES = 5 << 30
-"""Memory that a library may take while it reads one file: `ARRAYS_BYTES`, and what unpacking them needs beside."""
+FRAME_PIXELS = 64_000_000  # Of a frame, picture or cloud: sixty times the largest depth sensor; 1.5 GB as points
+ARRAYS_BYTES = 4 << 30  # All arrays of one ``.npz`` or ``.mat``: 5,800 frames of an Azure Kinect in 16 bits
+READING_BYTES = 5 << 30  # Memory of a library that reads one file: `ARRAYS_BYTES`, and what unpacking needs beside
 PICTURE_BYTES = 512 << 20  # A picture's file: what `FRAME_PIXELS` of 48 bits need without compression, and more
-RECORD_BYTES = 256 << 20
-"""A study's record: three million inspections. As Python's values it is some 10 times as large."""
-TEXT_BYTES = 16 << 20
-"""A file of settings, poses, a calibration, or a bag's description: those written by programs have some kB."""
+RECORD_BYTES = 256 << 20  # A study's record: three million inspections; as Python's values 10 times as large
+TEXT_BYTES = 16 << 20  # A file of settings, poses, a calibration, a bag's description: mostly some kB
 TABLE_BYTES = 256 << 20  # A table of inspections: five million rows
 RAISE = "if the file is to be so large, raise the limit in harness/vocabulary/files.py"
 
@@ -137,8 +131,7 @@ NOT_WRITABLE |= {errno.ENAMETOOLONG, errno.EINVAL}
 @contextmanager
 def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Yield a temporary path beside ``path`` (same suffix); rename it on success, delete it on failure. ``durable``:
-    the content is on the disk before the rename, against power failures. Raises UserError where the folder cannot be
-    written or the disk is full."""
+    on the disk before the rename. Raises UserError where the folder cannot be written or the disk is full."""
     path = Path(path)
 
     def make() -> str:
@@ -238,8 +231,7 @@ def explained(error: OSError, path: Path) -> Exception:
     return error
 
 
-Answer = Literal["held", "busy", "no locks"]
-"""``busy``: another process holds it. ``no locks``: the system (Windows) or the file system knows none."""
+Answer = Literal["held", "busy", "no locks"]  # busy: by another process; none on Windows and some file systems
 
 
 def opened_lock(path: Path) -> IO[bytes]:

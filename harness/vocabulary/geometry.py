@@ -20,8 +20,7 @@ MM = 1e-3  # Metres in a millimetre
 INCH = 25.4e-3  # Metres in an inch (exact by definition)
 UW_CM2 = 1e-2  # Watts per square metre in a microwatt per square centimetre
 SPEED_OF_LIGHT_VACUUM = 299_792_458.0  # m/s, exact by definition
-REFRACTIVE_INDEX_AIR = 1.00027
-"""Air at 850 nm, 20 C, 101 kPa (Ciddor 1996, rounded): +-1e-5 over indoor weather, 10 um at 1 m."""
+REFRACTIVE_INDEX_AIR = 1.00027  # At 850 nm, 20 C, 101 kPa (Ciddor 1996): +-1e-5 over indoor weather, 10 um at 1 m
 SPEED_OF_LIGHT_AIR = SPEED_OF_LIGHT_VACUUM / REFRACTIVE_INDEX_AIR  # m/s in indoor air
 
 
@@ -48,8 +47,7 @@ def rotation_xyz_deg(about_x: float, about_y: float, about_z: float) -> np.ndarr
     ax, ay, az = np.deg2rad([about_x, about_y, about_z])
     rx = np.array([[1, 0, 0], [0, np.cos(ax), -np.sin(ax)], [0, np.sin(ax), np.cos(ax)]])
     ry = np.array([[np.cos(ay), 0, np.sin(ay)], [0, 1, 0], [-np.sin(ay), 0, np.cos(ay)]])
-    rz = np.array([[np.cos(az), -np.sin(az), 0], [np.sin(az), np.cos(az), 0], [0, 0, 1]])
-    return rz @ ry @ rx
+    return np.array([[np.cos(az), -np.sin(az), 0], [np.sin(az), np.cos(az), 0], [0, 0, 1]]) @ ry @ rx
 
 
 @dataclass(frozen=True)
@@ -78,17 +76,13 @@ class Region:
 
 
 UNDISTORT_STEPS = 200  # Fixed-point steps of the inversion: the Azure Kinect's corners converge to 1e-9 px within 60
-
-
-SAME_SLOPE = 1e-3
-"""Rays closer than this, in slope, are the same: where a lens' distortion turns back they differ by more."""
+SAME_SLOPE = 1e-3  # Rays closer in slope are the same: where a lens' distortion turns back they differ by more
 
 
 @dataclass(frozen=True)
 class Lens:
     """A central camera: pinhole with OpenCV's rational and Brown-Conrady distortion. ``distortion`` is (k1, k2, p1, p2,
-    k3, k4, k5, k6); zeros mean none. Pixel (0, 0) is the centre of the first pixel. Not modelled: tilted sensors,
-    thin-prism terms, anything that is not a single centre of projection."""
+    k3, k4, k5, k6); zeros: none. Pixel (0, 0) is the first one's centre. Not modelled: tilted sensors, thin prisms."""
 
     width: int
     height: int
@@ -117,8 +111,7 @@ class Lens:
             return np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy], axis=-1)
         pixels = np.stack([u.ravel(), v.ravel()], axis=-1)[:, None, :]
         stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, UNDISTORT_STEPS, 1e-10)
-        flat = cv2.undistortPoints(pixels, self.matrix, np.array(self.distortion), criteria=stop)
-        return flat.reshape(*u.shape, 2)
+        return cv2.undistortPoints(pixels, self.matrix, np.array(self.distortion), criteria=stop).reshape(*u.shape, 2)
 
     def region_slopes(self, region: Region) -> np.ndarray:
         """(x/z, y/z) through the pixel centres of a region, shape (h, w, 2)."""
@@ -187,8 +180,7 @@ class Reason(IntEnum):
 class Frame:
     """One exposure. ``z_m`` (h, w) float32: distance along the optical axis, NaN where invalid. ``reason`` (h, w) uint8
     of `Reason`. ``xy_m`` (h, w, 2) only where the source has no lens (a stored point cloud). ``rgb`` (h, w, 3) uint8
-    and ``amplitude`` (h, w) float32 where known. ``name`` says in messages which frame it is. ``notes``: how its stored
-    numbers were understood, where that was not plain."""
+    and ``amplitude`` (h, w) float32 where known. ``name`` is for messages. ``notes``: how stored numbers were read."""
 
     name: str
     z_m: np.ndarray
@@ -232,8 +224,7 @@ class LeftOut:
 @dataclass(frozen=True)
 class MapViews:
     """The views that a map was made from. ``T_cloud_cameras`` (k, 4, 4): their camera frames to the map's; ``shares``
-    (k,): their weights in it, which sum to 1. ``pixel_m``: along x and y the sides of a rectangle that spreads as far
-    as their pixels do on its surface."""
+    (k,): their weights in it, which sum to 1. ``pixel_m``: sides in x and y of what their pixels see of its surface."""
 
     T_cloud_cameras: np.ndarray
     shares: np.ndarray
@@ -249,8 +240,7 @@ class Cloud:
     rounding step of one frame's z. A map of several views is a cloud too: its frame is its maker's, with z away from
     the viewer. ``projection``: the grid's samples are "central" (rays through the origin, a camera) or "parallel"
     (equal cells in x and y, a map). ``mean_variance_m2`` (h, w): variance of the point's z itself, systematic parts
-    included, where its maker states it. ``noise_reach_px``: the side of the square over which filter and interpolation
-    blur noise; 0: not measured."""
+    included, where stated. ``noise_reach_px``: side of the square over which noise is blurred; 0: unknown."""
 
     points_m: np.ndarray
     reason: np.ndarray

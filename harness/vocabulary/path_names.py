@@ -55,8 +55,7 @@ def camera_title(name: str) -> str:
 
 
 def in_words(variant: str) -> str:
-    """Return a set-up's name as people read it: ``camera=kinect_v2, distance=0.5 m`` is "Kinect v2, distance 0.5 m",
-    and ``source.target.distance_m=0.5``, a variation's, "distance 0.5 m"."""
+    """Return a set-up's name as people read it: ``camera=kinect_v2, distance=0.5 m`` is "Kinect v2, distance 0.5 m"."""
     return ", ".join(_said(part) for part in re.split(r", (?=[^=,]+=)", variant))
 
 

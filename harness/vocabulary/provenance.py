@@ -59,8 +59,7 @@ def record(command: str) -> dict[str, Any]:
     return {"command": command, "commit": commit, "dirty": dirty, "versions": versions(), "machine": machine}
 
 
-RESULTS_VERSION = 1
-"""Stands in every file of a result folder that has no version of its own; raised when the tables' meaning changes."""
+RESULTS_VERSION = 1  # Of files without a version of their own; raised when the tables' meaning changes
 GENERATOR = f"tofpod results {RESULTS_VERSION}"  # Stands in pages
 STAMP = re.compile(r"#\s*tofpod (\w+)(.*)")
 
@@ -68,9 +67,8 @@ STAMP = re.compile(r"#\s*tofpod (\w+)(.*)")
 def check_version(
     found: object, known: int, path: Path, what: str, *, oldest: int | None = None, again: str | None = None
 ) -> int:
-    """The version of a file that can be read: from ``oldest`` (default: ``known``) to ``known``. ``what`` the file is,
-    with its article ("a record"). ``again``: what makes an older one anew, for the message. Raises UserError where it
-    is newer, older, missing or no version at all."""
+    """The version of a file that can be read: from ``oldest`` (default: ``known``) to ``known``. ``what`` the file is:
+    "a record". ``again``: what makes an older one anew. Raises UserError where it is newer, older, missing or none."""
     first = known if oldest is None else oldest
     legal, fix = f"version {known}" if first == known else f"versions {first} to {known}", again
     if isinstance(found, bool) or not isinstance(found, int) or found < 0:
