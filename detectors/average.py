@@ -174,9 +174,8 @@ class FrameSums:
         if not np.isfinite(shift):
             return "no pixel has a range"
         if abs(shift) > self.jump_m:
-            return (
-                f"the whole range jumps by {shift / MM:+.1f} mm against {against} (allowed {self.jump_m / MM:.1f} mm)"
-            )
+            allowed = f"(allowed {self.jump_m / MM:.1f} mm)"
+            return f"the whole range jumps by {shift / MM:+.1f} mm against {against} {allowed}"
         if fraction > self.fraction:
             changed = f"lost their range or changed by more than {self.change_m / MM:.1f} mm against {against}"
             return f"disturbed: {100 * fraction:.1f} % of the pixels {changed} (allowed {100 * self.fraction:.1f} %)"

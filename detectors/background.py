@@ -63,8 +63,7 @@ class Background:
 @dataclass(frozen=True)
 class _Cells:
     """``points`` (c, 3) metres: a ray through each cell and its median z; ``weights`` (c,); ``noise`` (c,): of a pixel
-    in the cell; ``level_noise``: of a median; ``of`` (n,): each point's cell or -1; ``side``: in the picture's
-    units."""
+    in it; ``level_noise``: of a median; ``of`` (n,): each point's cell or -1; ``side``: in the picture's units."""
 
     points: np.ndarray
     weights: np.ndarray

@@ -67,9 +67,7 @@ class Oracle:
 
     def _known(self) -> tuple[TrueDamage, ...]:
         if self._truth is None:
-            what = (
-                "the detector 'oracle' was not told the truth: it tests studies on simulated boards, and finds nothing"
-            )
+            what = "the detector 'oracle' was not told the truth: it tests studies on simulated boards alone"
             raise UserError(what, fix="use it in an experiment with a simulated source, or choose another detector")
         return self._truth
 

@@ -216,20 +216,13 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
                 outline = outline & ~grown(surfaces.filled[other], surfaces.reach_px)
         candidates.append(replace(described[number], outline=outline))
     against = [(place, *table[order[0]][other]) for place, other in enumerate(order[1:], start=2)]
-    doubts = [
-        f"{why} (--target {place} takes the other)"
-        for place, probability, why in against
-        if probability < DOUBTFUL_BELOW
-    ]
+    close = [(place, why) for place, probability, why in against if probability < DOUBTFUL_BELOW]
+    doubts = [f"{why} (--target {place} takes the other)" for place, why in close]
     doubts = [f"it is doubtful which surface is the target: {'; '.join(doubts)}"] if doubts else []
-    further = [
-        str(n) for n, each in enumerate(candidates[1:], start=2) if candidates[0].continues(each, surfaces.contact_m)
-    ]
+    further = [str(n) for n, each in enumerate(candidates[1:], 2) if candidates[0].continues(each, surfaces.contact_m)]
     if further:
-        doubts.append(
-            f"target {' and '.join(further)} lies in the plane of target 1 and may be a part of it: it is not judged"
-            " (--target takes it)"
-        )
+        also = f"target {' and '.join(further)} lies in the plane of target 1 and may be a part of it"
+        doubts.append(f"{also}: it is not judged (--target takes it)")
     return tuple(candidates), doubts
 
 
@@ -357,8 +350,8 @@ def crop(cloud: Cloud, config: AnyCrop) -> np.ndarray:
 
 
 def choice_of(cloud: Cloud, config: AutoCrop) -> Choice:
-    """Return the automatic crop of a cloud with a valid point, and all that it chose from. Raises UserError where there
-    is no candidate ``target``."""
+    """Return the automatic crop of a cloud with a valid point, and all that it chose from. Raises UserError without
+    the candidate ``target``."""
     grid, smooth_px, inset_px, wanted = cloud, config.smooth_px, config.inset_px, config.target
     if not cloud.organised:
         grid, rows, columns, spacings = raster(cloud.points_m[cloud.valid], cloud)

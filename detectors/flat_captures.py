@@ -129,12 +129,9 @@ def flattened(cloud: Cloud, mask: np.ndarray, name: str, T_first_camera: np.ndar
     residual_m, variance_m2 = np.full((2, *mask.shape), np.nan)
     residual_m[mask], variance_m2[mask] = off_m, noise_m2[mask] * length**2
     plane = np.linalg.lstsq(np.column_stack([slopes, np.ones(len(slopes))]), 1 / points[:, 2], rcond=None)[0]
-    distance_m, places_m = float(np.median(points[:, 2])), None
-    if T_first_camera is not None:
-        places_m = transform_points(T_first_camera, cloud.points_m)
-    return FlatCapture(
-        name, cloud.n_frames, distance_m, -plane / np.linalg.norm(plane), residual_m, variance_m2, places_m
-    )
+    distance_m, normal = float(np.median(points[:, 2])), -plane / np.linalg.norm(plane)
+    places_m = None if T_first_camera is None else transform_points(T_first_camera, cloud.points_m)
+    return FlatCapture(name, cloud.n_frames, distance_m, normal, residual_m, variance_m2, places_m)
 
 
 def separated(captures: Sequence[FlatCapture], lens: Lens) -> Separated:
@@ -160,10 +157,8 @@ def separated(captures: Sequence[FlatCapture], lens: Lens) -> Separated:
     lasts = [number for group in groups if len(group) > 1 for number in group[len(group) // 2 :]]
     in_time = _change(rests, variances, firsts, lasts)
     in_range = _change(rests, variances, groups[0], groups[-1]) if len(groups) > 1 else None
-    found = Separated(
-        field, tuple(captures), float(np.sqrt(shape_m2)) if len(captures) > 1 else np.nan, is_solved, in_time, in_range
-    )
-    return _with_doubts(found)
+    surface_m = float(np.sqrt(shape_m2)) if len(captures) > 1 else np.nan
+    return _with_doubts(Separated(field, captures, surface_m, is_solved, in_time, in_range))
 
 
 def _averaged(residuals: np.ndarray, variances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -258,9 +253,7 @@ def _with_doubts(found: Separated) -> Separated:
     if len(captures) == 1 or not _moved(captures):
         told = "one capture" if len(captures) == 1 else "nothing shows that the camera moved between the captures"
         told += ": the surface's own shape cannot be told from the pattern, and the surface is taken to be flat"
-        said.append(
-            f"{told} (move the camera by {LEAST_SHIFT_M / MM:.0f} mm or more; if along the surface, state --poses)"
-        )
+        said.append(f"{told} (move the camera by {LEAST_SHIFT_M / MM:.0f} mm; if along the surface, state --poses)")
     parts = ((found.in_time, "from the first captures to the last"), (found.in_range, "with distance"))
     changes = [(part, apart) for part, apart in parts if part is not None and part.is_change_of(rms_m)]
     # of two parts that scatter by t each, the mean is off a third one by 3/2 t^2, and their difference is 2 t^2

@@ -111,16 +111,11 @@ def save_flat_field(path: Path, field: FlatField) -> None:
     """Write the file, whole or not at all. Raises UserError where it cannot be written."""
     lens = field.lens
     numbers = [lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion]
+    held: dict[str, Any] = {name: getattr(field, name).astype(np.float32) for name in ("error_m", "variance_m2")}
+    held |= {"version": np.array(FLAT_FIELD_VERSION), "lens": np.array(numbers, float)}
+    held |= {"distances_m": np.array(field.distances_m), "warnings": np.array(json.dumps(field.warnings))}
     with atomic_path(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(
-            file,
-            version=np.array(FLAT_FIELD_VERSION),
-            error_m=field.error_m.astype(np.float32),
-            variance_m2=field.variance_m2.astype(np.float32),
-            lens=np.array(numbers, float),
-            distances_m=np.array(field.distances_m),
-            warnings=np.array(json.dumps(field.warnings)),
-        )
+        np.savez_compressed(file, **held)
 
 
 def load_flat_field(path: Path) -> FlatField:

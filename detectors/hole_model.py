@@ -30,8 +30,7 @@ MOST_STEPS, TOLERANCE = 40, 1e-5  # limits of a descent: its steps, and the rela
 DAMPING, LEAST_M, SMALLEST = 1e-3, 1e-9, 1e-18
 """Damping of the first step; deviation that is rounding of the arithmetic, and its square."""
 MODEL_ERROR, RADIUS_ERROR_PX, DEPTH_ERROR = 0.02, 0.05, 0.05
-"""Errors that light between wall and floor leaves on simulated clouds: a pixel's share of its depth, and parts of the
-fitted radius and depth."""
+"""Errors by light between wall and floor on simulated clouds: shares of a pixel's depth, and of the fitted sizes."""
 MOST_MISFIT = 1.5
 """Deviation of what the fit leaves beyond which the model fails: .3 to 1.05 on its own optics, 1.1 to 3 on others."""
 WALL_PRIOR = (0.5, 12.0**-0.5)
@@ -125,11 +124,8 @@ def _painted(
             tube, is_wall = length * NODES[node], NODES[node] < 1.0
             end = tube if is_wall else max(deepest, 0.0)
             weights[k] = share / cosine * (length * WEIGHTS[node] if is_wall else deepest - length)
-            scale, lit, below = (
-                1.0 / (1.0 + tube * shrink),
-                end / (end + emitter),
-                (end - tube) / (end - tube + emitter),
-            )
+            scale, lit = 1.0 / (1.0 + tube * shrink), end / (end + emitter)
+            below = (end - tube) / (end - tube + emitter)
             shift_u, shift_v = tube * drift_u * scale, tube * drift_v * scale
             layers[k, 0] = shift_u, shift_v, scale
             layers[k, 1] = -lit * beam_u, -lit * beam_v, 1.0
@@ -139,10 +135,8 @@ def _painted(
             bottom, top = v + radius * height * EDGES[s], v + radius * height * EDGES[s + 1]
             down = radius * height * MIDDLES[s]
             for k in range(len(weights)):
-                start, end = (
-                    slant * down - radius * HALF_CHORDS[s] * width,
-                    slant * down + radius * HALF_CHORDS[s] * width,
-                )
+                reach = radius * HALF_CHORDS[s] * width
+                start, end = slant * down - reach, slant * down + reach
                 for shift_u, shift_v, scale in layers[k]:
                     middle = shift_u + slant * (down - shift_v)
                     half = width * math.sqrt(max((radius * scale) ** 2 - ((down - shift_v) / height) ** 2, 0.0))
@@ -159,12 +153,6 @@ def _painted(
                     images[n, r, c] += along * across[c]
             across[first : last + 1] = 0.0
     return images
-
-
-@numba.njit(**PLAIN)
-def _steps(hole: np.ndarray) -> np.ndarray:
-    depth = hole[3] if hole[3] != 0.0 else STEP
-    return STEP * np.array([1.0, 1.0, hole[2], depth, -1.0 if hole[4] >= 0.5 else 1.0])
 
 
 @dataclass(frozen=True)
@@ -205,8 +193,12 @@ def fit_hole(patch: HolePatch, u: float, v: float, radius_m: float, depth_m: flo
     square = float((left**2).sum())
     if factor is None:
         return HoleFit(u, v, radius, depth, offset, wall, sandwich_covariance(patch, by.T, square), converged, 0.0)
-    variance = square / max(len(data) - 6, 1)
-    covariance = _likelihood_covariance(patch, hole, by.T, variance)
+    # the information's inverse times the variance of what is left, and the model's own errors
+    variance, information = square / max(len(data) - 6, 1), by.T @ by
+    information[5, 5] += WALL_PRIOR[1] ** -2
+    covariance = np.linalg.pinv(information, hermitian=True) * variance
+    covariance[2, 2] += RADIUS_ERROR_PX**2 * float(np.trace(patch.metric_m2)) / 2.0
+    covariance[3, 3] += (DEPTH_ERROR * depth) ** 2
     return HoleFit(u, v, radius, depth, offset, wall, covariance, converged, math.sqrt(variance))
 
 
@@ -265,7 +257,8 @@ def _left(q, data, used, factor, weight, low, high, view):  # type: ignore[no-un
 
 @numba.njit(**PLAIN)
 def _slopes(hole, used, factor, view):  # type: ignore[no-untyped-def]
-    holes, steps = np.empty((6, 5)), _steps(hole)
+    depth, holes = hole[3] if hole[3] != 0.0 else STEP, np.empty((6, 5))
+    steps = STEP * np.array([1.0, 1.0, hole[2], depth, -1.0 if hole[4] >= 0.5 else 1.0])
     for k in range(6):
         holes[k] = hole
         if k < 5:
@@ -288,17 +281,6 @@ def _whiten(factor: np.ndarray, columns: np.ndarray) -> None:
                 columns[i, k] -= factor[i, j] * columns[j, k]
         for k in range(columns.shape[1]):
             columns[i, k] /= factor[i, i]
-
-
-def _likelihood_covariance(patch: HolePatch, hole: np.ndarray, rows: np.ndarray, variance: float) -> np.ndarray:
-    """Return the covariance (6, 6) of (u, v, radius, depth, offset, wall) from whitened derivatives (6, n) by them and
-    the variance of what is left: the information's inverse times that variance, and the model's own errors."""
-    information = rows @ rows.T
-    information[5, 5] += WALL_PRIOR[1] ** -2
-    found = np.linalg.pinv(information, hermitian=True) * variance
-    found[2, 2] += RADIUS_ERROR_PX**2 * float(np.trace(patch.metric_m2)) / 2.0
-    found[3, 3] += (DEPTH_ERROR * hole[3]) ** 2
-    return np.asarray(found)
 
 
 def sandwich_covariance(patch: HolePatch, by: np.ndarray, square_m2: float) -> np.ndarray:

@@ -127,18 +127,10 @@ class LocalDetector:
         signed, typical_m, unit = self.scored(*residuals)
         judged = cell >= 0
         scores = on_grid(signed.ravel()[cell[judged]], judged)
-        return LocalEvidence(
-            score=np.abs(scores),
-            residual_m=ground.residual_m,
-            surface_z_m=ground.surface_z_m,
-            scale_m=typical_m,
-            notes={**ground.notes, "surface": ground.description, "points": int(judged.sum())},
-            warnings=(ground.warning,) if ground.warning else (),
-            behind=scores > 0,
-            unit=unit,
-            signed=signed,
-            cell=cell,
-        )
+        notes = {**ground.notes, "surface": ground.description, "points": int(judged.sum())}
+        warnings = (ground.warning,) if ground.warning else ()
+        plain = np.abs(scores), ground.residual_m, ground.surface_z_m, typical_m, notes, warnings, scores > 0, unit
+        return LocalEvidence(*plain, signed, cell)
 
     def scored(
         self, residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]

@@ -69,9 +69,8 @@ def parts_with(mask: np.ndarray, seeds: np.ndarray, connectivity: int = 8, least
 
 def nearest_pixel(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distance of each pixel (h, w) to the mask, in pixels, and the flat index of the mask's nearest one."""
-    apart, labels = cv2.distanceTransformWithLabels(
-        (~mask).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
-    )
+    beyond = (~mask).astype(np.uint8)
+    apart, labels = cv2.distanceTransformWithLabels(beyond, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
     inside = np.flatnonzero(mask)
     flat = np.zeros(len(inside) + 1, dtype=np.int64)
     flat[labels.reshape(-1)[inside]] = inside

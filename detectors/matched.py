@@ -60,8 +60,7 @@ QUIET_SIGMAS = 4.0
 CLIP_SIGMAS = 5.0
 """Deviations beyond which no pixel counts for more than its neighbours: a flying pixel alone is no finding."""
 STRONG, LOUD_SIGMAS, MARGIN_PX = 6.0, 3.0, 2
-"""A peak of this score, the louder pixels joined to it, and those around them are taken out; the rest is judged
-again."""
+"""A peak of this score, the louder pixels joined to it, and those around are taken out; the rest is judged again."""
 LOUD_SHARE = 0.5
 """The loud pixels at a peak fill at least this share of its template's disc."""
 ALONE_PX = 7
@@ -141,9 +140,8 @@ class MatchedDetector(LocalDetector):
 
     def correlation(self, evidence: Evidence) -> np.ndarray:
         """Return the learned correlation of the noise by lag, or that of the residuals."""
-        covariance = self._covariance
+        covariance, known = self._covariance, np.isfinite(evidence.residual_m)
         if covariance is None:
-            known = np.isfinite(evidence.residual_m)
             residual_m = np.where(known, evidence.residual_m, 0.0)
             covariance = _covariance(_in_deviations(residual_m, known.astype(np.float32), (0.0, 0.0))[0], known)
         reach = np.arange(-whitening.LONGEST_LAG_PX, whitening.LONGEST_LAG_PX + 1)
@@ -214,9 +212,8 @@ def _judged(values: np.ndarray, known: np.ndarray, covariance: np.ndarray | None
     signed, by, _ = _scored(tamed * seen, seen, noise, start=solved)
     _fill_discs(signed, radius_px[by])
     signed = np.where(core, taken, np.where(known, signed, 0.0))
-    behind, before = (
-        cv2.dilate(np.maximum(each, 0.0), np.ones((2 * RIM_PX + 1,) * 2, np.uint8)) for each in (signed, -signed)
-    )
+    reach = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
+    behind, before = (cv2.dilate(np.maximum(each, 0.0), reach) for each in (signed, -signed))
     lobe = np.abs(signed) < LOBE_SHARE * np.where(signed > 0, before, behind)
     return np.where(lobe, 0.0, signed).astype(np.float64), noise.worths[0].energy ** -0.5
 
@@ -356,20 +353,13 @@ def _capped(score: np.ndarray, zone: np.ndarray, loud: np.ndarray, zones: int) -
 
 
 @numba.njit(**PLAIN)
-def _keep_stronger(
-    signed: np.ndarray,
-    by: np.ndarray,
-    score: np.ndarray,
-    zone: np.ndarray,
-    per_deviation: np.ndarray,
-    raised: float,
-    down: int,
-    right: int,
-    number: int,
-) -> None:
+def _keep_stronger(  # type: ignore[no-untyped-def]
+    signed, by, score, zone, per_deviation, raised, down, right, number
+):
     """Keep of each pixel's scores (r, c) the larger in size, and that template's ``number``. Scores are brought to
-    deviations of their ``zone`` (r, c), and raised: their squares grow by ``raised``, below `FAINT` in proportion.
-    Those of a template between pixels, ``down`` or to the ``right``, belong to all pixels round about."""
+    deviations of their ``zone`` (r, c) by the factors ``per_deviation`` (z,), and raised: their squares grow by
+    ``raised``, below `FAINT` in proportion. Those of a template between pixels, ``down`` or to the ``right``, belong to
+    all pixels round about."""
     faint = per_deviation * np.float32(np.sqrt(1.0 + raised / FAINT**2))
     height, width = score.shape
     for y in range(down + 1):
@@ -420,9 +410,7 @@ def _cores(
     loud = known & (np.abs(values) > LOUD_SIGMAS)
     around = (cv2.blur(each, (3, 3)) for each in (values, known.astype(np.float32)))
     smooth = next(around) / np.maximum(next(around), 0.1)
-    count, parts, stats, _ = cv2.connectedComponentsWithStats(
-        cv2.dilate(loud.astype(np.uint8), np.ones((3, 3), np.uint8))
-    )
+    count, parts, stats, _ = cv2.connectedComponentsWithStats(grown(loud, 1).astype(np.uint8))
     score = np.zeros(count)
     for row, column in peaks.tolist():
         for number in np.unique(parts[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]):

@@ -99,14 +99,9 @@ def measure_extents(cloud: Cloud, detection: Detection, note: str) -> Measuremen
 
 
 def measure_detection(
-    cloud: Cloud,
-    evidence: Evidence,
-    detection: Detection,
-    config: HoleModelConfig,
-    correlation: np.ndarray | None = None,
+    cloud: Cloud, evidence: Evidence, detection: Detection, config: HoleModelConfig, by_lag: np.ndarray | None = None
 ) -> Measurement:
-    """Measure one detection both ways; NaN and a note where a measure cannot be made. ``correlation`` of noise by
-    lag."""
+    """Measure one detection both ways; NaN and a note where one cannot be made. ``by_lag``: the noise's correlation."""
     if not cloud.organised:
         return measure_extents(cloud, detection, "no pixel grid: extents only")
     placed = measure_extents(cloud, detection, "too few valid pixels around for a model")
@@ -120,7 +115,7 @@ def measure_detection(
     volume = float((around.patch.residual_m[near] - around.offset_m).sum()) * float(abs(ax * by - ay * bx))
     length_m, width_m, along = _sides(around, near)
     placed = replace(placed, volume_m3=volume, length_m=length_m, width_m=width_m, along=along)
-    around = replace(around, patch=replace(around.patch, correlation=correlation))
+    around = replace(around, patch=replace(around.patch, correlation=by_lag))
     fit, doubt = _modelled(around, config)
     if fit is None:
         return _by_contour(placed, around, doubt)
@@ -309,9 +304,8 @@ def _by_contour(measured: Measurement, around: _Surroundings, doubt: str) -> Mea
         return replace(measured, model_note=doubt + "; no half-depth contour")
     v, u = (float((axis.mean() + 0.5) / CONTOUR_ZOOM - 0.5) for axis in np.nonzero(inside))
     area = inside.sum() / CONTOUR_ZOOM**2 * around.area_m2
-    return replace(
-        around.placed(measured, u, v),
-        model_diameter_m=2.0 * float(np.sqrt(area / np.pi)),
-        model_depth_m=np.nan if hollow.sum() > around.own.sum() else around.sign * around.peak_m,
-        model_note=doubt + "; from the contour at half depth, without standard errors",
-    )
+    diameter_m = 2.0 * float(np.sqrt(area / np.pi))
+    depth_m = np.nan if hollow.sum() > around.own.sum() else around.sign * around.peak_m
+    note = doubt + "; from the contour at half depth, without standard errors"
+    placed = around.placed(measured, u, v)
+    return replace(placed, model_diameter_m=diameter_m, model_depth_m=depth_m, model_note=note)

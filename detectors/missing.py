@@ -163,22 +163,17 @@ def measure_missing(cloud: Cloud, evidence: Evidence, detection: Detection) -> M
     if placed is None:
         raise ValueError("the detection is none that `missing_returns` made of this cloud")
     centre, pixel_m2 = placed
-    reasons = np.bincount(cloud.reason.ravel()[detection.pixels])
-    return Measurement(
-        u_px=float(columns.mean()) + cloud.region.col0,
-        v_px=float(rows.mean()) + cloud.region.row0,
-        points=len(detection.pixels),
-        score=detection.score,
-        extent_diameter_m=2.0 * float(np.sqrt(len(rows) * pixel_m2 / np.pi)),
-        extent_centre_m=centre,
-        model_note=f"no return: {REASONS.get(int(reasons.argmax()), 'no light came back')}",
-    )
+    u, v = float(columns.mean()) + cloud.region.col0, float(rows.mean()) + cloud.region.row0
+    diameter_m = 2.0 * float(np.sqrt(len(rows) * pixel_m2 / np.pi))
+    reason = int(np.bincount(cloud.reason.ravel()[detection.pixels]).argmax())
+    note = f"no return: {REASONS.get(reason, 'no light came back')}"
+    return Measurement(u, v, len(detection.pixels), detection.score, diameter_m, centre, model_note=note)
 
 
 def _clusters(missing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return labels (h, w) of clusters joined along rows and columns, and their sizes by label; 0 is no cluster."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(missing.astype(np.uint8), connectivity=4)
-    sizes = stats[:count, cv2.CC_STAT_AREA].astype(np.int64)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(missing.astype(np.uint8), connectivity=4)
+    sizes = stats[:, cv2.CC_STAT_AREA].astype(np.int64)
     sizes[0] = 0
     return labels, sizes
 

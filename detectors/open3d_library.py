@@ -24,11 +24,9 @@ def load_open3d() -> Any:
         package = next((package for library, package in DEBIAN_PACKAGES.items() if library in str(error)), None)
         if package is None:
             raise
-        raise MissingLibrary(
-            f"this needs Open3D, which cannot start: {error}",
-            legal=f"a system with the libraries of the Debian packages {', '.join(DEBIAN_PACKAGES.values())}",
-            fix=f"apt install {package}",
-        ) from error
+        what, legal = f"this needs Open3D, which cannot start: {error}", ", ".join(DEBIAN_PACKAGES.values())
+        legal = f"a system with the libraries of the Debian packages {legal}"
+        raise MissingLibrary(what, legal=legal, fix=f"apt install {package}") from error
     return open3d
 
 

@@ -75,10 +75,8 @@ class PlaneRansacDetector(ScoreMapDetector[PlaneRansacConfig]):
         fitted = -(a * points[:, 0] + b * points[:, 1] + d) / c
         residual = points[:, 2] - fitted
         scale = max(sigma_of(residual), rounding_floor(cloud, mask))
-        supported = float(np.mean(np.abs(residual * c) <= self.settings.inlier_mm * MM))
-        notes = {"surface": "plane", "points": len(points), "supporting_share": supported}
         score, residual_m, z_m = (on_grid(each, mask) for each in (np.abs(residual) / scale, residual, fitted))
-        return Evidence(score, residual_m, z_m, scale, notes)
+        return Evidence(score, residual_m, z_m, scale, {"surface": "plane", "points": len(points)})
 
     def _plane(self, points: np.ndarray) -> tuple[float, ...]:
         """Return (a, b, c, d) of the plane a x + b y + c z + d = 0, of least squares over its supporting points."""
@@ -152,15 +150,10 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
             share = f"{100 * alone:.0f} % of the target"
             warnings.append(f"{share} has no counterpart in {notes['surface']} and is not judged")
         notes |= {"points": len(points), "registration_error_m": error_m, "without_counterpart": alone}
-        return Evidence(
-            score=np.abs(signed),
-            residual_m=on_grid(points[:, 2] - feet[:, 2], mask),
-            surface_z_m=on_grid(feet[:, 2], mask),
-            scale_m=median_of(deviation_m[judged]),
-            notes=notes,
-            warnings=tuple(filter(None, warnings)),
-            behind=signed > 0,
-        )
+        residual_m, z_m = (on_grid(each, mask) for each in (points[:, 2] - feet[:, 2], feet[:, 2]))
+        scale_m = median_of(deviation_m[judged])
+        told = tuple(filter(None, warnings))
+        return Evidence(np.abs(signed), residual_m, z_m, scale_m, notes, told, behind=signed > 0)
 
     def places(self, points_m: np.ndarray) -> np.ndarray:
         """Return the places across the view, so that a rim and what lies deep behind it are one finding."""
@@ -189,14 +182,10 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
         py4dgeo = _py4dgeo()
         with threadpoolctl.threadpool_limits(1, user_api="openmp"):
             epochs = tuple(py4dgeo.Epoch(np.ascontiguousarray(points)) for points in (before, after))
-            measured = py4dgeo.M3C2(
-                epochs=epochs,
-                corepoints=np.ascontiguousarray(feet),
-                normal_radii=(self.settings.normal_radius_mm * MM,),
-                cyl_radius=self.settings.cylinder_radius_mm * MM,
-                max_distance=self.settings.reach_mm * MM,
-                registration_error=0.0,
-            )
+            normal_m, radius_m = self.settings.normal_radius_mm * MM, self.settings.cylinder_radius_mm * MM
+            sizes = {"normal_radii": (normal_m,), "cyl_radius": radius_m, "max_distance": self.settings.reach_mm * MM}
+            core = np.ascontiguousarray(feet)
+            measured = py4dgeo.M3C2(epochs=epochs, corepoints=core, registration_error=0.0, **sizes)
             distance, uncertainty = measured.run()
         few = np.minimum(uncertainty["num_samples1"], uncertainty["num_samples2"]) < LEAST_SAMPLES
         return np.where(few, np.nan, distance), uncertainty["lodetection"] / LOD_SIGMAS
@@ -274,15 +263,10 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
         features, _, _ = self._features(cloud, mask)
         score = nearest(features, self._learned["memory"]) / max(float(self._learned["unit"]), 1e-9)
         ground = background(cloud, mask, self.settings.surface)
-        scale_m = sigma_of(ground.residual_m[np.isfinite(ground.residual_m)])
-        return Evidence(
-            score=on_grid(score, mask),
-            residual_m=ground.residual_m,
-            surface_z_m=ground.surface_z_m,
-            scale_m=max(scale_m, rounding_floor(cloud, mask)),
-            notes={"surface": ground.description, "points": len(score), "memory": len(self._learned["memory"])},
-            unit="the median distance of an undamaged target's features from the memory, which is no length",
-        )
+        scale_m = max(sigma_of(ground.residual_m[np.isfinite(ground.residual_m)]), rounding_floor(cloud, mask))
+        notes = {"surface": ground.description, "points": len(score), "memory": len(self._learned["memory"])}
+        unit = "the median distance of an undamaged target's features from the memory, which is no length"
+        return Evidence(on_grid(score, mask), ground.residual_m, ground.surface_z_m, scale_m, notes, unit=unit)
 
     def _features(self, cloud: Cloud, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the averaged features (n, 33) of the masked points, and their rows and columns (n,)."""

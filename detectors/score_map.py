@@ -55,13 +55,11 @@ class ScoreMapDetector(ABC, Generic[S]):
         pixels = above(evidence, thresholds[0])
         pixels = pixels[cloud.valid.reshape(-1)[pixels]]
         points, scores = cloud.points_m.reshape(-1, 3)[pixels], evidence.score.reshape(-1)[pixels]
-        levels = [*zip(*self._clusters(self.places(points), scores, thresholds), strict=True)]
         found = []
-        for labels, strengths in levels:
-            count = int(labels.max(initial=-1)) + 1
-            kept = labels >= 0
-            of_kept = points[kept], labels[kept]
-            found.append(Findings(strengths[:count], pixels[kept], of_kept[1], centres_of(*of_kept, count)))
+        for labels, strengths in zip(*self._clusters(self.places(points), scores, thresholds), strict=True):
+            count, kept = int(labels.max(initial=-1)) + 1, labels >= 0
+            centres_m = centres_of(points[kept], labels[kept], count)
+            found.append(Findings(strengths[:count], pixels[kept], labels[kept], centres_m))
         return found
 
     def quiet_threshold(self, cloud: Cloud, evidence: Evidence) -> float:

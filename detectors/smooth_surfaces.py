@@ -77,7 +77,8 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
     weight = cv2.blur(valid.astype(np.float64), size, borderType=cv2.BORDER_REFLECT)
     smooth = cv2.blur(np.where(valid[..., None], points, 0.0), size, borderType=cv2.BORDER_REFLECT)
     smooth = np.asarray(smooth / np.maximum(weight, 1e-12)[..., None])
-    central = sees_from_origin(cloud)
+    # whether the grid samples rays through the origin, as a camera does
+    central = cloud.projection == "central" and _before_lens(cloud.points_m[np.isfinite(z)])
     if noise_m <= pitch_m:
         right, down = links(points, MAX_SURFACE_TILT, STEP_SIGMAS * noise_m, central)
     else:
@@ -104,11 +105,6 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
     _trim_rims(own, cores, seen, local, window, reach, contact_m)
     filled = np.array([holes_filled(each) for each in own]) if len(own) else own.copy()
     return Surfaces(own & seen, filled, contact_m, reach)
-
-
-def sees_from_origin(cloud: Cloud) -> bool:
-    """Return whether the cloud's grid samples rays through the origin, as a camera does."""
-    return cloud.projection == "central" and _before_lens(cloud.points_m[np.isfinite(cloud.points_m[..., 2])])
 
 
 def _before_lens(points: np.ndarray) -> bool:

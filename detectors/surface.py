@@ -132,9 +132,8 @@ def fit_surface(x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray, config: Surfa
     fewer points than coefficients, or where all points lie on a line."""
     terms = (2 * config.degree + 1) if config.drop_cross_terms else (config.degree + 1) * (config.degree + 2) // 2
     if len(z_m) < terms:
-        what = (
-            f"{len(z_m)} valid points cannot determine the {terms} coefficients of a surface of degree {config.degree}"
-        )
+        degree = f"a surface of degree {config.degree}"
+        what = f"{len(z_m)} valid points cannot determine the {terms} coefficients of {degree}"
         legal, fix = f"{terms} points at least", "widen the crop, lower surface.degree, or check the capture"
         raise UserError(what, legal=legal, fix=fix)
     xy = np.column_stack([x_m, y_m]).astype(np.float64)
@@ -160,11 +159,9 @@ def fit_surface(x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray, config: Surfa
     return Surface(chebyshev, c, note)
 
 
-def _solved(
-    basis: np.ndarray, z: np.ndarray, weights: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray] | None:
+def _solved(basis: np.ndarray, z: np.ndarray, weight: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the weighted least-squares solution (p,) of a basis (p, n) and Cholesky's factor (p, p), or None."""
-    weighted = basis if weights is None else basis * weights
+    weighted = basis if weight is None else basis * weight
     factor = _factor(weighted @ basis.T)
     return None if factor is None else (cho_solve((factor, True), weighted @ z, check_finite=False), factor)
 

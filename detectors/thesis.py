@@ -1,7 +1,6 @@
 """The thesis' detector: points farther from a surface than k deviations, in clusters at 10 mm. The text's variant:
 robust cubic, robust deviations of the residual. The script's: ``surface: {method: least_squares, drop_cross_terms:
-true}, scale: raw_z_std``, at k = 1.2. `highest_before` excludes all outliers that are no damage, as the text also
-asks."""
+true}, scale: raw_z_std``, at k = 1.2. `highest_before` excludes outliers that are no damage, as the text also asks."""
 
 from __future__ import annotations
 
@@ -71,17 +70,13 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
     def _before_background(self, cloud: Cloud, mask: np.ndarray) -> Evidence:
         """Analyse with a surface whose shape is chosen: one unit of score is the noise round about each pixel."""
         behind = background(cloud, mask, self.settings.surface)
-        unit = np.maximum(behind.noise_m, rounding_floor(cloud, mask))
-        stated = self._stated_deviation(cloud, mask)
+        unit, stated = np.maximum(behind.noise_m, rounding_floor(cloud, mask)), self._stated_deviation(cloud, mask)
         if stated is not None:
-            deviation = on_grid(stated, mask)
-            known = np.isfinite(behind.residual_m)
-            spread = sigma_of(behind.residual_m[known] / deviation[known])
-            unit = np.maximum(unit, spread * deviation)
+            deviation, known = on_grid(stated, mask), np.isfinite(behind.residual_m)
+            unit = np.maximum(unit, sigma_of(behind.residual_m[known] / deviation[known]) * deviation)
         score, notes = np.abs(behind.residual_m) / unit, {"surface": behind.description, **behind.notes}
         warnings = (behind.warning,) if behind.warning else ()
-        scale_m = float(np.nanmedian(unit))
-        return Evidence(score, behind.residual_m, behind.surface_z_m, scale_m, notes, warnings)
+        return Evidence(score, behind.residual_m, behind.surface_z_m, float(np.nanmedian(unit)), notes, warnings)
 
     def _stated_deviation(self, cloud: Cloud, mask: np.ndarray) -> np.ndarray | None:
         """Return the standard deviation (n,) that the cloud states of each point, metres."""

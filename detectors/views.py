@@ -30,11 +30,9 @@ class PreparedView:
     @property
     def points_m(self) -> np.ndarray:
         """(n, 3) the target's points, camera frame of this view, in the order of the grid."""
-        points: np.ndarray = self.view.cloud.points_m[self.inside]
-        return points
+        return np.asarray(self.view.cloud.points_m[self.inside])
 
     @property
     def mark_points_m(self) -> np.ndarray:
         """(m, 3) the fiducial cloud: valid points of the fiducial colour."""
-        points: np.ndarray = self.view.cloud.points_m.reshape(-1, 3)[self.marks.points]
-        return points
+        return np.asarray(self.view.cloud.points_m.reshape(-1, 3)[self.marks.points])

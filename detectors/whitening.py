@@ -212,11 +212,9 @@ def worths(power: np.ndarray, window_px: int) -> tuple[Worth, ...]:
         reach = np.sqrt(3.0 * np.stack((along, down), axis=1) / energy[:, None]) * side / (2.0 * math.pi)
         halves = np.array(SIDES_PX)[np.abs(np.array(SIDES_PX) - reach[..., None]).argmin(axis=2)]
         # maxima are as dense as the root of the score's second spectral moments (Adler 1981)
-        moments = (
-            energies.sum(axis=2) @ np.fft.fftfreq(side) ** 2,
-            energies.sum(axis=1) @ (np.arange(values.shape[2]) / side) ** 2,
-        )
-        crowds += (np.sqrt(moments[0] * moments[1]) / energy * side**2).tolist()
+        of_rows = energies.sum(axis=2) @ np.fft.fftfreq(side) ** 2
+        of_columns = energies.sum(axis=1) @ (np.arange(values.shape[2]) / side) ** 2
+        crowds += (np.sqrt(of_rows * of_columns) / energy * side**2).tolist()
         found += [
             Worth(each / GRID**2, (2 * across + 1, 2 * along + 1), 0.0)
             for each, (across, along) in zip(energy.tolist(), halves.tolist(), strict=True)

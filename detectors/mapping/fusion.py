@@ -154,8 +154,7 @@ def combine(
 def _outliers(heights: np.ndarray, variances: np.ndarray) -> np.ndarray:
     """(k, h, w) bool: observations more than `GATE_SIGMAS` deviations (their own, or the robust spread of the views, if
     that is larger) from the median of at least three views, where they cannot be damage: as far before the fitted
-    surface, where damage would have been in the others' way; or behind, but alone among its own neighbours, as a flying
-    pixel is."""
+    surface, where damage would have been in the others' way; or behind, but alone among its neighbours."""
     middle = pixel_medians(heights)
     deviation = heights - middle
     limit = GATE_SIGMAS * np.maximum(1.4826 * pixel_medians(np.abs(deviation)), np.sqrt(variances))
@@ -213,16 +212,11 @@ def fuse(
         correlation = _neighbour_correlation(view)
         kept = correlation + (1.0 - correlation) * raster.concentration
         in_view = rays @ view.T_map_view[:3, :3]
+        by_sensor = values[..., 1] * kept * per_range**2
         by_registration = _registration_variance(view.chosen, points, gradient, T_reference_map)
-        observed.append(
-            (
-                values[..., 0],
-                values[..., 1] * kept * per_range**2,
-                (LATERAL_PX * view.pitch_m) ** 2 * across + by_registration,
-                in_view[..., :2] / in_view[..., 2:] / views[0].slope_step,
-                values[..., 2:],
-            )
-        )
+        by_others = (LATERAL_PX * view.pitch_m) ** 2 * across + by_registration
+        look_px = in_view[..., :2] / in_view[..., 2:] / views[0].slope_step
+        observed.append((values[..., 0], by_sensor, by_others, look_px, values[..., 2:]))
     heights, sensor, other, looks_px, more = (np.stack(each) for each in zip(*observed, strict=True))
     found = combine(heights, sensor, other, looks_px, repeated, grid.step)
 
@@ -317,8 +311,7 @@ def depth_noise(cloud: Cloud, inside: np.ndarray, deviation_m: np.ndarray) -> tu
     sample variances of repeated frames inside the target. The law is v = k q + c with q = 1 / amplitude^2 (phase noise:
     Lange and Seitz 2001), or the range to the fourth where a tenth of the points has no amplitude; a pixel's own sample
     variance would favour pixels quiet by chance. ``deviation_m`` (h, w): z less the view's own smooth surface, whose
-    squares stand in for the variances of a single frame. Not modelled: noise that frames share, multipath, the
-    pattern."""
+    squares stand in for the variances of a single frame. Not modelled: noise that frames share, multipath, pattern."""
     from scipy.optimize import nnls
     from scipy.stats import chi2
 

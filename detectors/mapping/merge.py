@@ -42,8 +42,7 @@ BLOCK, BLOCKS_AT_FIRST = 8, 4096
 def integrate(views: Sequence[ChosenView], voxel_m: float | None) -> tuple[Cloud, tuple[str, ...]]:
     """Return an unorganised cloud in the first view's frame, the field's zero crossings, sorted by x, y, z; and notes.
     ``count`` is 1, ``variance_m2`` of all points the median variance of one frame's z over the views' targets, for the
-    floor that rounding sets. Raises UserError where the field holds no surface, or the targets determine no smooth
-    one."""
+    floor that rounding sets. Raises UserError where the field or the targets hold no smooth surface."""
     clouds = [view.cloud for view in views]
     z = clouds[0].points_m[views[0].inside][:, 2]
     pitch = float(np.median(z)) * views[0].slope_step
@@ -71,8 +70,7 @@ def integrate(views: Sequence[ChosenView], voxel_m: float | None) -> tuple[Cloud
 
 
 def _undistorted(view: ChosenView) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-    """Depth (h, w, 1) float32, 0 where there is none, on a pinhole's grid; colour (h, w, 3) 0..1 if any; camera
-    matrix."""
+    """Depth (h, w, 1) float32, 0 for none, on a pinhole's grid; colour (h, w, 3) 0..1 if any; camera matrix."""
     cloud, inside = view.cloud, view.inside
     with np.errstate(invalid="ignore"):
         slopes = cloud.points_m[..., :2] / cloud.points_m[..., 2:]
@@ -125,8 +123,8 @@ def _facing(views: Sequence[ChosenView], points_m: np.ndarray, normals: np.ndarr
     face = surface.gradients(x, y, pitch_m)
     face /= np.linalg.norm(face, axis=1, keepdims=True)
     turned = normals @ T_reference_map[:3, :3]
-    along: np.ndarray = np.abs(np.einsum("ni,ni->n", turned, face))
-    return along >= np.cos(np.deg2rad(WALL_DEG)) * np.linalg.norm(turned, axis=1)
+    along = np.abs(np.einsum("ni,ni->n", turned, face))
+    return np.asarray(along >= np.cos(np.deg2rad(WALL_DEG)) * np.linalg.norm(turned, axis=1))
 
 
 SEVERAL = -1
@@ -168,13 +166,9 @@ class Mapped:
             return np.where(seen.sum(axis=0) == 1, seen.argmax(axis=0), SEVERAL)
         points = merged.cloud.points_m.reshape(-1, 3)
         known = np.isfinite(points).all(axis=1)
-        distances = np.stack(
-            [
-                cKDTree(transform_points(each.T_reference_view, view.points_m)).query(points[known])[0]
-                for view, each in zip(self.views, self.registrations, strict=True)
-                if each.view in merged.views_used
-            ]
-        )
+        pairs = zip(self.views, self.registrations, strict=True)
+        used = (transform_points(T.T_reference_view, view.points_m) for view, T in pairs if T.view in merged.views_used)
+        distances = np.stack([cKDTree(placed).query(points[known])[0] for placed in used])
         least, second = np.sort(np.vstack([distances, np.full(known.sum(), np.inf)]), axis=0)[:2]
         indices = np.full(count, SEVERAL)
         indices[known] = np.where(second <= 2 * least, SEVERAL, distances.argmin(axis=0))
@@ -223,8 +217,7 @@ def _on_grid(views: Sequence[ChosenView], step_m: float) -> Cloud:
     overlap of the clouds' axis-parallel bounding boxes is divided into boxes from its lowest corner; each box with
     points becomes their plain mean, in place and in colour; points beyond the overlap stay. Of more than two clouds all
     go into one grid, over the union of the pairwise overlaps, where pcmerge called in turn would weight a late cloud
-    more. ``count``: samples of all points of a box; ``variance_m2``: their mean variance; ``n_frames``: the least of
-    all views."""
+    more. ``count``: samples of all points of a box; ``variance_m2``: their mean variance; ``n_frames``: the least."""
     limits = [(view.points_reference_m.min(axis=0), view.points_reference_m.max(axis=0)) for view in views]
     # x, y, z, red, green, blue, amplitude, samples, samples times variance, number of points
     columns = np.concatenate([_columns(view) for view in views])

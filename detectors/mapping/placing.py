@@ -58,8 +58,7 @@ class Raster:
     @property
     def concentration(self) -> np.ndarray:
         """(h, w) sum of squares of the samples' weights: by what independent errors shrink in variance."""
-        squares: np.ndarray = np.asarray(self.weights.multiply(self.weights).sum(axis=1)).reshape(self.shape)
-        return squares
+        return np.asarray(self.weights.multiply(self.weights).sum(axis=1), np.float64).reshape(self.shape)
 
 
 def raster_between(places: np.ndarray, valid: np.ndarray, organised: bool, spacing: float, grid: CellGrid) -> Raster:
@@ -101,8 +100,7 @@ def _of_points(places: np.ndarray, valid: np.ndarray) -> np.ndarray:
     known = np.flatnonzero(valid)
     triangles = known[Delaunay(places[known]).simplices.astype(np.int64)]
     lengths = np.linalg.norm(places[triangles] - places[np.roll(triangles, 1, axis=1)], axis=-1)
-    short: np.ndarray = (lengths <= LONGEST_EDGE * np.median(lengths)).all(axis=1)
-    return triangles[short]
+    return triangles[(lengths <= LONGEST_EDGE * np.median(lengths)).all(axis=1)]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -189,8 +187,8 @@ def T_reference_map_of(first: ChosenView) -> np.ndarray:
     stands before the place where the optical axis meets the plane, as far from it as the camera; where the axis meets
     no target, before the target's middle."""
     points = _some(first.cloud.points_m[first.inside], FIT_POINTS)
-    x, y = points[:, 0], points[:, 1]
-    plane = fit_surface(x, y, points[:, 2], SurfaceConfig(degree=1))
+    x, y, z = points.T
+    plane = fit_surface(x, y, z, SurfaceConfig(degree=1))
     z0, zx, zy = plane.evaluate(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
     normal = np.array([z0 - zx, z0 - zy, 1.0])
     normal /= np.linalg.norm(normal)
@@ -217,9 +215,8 @@ def common_surface(views: Sequence[ChosenView], T_reference_map: np.ndarray) -> 
 
 def place(view: ChosenView, T_reference_map: np.ndarray, surface: Surface) -> PlacedView:
     """Follow each pixel's ray from its point to the surface. Two steps: what is left is the square of the surface's
-    slope times the deviation (0.3 % of it at 3 degrees). Pixels are measured by medians; without a grid as if the
-    points lay on a square one. A pixel is the parallelogram J of its steps by u and v, of variance (Jxu^2 + Jxv^2) / 12
-    along x."""
+    slope times the deviation (0.3 % of it at 3 degrees). Pixels are measured by medians; without a grid as if points
+    lay on a square one. A pixel is the parallelogram J of its steps, of variance (Jxu^2 + Jxv^2) / 12 along x."""
     T_map_view = invert(T_reference_map) @ view.registration.T_reference_view
     inside = view.inside
     points = transform_points(T_map_view, view.cloud.points_m[inside])
@@ -252,9 +249,7 @@ def grid_over(views: Sequence[PlacedView], cell_m: float | None) -> CellGrid:
     first, last = np.ceil(low / step), np.floor(high / step)
     columns, rows = (np.maximum(last - first, 0) + 1).astype(int)
     if not columns * rows <= MAX_CELLS:
-        what = (
-            f"a map of {high[0] - low[0]:.3g} x {high[1] - low[1]:.3g} m with cells of {step * 1e3:.3g} mm would have"
-        )
+        what = f"a map of {high[0] - low[0]:.3g} x {high[1] - low[1]:.3g} m with cells of {step * 1e3:.3g} mm"
         fix = "crop the views to the target, or give a larger merge.cell_mm"
-        raise UserError(f"{what} {columns * rows:.3g} cells", legal=f"up to {MAX_CELLS:.2g} cells", fix=fix)
+        raise UserError(f"{what} would have {columns * rows:.3g}", legal=f"up to {MAX_CELLS:.2g} cells", fix=fix)
     return CellGrid(float(first[0] * step), float(first[1] * step), float(step), (int(rows), int(columns)))

@@ -101,8 +101,7 @@ SHIFTS = 12  # of the lattice along each axis, over which the error of a centroi
 RECTANGULAR = 0.85
 """Least share of its smallest rectangle that a rectangle's pixels fill; an ellipse's fill 0.79."""
 SIZES, TURNS = 5, np.array([-1.0, 0.0, 1.0]) / 3
-"""Outlines between one whole pixel and the next, over width and height; turns of each, in pixels over its longer
-side."""
+"""Outlines between one whole pixel and the next, over width and height; turns of each, in pixels over its length."""
 
 
 @dataclass(frozen=True)
@@ -200,15 +199,11 @@ def _window(
         else:
             covariance = region_covariance_px2(grid)
         own, around = ((v + row) * inside.shape[1] + u + column for v, u in ((used_v, used_u), np.nonzero(target)))
-        contrast = _contrast(other + span, other)
+        # a count is added to each colour, so that black has a logarithm
+        contrast = np.log((other + span + 1.0) / (other + 1.0))
         return Blob(own, weights[used_v, used_u], grid, covariance, around, contrast, doubt)
 
     return share[rim], settled
-
-
-def _contrast(own: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Logarithm (3,) of one colour over another; a count is added to each, so that black has one."""
-    return np.asarray(np.log((own + 1.0) / (other + 1.0)))
 
 
 def _evenly_lit(rgb: np.ndarray, ring: np.ndarray, group: np.ndarray) -> np.ndarray:

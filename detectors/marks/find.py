@@ -56,8 +56,7 @@ class Patch:
 
     def range_covariance_m2(self, centre_m: np.ndarray, cloud: Cloud, pixels: np.ndarray) -> np.ndarray:
         """Return the covariance (3, 3) of a centre (3,) on the plane by the mean z of its pixels (n,): by what is left
-        about the plane, the averaged frames' noise, or what a map states, whichever is most; `CORRELATED_PIXELS` share
-        one value."""
+        about the plane, the frames' noise, or what a map states, the most of these; `CORRELATED_PIXELS` share it."""
         frames = cloud.variance_m2.ravel()[pixels] / np.maximum(cloud.count.ravel()[pixels], 1)
         known = frames[np.isfinite(frames)]
         variance = max(self.sigma_m**2, float(known.mean()) if len(known) else 0.0)
@@ -306,9 +305,7 @@ def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str)
         marks += [replace(mark, doubt=mark.doubt or doubt) for mark in found]
     marks.sort(key=lambda mark: int(mark.pixels[0]))
     holes = len(spots) - len(marks)
-    notes = (
-        (f"{holes} spots of another colour lie behind the surface: taken for holes, not for marks",) if holes else ()
-    )
+    notes = (f"{holes} spots of another colour lie behind the surface: taken for holes, not marks",) if holes else ()
     return MarkSet(tuple(marks), np.flatnonzero(coloured), problem_of(marks, missing), notes)
 
 

@@ -26,8 +26,7 @@ class RedMarks(Config):
 
 
 class ColourMarks(Config):
-    """Pixels whose chromaticity stands apart from the target's own; where that gives no three marks, whose lightness
-    does."""
+    """Pixels whose chromaticity, or where that gives no three marks lightness, stands apart from the target's own."""
 
     kind: Literal["colour"] = "colour"
 
@@ -103,6 +102,4 @@ def off_line_problem(marks: Sequence[Mark]) -> str:
     if sizes[1] >= max(OFF_LINE_SIGMAS * error, OFF_LINE_SHARE * sizes[0]):
         return ""
     off = f"{sizes[1] / MM:.1f} mm off it"
-    return (
-        f"the {len(marks)} marks lie on a line, {off}, which leaves the turn about it open: add a mark beside the line"
-    )
+    return f"the {len(marks)} marks lie on a line, {off}, which leaves the turn about it open: add a mark beside it"

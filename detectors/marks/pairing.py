@@ -58,17 +58,15 @@ def kabsch(from_m: np.ndarray, to_m: np.ndarray, weights: np.ndarray) -> np.ndar
     return T
 
 
-def place(
-    from_m: np.ndarray, from_covariance_m2: np.ndarray, to_m: np.ndarray, to_covariance_m2: np.ndarray
-) -> Placement:
+def place(from_m: np.ndarray, from_spread_m2: np.ndarray, to_m: np.ndarray, to_spread_m2: np.ndarray) -> Placement:
     """Find the most probable rigid transform of points (n, 3) onto (n, 3) with covariances (n, 3, 3), n >= 3. Raises
     numpy.linalg.LinAlgError where the points leave it undetermined (two, or all on a line)."""
 
     def state(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        spread = to_covariance_m2 + T[:3, :3] @ from_covariance_m2 @ T[:3, :3].T
+        spread = to_spread_m2 + T[:3, :3] @ from_spread_m2 @ T[:3, :3].T
         return transform_points(T, from_m) - to_m, np.linalg.inv(spread)
 
-    trust = 1.0 / np.trace(from_covariance_m2 + to_covariance_m2, axis1=1, axis2=2)
+    trust = 1.0 / np.trace(from_spread_m2 + to_spread_m2, axis1=1, axis2=2)
     T = kabsch(from_m, to_m, trust)
     centre = np.average(to_m, axis=0, weights=trust)
     converged, steps = False, 0
@@ -112,8 +110,7 @@ class Pairing:
 
 
 def pair_marks(reference: Sequence[Mark], view: Sequence[Mark], T_reference_view_guess: np.ndarray | None) -> Pairing:
-    """Match the marks of two views. The placement is chosen that the number of its pairs, their fit and the guess
-    favour."""
+    """Match the marks of two views by the placement that the number of its pairs, their fit and the guess favour."""
     counts = f"{len(reference)} marks in the reference and {len(view)} in the view"
     if min(len(reference), len(view)) < LEAST_MARKS:
         return Pairing(NO_PAIRS, f"{counts}, {LEAST_MARKS} needed in each")
@@ -184,8 +181,7 @@ class _Side:
 
 
 Solution = tuple[tuple[int, ...], np.ndarray, float]
-"""The mark in the larger set of each in the smaller, or -1; (4, 4) larger from smaller; the pairs' mean square distance
-over their worst variance."""
+"""Each mark's partner in the larger set, or -1; (4, 4) larger from smaller; mean square distance over its variance."""
 
 
 def _solutions(few: _Side, many: _Side) -> list[Solution]:

@@ -37,7 +37,8 @@ LEGAL_PICTURES = "a page or more of one channel in 16 bits or floating point, or
 EXPORT = "Location = pc.Location; Color = pc.Color; save('cloud.mat','Location','Color','-v7')"
 """The line for MATLAB that turns a point cloud ``pc`` into arrays."""
 
-ArraysLoader = Callable[[Path], Mapping[str, np.ndarray]]
+Arrays = Mapping[str, np.ndarray]
+ArraysLoader = Callable[[Path], Arrays]
 """Loads a file's arrays by name; the only array of a file without names is called ""."""
 
 
@@ -267,9 +268,7 @@ def _apart(first: np.ndarray, second: np.ndarray) -> float:
     return float(np.median(np.abs(one - other) / one)) if both.any() else float("inf")
 
 
-def _named_array(
-    name: str, arrays: Mapping[str, np.ndarray], usual: Sequence[str], asked: str | None
-) -> tuple[str, np.ndarray]:
+def _named_array(name: str, arrays: Arrays, usual: Sequence[str], asked: str | None) -> tuple[str, np.ndarray]:
     """Return (name, array): the one asked for as NAME[:NUMBER], else the one with a usual name, else the only one."""
     held = ", ".join(f"{key} {value.shape}".strip() for key, value in arrays.items()) or "nothing"
     key, _, number = (asked or "").partition(":")
@@ -326,7 +325,7 @@ def _open_height_map(path: Path, load: ArraysLoader, asked: Asked) -> Recording:
         raise UserError(f"{name}: not one finite height", legal="numbers; NaN where there is none")
     relief = float(np.ptp(np.quantile(known, (0.01, 0.99))))
     height, width = heights.shape
-    side_m = min(heights.shape) * pitch_m
+    side_m = min(height, width) * pitch_m
     plausible = (UNITS_M[u] for u in ("mm", "m", "um") if RELIEF[0] <= relief * UNITS_M[u] / side_m < RELIEF[1])
     scale_m = next(plausible, None) if asked.scale_m is None else asked.scale_m
     if scale_m is None:
@@ -334,29 +333,20 @@ def _open_height_map(path: Path, load: ArraysLoader, asked: Asked) -> Recording:
         raise UserError(what, fix="state it: --unit mm, --unit m or --unit um")
     is_down = name.rpartition(" ")[2].partition(":")[0].lower() in DOWN_NAMES
     direction = "grow away from the viewer, as its name says" if is_down else "grow towards the viewer: holes are low"
-    return Recording(
-        name=path.name,
-        read=partial(_map_frames, path, load, asked.array, pitch_m, scale_m if is_down else -scale_m),
-        shape=(height, width),
-        scale_m=scale_m,
-        z_step_m=0.0 if (known % 1).any() else scale_m,  # whole numbers were rounded, others were not
-        files=(path,),
-        projection="parallel",
-        notes=(
-            f"height map {name}: {width} x {height} pixels of {1e3 * pitch_m:.4g} mm; its numbers {direction}",
-            f"the median height lies at z = {1e3 * DISTANCE_M:g} mm",
-        ),
-        unit_from=f"the map's relief, {relief:.4g} over {1e3 * side_m:.4g} mm (--unit states another)",
-    )
+    z_step_m = 0.0 if (known % 1).any() else scale_m  # whole numbers were rounded, others were not
+    read = partial(_map_frames, path, load, asked.array, pitch_m, scale_m if is_down else -scale_m)
+    note = f"height map {name}: {width} x {height} pixels of {1e3 * pitch_m:.4g} mm; its numbers {direction}"
+    notes = (note, f"the median height lies at z = {1e3 * DISTANCE_M:g} mm")
+    told = f"the map's relief, {relief:.4g} over {1e3 * side_m:.4g} mm (--unit states another)"
+    found = Recording(path.name, read, (height, width), scale_m, z_step_m, (path,), notes=notes, unit_from=told)
+    return replace(found, projection="parallel")
 
 
-def _map_frames(
-    path: Path, load: ArraysLoader, array: str | None, pitch_m: float, signed_scale_m: float
-) -> Iterator[Frame]:
-    """Yield the map as a frame. ``signed_scale_m`` below 0: heights grow towards the viewer."""
+def _map_frames(path: Path, load: ArraysLoader, array: str | None, pitch_m: float, scale_m: float) -> Iterator[Frame]:
+    """Yield the map as a frame. ``scale_m`` below 0: heights grow towards the viewer."""
     name, heights = _map_in(path, load, array)
     known = np.isfinite(heights)
-    z_m = signed_scale_m * heights.astype(np.float64)
+    z_m = scale_m * heights.astype(np.float64)
     z_m += DISTANCE_M - (np.median(z_m[known]) if known.any() else 0.0)
     z_m[~known] = np.nan
     v, u = np.mgrid[: heights.shape[0], : heights.shape[1]]

@@ -226,11 +226,10 @@ def _motion_warnings(
     blur_px = lens.fx * (turned + moved_m / median_m)
     if blur_px <= BLUR_PX:
         return ()
-    moved = (
-        f"the camera moved by {1e3 * moved_m:.3g} mm and {np.degrees(turned):.2g} degrees during the {len(places_m)}"
-    )
+    moved = f"the camera moved by {1e3 * moved_m:.3g} mm and {np.degrees(turned):.2g} degrees"
     blur = f"up to {blur_px:.2g} pixels on the target, so their average is blurred"
-    return (f"{moved} frames ({source}), {blur}: --max-frames 1 takes the first frame alone",)
+    during = f"during the {len(places_m)} frames ({source})"
+    return (f"{moved} {during}, {blur}: --max-frames 1 takes the first frame alone",)
 
 
 def is_stray(folder: Path) -> bool:

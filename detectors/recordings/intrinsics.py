@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -183,9 +182,7 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
         raise UserError(f"{path}: the lens' width and height are no whole numbers", legal=LEGAL_LENS)
     if across * height != down * width:
         what = f"{path}: is for images of {across} x {down} pixels, but the depth images have {width} x {height}"
-        raise UserError(
-            what, fix="give the lens of the depth images (or of the colour camera that they are aligned to)"
-        )
+        raise UserError(what, fix="give the lens of the depth images (or of the colour camera they are aligned to)")
     fx, fy, cx, cy = _focal_and_centre(path, data)
     side = across / width
     fx, fy, cx, cy = fx / side, fy / side, (cx + 0.5) / side - 0.5, (cy + 0.5) / side - 0.5
@@ -246,9 +243,7 @@ def mappings(data: dict[str, Any], name: str = "", level: int = 0) -> Iterator[t
 def _the_lens(path: Path, data: dict[str, Any], size: tuple[int, int]) -> dict[str, Any]:
     """Return the mapping in a file that holds the lens: of several different ones those of this image size count, then
     those under a name with "depth". Raises UserError where there is none, or where several are left."""
-    found = [
-        (name, each) for name, each in mappings(data) if _matrix_key(each) or all(map(partial(_named, each), SPELLINGS))
-    ]
+    found = [pair for pair in mappings(data) if _matrix_key(pair[1]) or all(_named(pair[1], key) for key in SPELLINGS)]
     for fits in (lambda _, each: _size(each) == size, lambda name, _: "depth" in name.lower()):
         if len(found) > 1:
             found = [(name, each) for name, each in found if fits(name, each)] or found

@@ -60,19 +60,9 @@ def register_by_marks(reference: PreparedView, view: PreparedView) -> registered
         ratio = float(np.sqrt(placement.chi2 / freedom))
         covariance = covariance * ratio**2
         notes += (f"the marks disagree by {ratio:.1f} times their noise; the covariance is widened to match",)
-    return registered.Registration(
-        view=view.view.name,
-        method="marks",
-        T_reference_view=placement.T_to_from,
-        covariance=covariance,
-        centre_m=placement.centre_m,
-        residual_m=residual,
-        pairs=len(ours),
-        iterations=placement.iterations,
-        converged=placement.converged,
-        failure=problem,
-        notes=notes,
-    )
+    where = placement.T_to_from, covariance, placement.centre_m
+    found = registered.Registration(view.view.name, "marks", *where, residual, failure=problem, notes=notes)
+    return replace(found, pairs=len(ours), iterations=placement.iterations, converged=placement.converged)
 
 
 def held_out_error_m(reference: PreparedView, view: PreparedView) -> float | None:
@@ -137,8 +127,7 @@ class ViewData:
 class JointState:
     """Estimates: ``T`` (v, 4, 4) from the views to the surface's frame; ``surface`` (10,) and ``own`` (v, 10)
     coefficients, metres; ``marks_m`` (m, 2) places in the plane. ``shared_m``: prior deviation of each term of ``own``.
-    ``half_m`` (2,) scales x and y to -1..1. Vectors of all unknowns hold the poses of views 1.., surface, marks,
-    own."""
+    ``half_m`` (2,) scales x, y to -1..1. Vectors of all unknowns hold poses of views 1.., surface, marks, own."""
 
     T: np.ndarray
     surface: np.ndarray
@@ -222,11 +211,9 @@ def register_jointly(views: Sequence[PreparedView]) -> list[registered.Registrat
     return [replace(each, method="joint") for each in found]
 
 
-def _adjust(
-    views: Sequence[PreparedView], by_marks: Sequence[registered.Registration]
-) -> list[registered.Registration]:
+def _adjust(views: Sequence[PreparedView], marked: Sequence[registered.Registration]) -> list[registered.Registration]:
     """Registrations of views 1.. adjusted from those by their marks, none of which failed."""
-    T_reference = [np.eye(4), *(found.T_reference_view for found in by_marks)]
+    T_reference = [np.eye(4), *(found.T_reference_view for found in marked)]
     data = [_view_data(view, views[0]) for view in views]
     # the frame of the surface z(x, y): z along its mean normal, towards the camera
     sampling, T_surface_reference = registered.sampling_of(views[0]), np.eye(4)
@@ -257,27 +244,17 @@ def _adjust(
     covariance = np.linalg.inv(state.equations(data)[0])
     T_reference_surface = invert(T_surface_reference)
     both = np.kron(np.eye(2), T_reference_surface[:3, :3])
-    note = (
-        f"each view's own smooth error is {state.shared_m / MM:.2f} mm in each term of a cubic; the covariance holds it"
-    )
+    note = f"each view's own smooth error is {state.shared_m / MM:.2f} mm a term of a cubic; the covariance holds it"
+    lost = "" if converged else f"did not converge in {steps} steps of the joint adjustment"
     adjusted = []
-    for v, found in enumerate(by_marks, start=1):
+    for v, found in enumerate(marked, start=1):
         residual, _, _, weight = state.across(data[v], v)
+        residual_m = float(np.sqrt(np.average(residual**2, weights=weight)))
         pose = slice(6 * (v - 1), 6 * v)
-        adjusted.append(
-            replace(
-                found,
-                T_reference_view=T_reference_surface @ state.T[v],
-                covariance=both @ covariance[pose, pose] @ both.T,
-                centre_m=T_reference_surface[:3, 3],
-                residual_m=float(np.sqrt(np.average(residual**2, weights=weight))),
-                pairs=len(data[v].marks),
-                iterations=steps,
-                converged=converged,
-                failure="" if converged else f"did not converge in {steps} steps of the joint adjustment",
-                notes=(*found.notes, note),
-            )
-        )
+        spread = both @ covariance[pose, pose] @ both.T
+        where = T_reference_surface @ state.T[v], spread, T_reference_surface[:3, 3]
+        each = registered.Registration(found.view, found.method, *where, residual_m, pairs=len(data[v].marks))
+        adjusted.append(replace(each, iterations=steps, converged=converged, failure=lost, notes=(*found.notes, note)))
     return adjusted
 
 

@@ -16,7 +16,7 @@ does not move with the target. No loop is closed, no map is kept.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -34,8 +34,7 @@ GUESS_ERROR_M, GUESS_ERROR_RAD = 10 * MM, np.deg2rad(3.0)
 FINEST_PITCHES = 3.0
 """Limit of the last stage: a mark's rim is known to a pixel in either view, and noise and shared errors add one."""
 STAGE_ITERATIONS, LEAST_CHANGE = 100, 1e-8
-"""A stage ends after so many steps, or a smaller change of the share of paired points and of their distance in
-metres."""
+"""A stage ends after so many steps, or a smaller change of the paired points' share and of their distance (m)."""
 CONVERGED_PITCHES = 0.05
 
 
@@ -69,20 +68,13 @@ def register_by_icp(reference: PreparedView, view: PreparedView, config: IcpRegi
     moved = transform_points(T, moving)
     apart, paired = _pairs(tree, moved, limit_m)
     covariance = _covariance(tree, moved, limit_m, sampling.pitch_m)
-    return registered.Registration(
-        view=view.view.name,
-        method="icp",
-        T_reference_view=T,
-        covariance=covariance,
-        centre_m=moved.mean(axis=0),
-        residual_m=float(np.sqrt(np.sum(apart**2) / max(paired.sum(), 1))),
-        pairs=int(paired.sum()),
-        iterations=iterations,
-        converged=bool(step_m <= CONVERGED_PITCHES * sampling.pitch_m),
-        failure=registered.still_moving(step_m, sampling.pitch_m)
-        or ("" if np.isfinite(covariance).all() else registered.SLIDES),
-        notes=notes,
-    )
+    residual_m = float(np.sqrt(np.sum(apart**2) / max(paired.sum(), 1)))
+    found = registered.Registration(view.view.name, "icp", T, covariance, moved.mean(axis=0), residual_m)
+    failure = registered.still_moving(step_m, sampling.pitch_m)
+    failure = failure or ("" if np.isfinite(covariance).all() else registered.SLIDES)
+    converged = bool(step_m <= CONVERGED_PITCHES * sampling.pitch_m)
+    found = replace(found, pairs=int(paired.sum()), iterations=iterations, converged=converged)
+    return replace(found, failure=failure, notes=notes)
 
 
 def stages_m(pitch_m: float, extent_m: float) -> tuple[float, ...]:
@@ -203,23 +195,13 @@ def register_by_cpd(reference: PreparedView, view: PreparedView, config: CpdRegi
     pitch = registered.sampling_of(view).pitch_m
     covariance = drift_covariance(fixed, transform_points(drift.T_fixed_moving, moving), drift, pitch)
     failure = "" if drift.converged else registered.still_moving(drift.step_m, pitch)
-    if not failure and not np.isfinite(covariance).all():
-        failure = registered.SLIDES
+    failure = failure or ("" if np.isfinite(covariance).all() else registered.SLIDES)
     if not drift.converged:
         notes += (f"stopped after {drift.iterations} iterations, the limit in the settings",)
-    return registered.Registration(
-        view=view.view.name,
-        method="cpd",
-        T_reference_view=drift.T_fixed_moving,
-        covariance=covariance,
-        centre_m=fixed.mean(axis=0),
-        residual_m=drift.sigma_m * np.sqrt(3.0),
-        pairs=round(drift.matched),
-        iterations=drift.iterations,
-        converged=drift.converged,
-        failure=failure,
-        notes=notes,
-    )
+    where = drift.T_fixed_moving, covariance, fixed.mean(axis=0)
+    found = registered.Registration(view.view.name, "cpd", *where, drift.sigma_m * np.sqrt(3.0))
+    found = replace(found, pairs=round(drift.matched), iterations=drift.iterations, converged=drift.converged)
+    return replace(found, failure=failure, notes=notes)
 
 
 def drift_covariance(fixed_m: np.ndarray, moved_m: np.ndarray, drift: Drift, pitch_m: float) -> np.ndarray:
@@ -231,9 +213,8 @@ def drift_covariance(fixed_m: np.ndarray, moved_m: np.ndarray, drift: Drift, pit
     centre = fixed_m.mean(axis=0)
     x = fixed_m - centre
     variance = max(drift.sigma_m, pitch_m) ** 2
-    moments, _ = posterior_moments(
-        x, moved_m - centre, variance, drift.background * (variance / drift.sigma_m**2) ** 1.5
-    )
+    background = drift.background * (variance / drift.sigma_m**2) ** 1.5
+    moments, _ = posterior_moments(x, moved_m - centre, variance, background)
     # the score of a pair is J'(x - y) / variance = (y x x, x - y) / variance, linear in (y, 1)
     linear = np.zeros((len(x), 6, 4))
     linear[:, :3, :3] = np.swapaxes(np.cross(np.eye(3)[None], x[:, None]), 1, 2)
@@ -281,7 +262,7 @@ def register_by_odometry(views: Sequence[PreparedView]) -> list[registered.Regis
     """Register views but the first to the first, in the order given: that of the walk. A view that odometry loses
     (Open3D says so, or less than a tenth of the target's pixels pair) is a failure, and so is every view after it.
     ``residual_m`` and ``covariance`` are NaN. Every view needs colour, a pixel grid and a lens."""
-    T_reference_view, lost, found = np.eye(4), "", []
+    T, lost, found = np.eye(4), "", []
     # one pinhole for all: the first lens's focal lengths, and room for every target's points
     first = views[0].view.cloud.lens
     assert first is not None
@@ -306,10 +287,8 @@ def register_by_odometry(views: Sequence[PreparedView]) -> list[registered.Regis
             if lost:
                 found.append(registered.failed(view, "odometry", None, lost))
                 continue
-            T_reference_view = T_reference_view @ step
-            found.append(
-                registered.Registration(view.view.name, "odometry", T_reference_view, pairs=pairs, notes=(DRIFTS,))
-            )
+            T = T @ step
+            found.append(registered.Registration(view.view.name, "odometry", T, pairs=pairs, notes=(DRIFTS,)))
     return found
 
 

@@ -27,8 +27,7 @@ FALSE_ALARM_SIGMAS = 3.09
 MEDIAN_SCATTER = 1.65
 """Relative error of a standard deviation from the median, over that from the mean square (1 / sqrt(0.37))."""
 BLUR_M = 2.0 * MM
-"""Distance between registered views beyond which a map of them is blurred too much: the noise of a single frame,
-twice."""
+"""Distance between registered views beyond which a map is blurred too much: twice the noise of a single frame."""
 UNDETERMINED_PITCHES = 3.0
 """A predicted error over the target beyond this, and beyond `BLUR_M`, puts every point on a wrong pixel."""
 MAX_JUMP_DEG, MAX_JUMP_M = 30.0, 0.1
@@ -92,15 +91,11 @@ def _agreement(
 def judge(
     registration: registered.Registration, reference: PreparedView, view: PreparedView
 ) -> registered.Registration:
-    """Return the registration with its overlap and, where it cannot be trusted, its ``failure`` or, for baselines, a
-    note."""
+    """Return the registration with its overlap and, where it is not to be trusted, a ``failure`` or note."""
     T = registration.T_reference_view
-    broken = ""
-    if not (np.isfinite(T).all() and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-6)):
-        broken = "no transform was found"
-    elif np.linalg.det(T[:3, :3]) < 0:
-        broken = "mirrored: the transform is a reflection, not a rotation"
-    if broken:
+    is_rigid = np.isfinite(T).all() and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-6)
+    if not is_rigid or np.linalg.det(T[:3, :3]) < 0:
+        broken = "mirrored: the transform is a reflection, not a rotation" if is_rigid else "no transform was found"
         return replace(registration, overlap=0.0, failure=registration.failure or broken)
     ours, points = registered.sampling_of(reference), registered.thinned(reference.points_m, 200)
     agreement = _agreement(reference, ours, view, T)
@@ -108,10 +103,8 @@ def judge(
     if judged.failure:
         return judged
     if not agreement.beside >= registered.MIN_OVERLAP:
-        needed = f"{100 * registered.MIN_OVERLAP:.0f} % needed"
-        elsewhere = (
-            f"the views do not overlap: {100 * agreement.beside:.0f} % of the view lies beside the reference ({needed})"
-        )
+        share = f"{100 * agreement.beside:.0f} % of the view lies beside the reference"
+        elsewhere = f"the views do not overlap: {share} ({100 * registered.MIN_OVERLAP:.0f} % needed)"
     else:
         elsewhere = _jump(judged, reference, view)
     if elsewhere:
@@ -120,13 +113,11 @@ def judge(
     error_m, limit_m = float(np.hypot(within, across)), max(UNDETERMINED_PITCHES * ours.pitch_m, BLUR_M)
     undetermined, apart = "", _apart(agreement)
     if error_m > limit_m:
-        undetermined = (
-            "not determined: the points let the target slide or turn (they lie on a line, or the surface slides"
-        )
+        undetermined = "not determined: the points let the target slide or turn (they lie on a line, or the surface"
         undetermined += (
-            f" in itself); the predicted error over the target is {error_m / MM:.1f} mm, which would blur the"
+            f" slides in itself); the predicted error over it is {error_m / MM:.1f} mm, which would blur the map"
         )
-        undetermined += f" map (up to {limit_m / MM:.1f} mm are merged)"
+        undetermined += f" (up to {limit_m / MM:.1f} mm are merged)"
     if judged.method in UNJUDGED_AGREEMENT:
         return replace(judged, failure=undetermined, notes=(*judged.notes, *([apart] if apart else [])))
     failure = "; ".join(reason for reason in (undetermined, apart) if reason)
@@ -156,14 +147,14 @@ def _apart(agreement: Agreement) -> str:
     limit = blur * (1 + agreement.scatter)
     marks_limit = float(np.hypot(blur, agreement.grids_m)) * (1 + agreement.marks_scatter)
     if agreement.apart_m > limit:
-        said, distance = "the surfaces lie {} mm apart where the views overlap", agreement.apart_m
+        said = f"the surfaces lie {agreement.apart_m / MM:.1f} mm apart where the views overlap"
     elif agreement.marks_m > marks_limit:
-        said, distance = "the marks of the views do not coincide: their points lie {} mm apart", agreement.marks_m
+        said = f"the marks of the views do not coincide: their points lie {agreement.marks_m / MM:.1f} mm apart"
         limit = marks_limit
     else:
         return ""
     blurred = f"which would blur the map (up to {limit / MM:.1f} mm are merged)"
-    return f"{said.format(f'{distance / MM:.1f}')}, {blurred}: a wrong registration, or different targets"
+    return f"{said}, {blurred}: a wrong registration, or different targets"
 
 
 def _widened(
@@ -187,10 +178,8 @@ def _widened(
     # an error within the plane has two axes to share its mean square
     covariance[3:, 3:] += more_across**2 * along + 0.5 * more_within**2 * (np.eye(3) - along)
     parts = [f"{m / MM:.2g} mm {way}" for m, way in ((more_across, "across"), (more_within, "along")) if m]
-    note = (
-        f"the views disagree by {' and '.join(parts)} the surface beyond what noise explains: an error that each view"
-    )
-    note += " shares (offset, wiggling, lens); the covariance is widened by it"
+    note = f"the views disagree by {' and '.join(parts)} the surface beyond what noise explains: each view's own"
+    note += " error (offset, wiggling, lens); the covariance is widened by it"
     return replace(registration, covariance=covariance, notes=(*registration.notes, note))
 
 

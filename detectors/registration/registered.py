@@ -47,11 +47,9 @@ def reference_registration(view: str, method: str) -> Registration:
     return Registration(view, method, np.eye(4), np.zeros((6, 6)), residual_m=0.0, overlap=1.0)
 
 
-def failed(
-    view: PreparedView, method: str, T_reference_view: np.ndarray | None, failure: str, *notes: str
-) -> Registration:
+def failed(view: PreparedView, method: str, T_guess: np.ndarray | None, failure: str, *notes: str) -> Registration:
     """Return a registration that found nothing: it stands at its guess, or else at the reference's own place."""
-    T = np.eye(4) if T_reference_view is None else T_reference_view
+    T = np.eye(4) if T_guess is None else T_guess
     return Registration(view.view.name, method, T, converged=False, failure=failure, notes=notes)
 
 
@@ -110,8 +108,8 @@ def clustered_sandwich(curvature: np.ndarray, scores: np.ndarray, points_m: np.n
     # the scores sum to zero at the optimum, which takes one cube's worth of scatter away
     scatter = summed.T @ summed * len(summed) / (len(summed) - 1)
     inverse = (vectors / values) @ vectors.T
-    covariance: np.ndarray = inverse @ scatter @ inverse * np.outer(unit, unit)
-    return (covariance + covariance.T) / 2
+    covariance = inverse @ scatter @ inverse * np.outer(unit, unit)
+    return np.asarray((covariance + covariance.T) / 2)
 
 
 NOISE_LAG = 6
@@ -157,10 +155,9 @@ def sampling_of(view: PreparedView) -> Sampling:
 
 def plane_through(points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the centroid (3,) of points (n, 3) and the unit normal (3,) of their plane, towards the origin."""
+    centre = points_m.mean(axis=0) if len(points_m) else np.zeros(3)
     if len(points_m) < 3:
-        middle = points_m.mean(axis=0) if len(points_m) else np.zeros(3)
-        return middle, np.array([0.0, 0.0, -1.0])
-    centre = points_m.mean(axis=0)
+        return centre, np.array([0.0, 0.0, -1.0])
     normal = local_normals(points_m[None])[0]
     return centre, normal if normal @ centre <= 0 else -normal
 
@@ -196,8 +193,7 @@ def independent(points: int) -> float:
 def local_normals(near_m: np.ndarray) -> np.ndarray:
     """Return unit normals (n, 3) of the planes through sets of points (n, k, 3); their sign is not fixed."""
     arm = near_m - near_m.mean(axis=1, keepdims=True)
-    normals: np.ndarray = np.linalg.eigh(np.swapaxes(arm, 1, 2) @ arm)[1][:, :, 0]
-    return normals
+    return np.asarray(np.linalg.eigh(np.swapaxes(arm, 1, 2) @ arm)[1][:, :, 0])
 
 
 def _on_grid(cloud: Cloud, inside: np.ndarray) -> tuple[float, float]:
