@@ -10,12 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harness.evaluation.set_ups import LIMIT_RULE, set_ups_of
-from harness.evaluation.summary import (
-    MAIN,
-    fit_floor,
-    found_holes,
-    hole_list,
-)
+from harness.evaluation.summary import MAIN, fit_floor, found_holes, hole_list
 from harness.report import blocks, sections
 from harness.report.blocks import COLOURS, MARKERS
 from harness.report.clouds import ExampleCloud, MappedExample, residual_figure
@@ -88,7 +83,7 @@ def limits_figure(compared: pd.DataFrame, layout: Layout, frames: Sequence[int])
 def noise_figure(noise: pd.DataFrame) -> str:
     """Temporal, systematic and total error of one variant against frames, with the 1/sqrt(N) guide and the floor."""
     frames = noise["frames"].to_numpy(float)
-    fit = fit_floor(frames, noise["total_rms_mm"].to_numpy(float))
+    floor_mm = fit_floor(frames, noise["total_rms_mm"].to_numpy(float))
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
@@ -101,8 +96,8 @@ def noise_figure(noise: pd.DataFrame) -> str:
         ):
             values = noise[column].where(noise[column] > 0)
             axes.plot(frames, values, marker=marker, ms=5, lw=1.4, color=colour, label=label)
-        if fit is not None and fit.floor_mm > 0:
-            axes.axhline(fit.floor_mm, color=blocks.INK, lw=0.8, ls=(0, (6, 3)), label=f"floor {fit.floor_mm:.2f} mm")
+        if floor_mm > 0:
+            axes.axhline(floor_mm, color=blocks.INK, lw=0.8, ls=(0, (6, 3)), label=f"floor {floor_mm:.2f} mm")
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.set_xticks(frames, [f"{n:g}" for n in frames])
@@ -347,6 +342,5 @@ def answer_sentence(main: pd.DataFrame, verdicts: Sequence[Verdict] = ()) -> str
             drill = f", {inches(least)}" if inches(least) else ""
             text += f" ({hole_list(found)}; the smallest is {least:.2f} mm{drill})"
         text += f", with {hole_list(open_)} undecided" if open_ else ""
-        counted = "one frame" if n == 1 else f"{n} averaged frames"
-        parts.append(f"with {counted} {text}" if parts else f"With {counted} the camera finds {text}")
+        parts.append(f"with {_averaged(n)} {text}" if parts else f"With {_averaged(n)} the camera finds {text}")
     return f"{'; '.join(parts)}.{sections.counted_verdicts(verdicts)}"

@@ -221,12 +221,8 @@ def axis_figure(axis: study.AxisGroup, name: str) -> str:
         axes.set_ylim(0, top_mm if np.isfinite(top_mm) else None)
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2)
 
-    return svg(
-        name,
-        (7.0, 4.4 + 0.13 * len(shown)),
-        f"Diameter found 90 % of the time (a90) against {axis.title}, as the table says.",
-        draw,
-    )
+    alt = f"Diameter found 90 % of the time (a90) against {axis.title}, as the table says."
+    return svg(name, (7.0, 4.4 + 0.13 * len(shown)), alt, draw)
 
 
 def study_parts(result: StudyResult) -> list[str | Grid]:
@@ -238,11 +234,7 @@ def study_parts(result: StudyResult) -> list[str | Grid]:
 
 
 def study_html(
-    result: StudyResult,
-    examples: Sequence[StudyExample],
-    provenance: Mapping[str, Any],
-    resolved_yaml: str,
-    title: str,
+    result: StudyResult, examples: Sequence[StudyExample], provenance: Mapping[str, Any], resolved_yaml: str, title: str
 ) -> str:
     """Return the page as text; the same input gives the same bytes."""
     limits, rows = result.limits, study.study_tables(result)

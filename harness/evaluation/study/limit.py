@@ -69,12 +69,6 @@ def targets_of(board: np.ndarray, hole: np.ndarray, size_mm: np.ndarray, hit: np
     return Targets(board[first], size_mm[first], hits, inspections)
 
 
-def row_weights(board: np.ndarray, draws: int = DRAWS, population: str = "damaged") -> np.ndarray:
-    """Draw boards again: (draws, n) how often the ``board`` (n,) of each row is in each draw; alike for as many boards
-    of a population, so that set-ups are paired; two populations ("damaged", "hole-free") are drawn independently."""
-    return np.concatenate([weights for (weights,) in weights_in_blocks(draws, (board, population))])
-
-
 def _drawn(stream: np.random.Generator, boards: int, draws: int) -> np.ndarray:
     if not boards:
         return np.zeros((draws, 0))
@@ -82,7 +76,9 @@ def _drawn(stream: np.random.Generator, boards: int, draws: int) -> np.ndarray:
 
 
 def weights_in_blocks(draws: int, *rows: tuple[np.ndarray, str]) -> Iterator[tuple[np.ndarray, ...]]:
-    """Yield the `row_weights` of one or several (board (n,), population) in blocks of draws, to bound the memory."""
+    """Draw boards again, for one or several (board (n,), population): yield, in blocks of draws to bound the memory,
+    (draws, n) how often the board of each row is in each draw; alike for as many boards of a population, so that
+    set-ups are paired; two populations ("damaged", "hole-free") are drawn independently."""
     found = [(*np.unique(board, return_inverse=True), population) for board, population in rows]
     streams = [random_stream(0, "boards drawn again", of, len(names)) for names, _, of in found]
     at_once = max(1, CELLS // max(1, *(len(which) for _, which, _ in found)))
