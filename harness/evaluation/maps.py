@@ -66,8 +66,8 @@ def maps_of(tables: ResultTables) -> list[MapSetUp]:
         named = [row.get(axis) for axis in (REGISTRATION, MERGE)]
         ways = [name if isinstance(name, str) and name != "null" else "" for name in named]
         place = ", ".join(value_text(path, row[path]) for path in others)
-        told = (str(row["variant"]), views(row), *ways, place, bool(row["is_variation"]), str(row["reference"]))
-        found.append(MapSetUp(*told))
+        told = place, bool(row["is_variation"]), str(row["reference"])
+        found.append(MapSetUp(str(row["variant"]), views(row), ways[0], ways[1], *told))
     return found
 
 

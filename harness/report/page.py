@@ -18,19 +18,11 @@ from harness.report.perspectives import map_files, map_text, perspectives_html
 from harness.report.posterior import posterior_section
 from harness.report.summaries import Summaries, is_thesis, of_set_ups, summaries, verdicts_of
 from harness.report.view3d import write_view3d
+from harness.tables import trials
 from harness.tables.outputs import REPORT
 from harness.tables.study import axis_value
 from harness.tables.text import Grid, inches, many
-from harness.tables.trials import (
-    EFFECTS,
-    ERRORS,
-    FALSE_CALLS,
-    NOISE_BY_FRAMES,
-    POSTERIOR,
-    SET_UPS,
-    SUMMARY,
-    ResultTables,
-)
+from harness.tables.trials import ERRORS, FALSE_CALLS, NOISE_BY_FRAMES, SET_UPS, SUMMARY, ResultTables
 from harness.thesis.claims import Verdict
 from harness.thesis.inference import borne_out_if
 from harness.vocabulary.files import write_text
@@ -199,7 +191,7 @@ def set_ups_html(
 ) -> str:
     """The page of several set-ups as text; see `write_report`."""
     found = found or summaries(tables, examples, with_claims=about.with_claims)
-    compared, costs, posterior = of_set_ups(found[SET_UPS], tables), found[EFFECTS], found.get(POSTERIOR)
+    compared, costs, posterior = of_set_ups(found[SET_UPS], tables), found[trials.EFFECTS], found.get(trials.POSTERIOR)
     verdict = next(iter(verdicts_of(found)), None)
     layout, frames = Layout.of(tables), sections.shown_frames(compared)
     figures: dict[str, str] = {}

@@ -73,7 +73,7 @@ def draw_overlay(figure: Figure, limits: Sequence[SetUpLimit]) -> None:
     axes.axhline(0.9, color=GREY, lw=0.8, ls=":")
     room = ROW * len(limits)
     axes.set(xlim=_span(limits), ylim=(-room, 1 + room), yticks=np.linspace(0, 1, 6))
-    axes.set(xlabel=_size_axis(limits[0]), ylabel="probability of detection")
+    axes.set(xlabel=f"{limits[0].record.inspected.limit_of} (mm)", ylabel="probability of detection")
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=_names_across(names))
 
 
@@ -99,10 +99,6 @@ def depth_limits_figure(results: Sequence[SetUpResult]) -> str:
     lines = sum(-(-len(name_of(limit)) // LONGEST_NAME) for limit, _ in surfaces)
     alt = "Smallest depth found 90 % of the time against size, as depth_limits.csv says."
     return svg("depth-limits", (7.0, 4.0 + 0.17 * lines), alt, draw)
-
-
-def _size_axis(limit: SetUpLimit) -> str:
-    return f"{limit.record.inspected.limit_of} (mm)"
 
 
 def _span(limits: Sequence[SetUpLimit]) -> tuple[float, float]:
@@ -244,7 +240,7 @@ def study_html(
     inspected = [one.limit for one in shown if one.limit.inspections]
     curved = [one for one in shown if one.roc or one.free_response or one.pixels]
     figures = {name: axis_figure(group, name) for name, group in groups.items()}
-    if inspected and len({_size_axis(limit) for limit in inspected}) == 1:  # a depth is not drawn beside a diameter
+    if len({one.record.inspected.limit_of for one in inspected}) == 1:  # a depth is not drawn beside a diameter
         figures["overlay"] = overlay_figure(inspected)
     figures |= {"depth-limits": depth_limits_figure(shown)} if any(one.surface for one in shown) else {}
     figures |= {"operating": operating_figure(curved)} if curved else {}

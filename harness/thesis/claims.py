@@ -217,8 +217,8 @@ def score_claims(
     """A verdict for each of `RULES` on one variant. ``summary`` saves making `summarise_holes` again."""
     summary = summarise_holes(tables.holes) if summary is None else summary
     every = (summary, with_columns(tables.holes), tables.runs, tables.probes)
-    own = [table[table["variant"] == variant] for table in every]
-    case = Case(variant, *own, [example for example in examples if example.variant == variant])
+    summary, holes, runs, probes = (table[table["variant"] == variant] for table in every)
+    case = Case(variant, summary, holes, runs, probes, [one for one in examples if one.variant == variant])
     return [verdict_of(claim, *rule(case)) for claim, rule in RULES.items()]
 
 

@@ -10,18 +10,10 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from harness.evaluation.pod import hit_miss
 from harness.evaluation.pod.ahat import LEVEL, AhatFit, ahat_band, ahat_bound, choose_axes, diagnose
 from harness.evaluation.pod.curve import Bound, PodCurve
-from harness.evaluation.pod.hit_miss import (
-    NEAR_DEVIANCE,
-    Beyond,
-    HitMissFit,
-    bound,
-    choose_model,
-    floor_ceiling_tests,
-    near_models,
-    widest_band,
-)
+from harness.evaluation.pod.hit_miss import NEAR_DEVIANCE, Beyond, HitMissFit
 from harness.evaluation.pod.inspections import Inspections
 from harness.tables.schema import jsonable
 from harness.vocabulary.errors import UserError
@@ -100,7 +92,7 @@ class PodStatement:
         """Lower and upper edges (`DRAWN`,) of the band; made when it is drawn, because it takes long."""
         if self.signal:
             return ahat_band(self.signal, self.sizes, CONFIDENCE)
-        return widest_band(self.fits, self.sizes)
+        return hit_miss.widest_band(self.fits, self.sizes)
 
     @property
     def model(self) -> str:
@@ -161,12 +153,12 @@ def state_hits(
     # L-BFGS-B hands LAPACK systems of four unknowns, whose threads wait for each other: 9 s, not 0.6 s, on busy cores
     with threadpool_limits(1, user_api="blas"):
         size, hit = read.size, read.response
-        tried = choose_model(size, hit, inspections=read.target)
+        tried = hit_miss.choose_model(size, hit, inspections=read.target)
         left = [one for one in tried if link in (None, one.curve.link) and log_size in (None, one.curve.log_size)]
-        fit, near = left[0], near_models(left)
+        fit, near = left[0], hit_miss.near_models(left)
         curve, notes = fit.curve, [*read.notes, *fit.notes]
-        tests = floor_ceiling_tests(fit) if tested else ()
-        models = [(one, bound(one, POD, CONFIDENCE)) for one in tried]
+        tests = hit_miss.floor_ceiling_tests(fit) if tested else ()
+        models = [(one, hit_miss.bound(one, POD, CONFIDENCE)) for one in tried]
         limit = max((limit for one, limit in models if one in near), key=lambda limit: limit.value)
 
     if fit.targets < LEAST_TARGETS:

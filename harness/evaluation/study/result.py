@@ -1,7 +1,6 @@
 """A whole study judged: every set-up's limit and curves, limits against each swept axis, and the limits of validity.
 
-Set-ups that differ in one axis alone stand in one line. Intervals of their ratios are a little narrow: of differences
-that are none 8 to 9 % are called beyond chance with 60 and 20 boards of eight damages."""
+Intervals of ratios are a little narrow: 8 to 9 % of those of equal set-ups leave out 1 (60 and 20 boards of 8)."""
 
 from __future__ import annotations
 
@@ -14,16 +13,8 @@ import numpy as np
 
 from harness.evaluation.intervals import SITES_PER_TARGET, Interval, percentiles
 from harness.evaluation.pod.hit_miss import NEAR_DEVIANCE
-from harness.evaluation.study.curves import (
-    ChanceHits,
-    FreeResponse,
-    PixelCurves,
-    Roc,
-    chance_hits,
-    free_response,
-    pixel_curves,
-    roc_curve,
-)
+from harness.evaluation.study import curves
+from harness.evaluation.study.curves import ChanceHits
 from harness.evaluation.study.limit import ALL_FOUND, DRAWS, PodSurface, SetUpLimit, limit_of, surface_of
 from harness.evaluation.study.record import SetUpRecord, StudyRecord
 from harness.tables.trials import ResultTables
@@ -304,9 +295,9 @@ class SetUpResult:
 
     limit: SetUpLimit
     chance: ChanceHits | None
-    roc: Roc | None
-    free_response: FreeResponse | None
-    pixels: PixelCurves | None
+    roc: curves.Roc | None
+    free_response: curves.FreeResponse | None
+    pixels: curves.PixelCurves | None
     surface: PodSurface | None
     surface_why: str
 
@@ -352,8 +343,8 @@ def _set_up(record: SetUpRecord, tables: ResultTables, radius_mm: float, draws: 
         typical_mm = float((sized[of] - sized["true_diameter_mm"]).abs().median())
         seconds = float(runs.loc[runs["role"] == "damaged", "seconds_detect"].median())
         limit = replace(limit, size_error_mm=typical_mm, sized=len(sized), seconds_detect=seconds)
-        chance = chance_hits(holes, sites, runs, own(tables.findings), radius_mm, limit.false_calls)
-    roc = roc_curve(holes, sites, record.threshold)
-    response = free_response(own(tables.operating), runs, holes, draws)
-    pixels = pixel_curves(own(tables.pixels))
+        chance = curves.chance_hits(holes, sites, runs, own(tables.findings), radius_mm, limit.false_calls)
+    roc = curves.roc_curve(holes, sites, record.threshold)
+    response = curves.free_response(own(tables.operating), runs, holes, draws)
+    pixels = curves.pixel_curves(own(tables.pixels))
     return SetUpResult(limit, chance, roc, response, pixels, *surface_of(record, draws))
