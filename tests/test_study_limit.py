@@ -19,7 +19,6 @@ from harness.evaluation.study.limit import (
     design_effect,
     limit_of,
     refitted_sizes,
-    row_weights,
     targets_of,
     weights_in_blocks,
 )
@@ -212,6 +211,10 @@ class TestFalseCalls:
         over = limit.false_calls_interval_per_m2
         poisson = limit.false_calls.interval_per_m2
         assert over.high - over.low > 1.5 * (poisson.high - poisson.low)
+
+
+def row_weights(board: np.ndarray, draws: int, population: str = "damaged") -> np.ndarray:
+    return np.concatenate([weights for (weights,) in weights_in_blocks(draws, (board, population))])
 
 
 class TestBoardsDrawnAgain:

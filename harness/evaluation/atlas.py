@@ -86,7 +86,7 @@ class LimitSurface:
         if not around.any() or not self.known[around].all() or not len(self.coefficients):
             unknown = float("nan")
             return Answer(unknown, unknown, unknown, largest_mm if self.beyond[around].all() else unknown)
-        row = _rows(self._scaled(wanted[None]), self.terms)[0]
+        row = _rows(_scaled(wanted[None], list(self.grid.values())), self.terms)[0]
         middle = float(row @ self.coefficients)
         spread = np.hypot(np.sqrt(row @ self.covariance @ row), self.error)
         half = float(stats.t.ppf(0.5 + CONFIDENCE / 2, self.degrees) * spread)
@@ -99,9 +99,6 @@ class LimitSurface:
         low = values[values <= value + TOLERANCE].max()
         high = values[values >= value - TOLERANCE].min()
         return np.asarray(np.isclose(self.nodes[:, axis], low) | np.isclose(self.nodes[:, axis], high))
-
-    def _scaled(self, places: np.ndarray) -> np.ndarray:
-        return _scaled(places, list(self.grid.values()))
 
 
 def surfaces_of(limits: pd.DataFrame) -> list[LimitSurface]:

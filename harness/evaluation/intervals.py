@@ -74,14 +74,11 @@ def clopper_pearson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray
     return np.where(n > 0, low, np.nan), np.where(n > 0, high, np.nan)
 
 
-def poisson_rate(
-    count: ArrayLike, exposure: ArrayLike, confidence: float = CONFIDENCE
-) -> tuple[np.ndarray, np.ndarray]:
+def poisson_rate(count: ArrayLike, exposure: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Garwood's exact interval of a Poisson rate, ``count`` events in ``exposure`` (runs, areas), NaN where 0."""
     k, time = np.broadcast_arrays(np.asarray(count, float), np.asarray(exposure, float))
-    tail = (1 - confidence) / 2
-    low = np.where(k == 0, 0.0, stats.chi2.ppf(tail, 2 * k) / 2)
-    high = stats.chi2.ppf(1 - tail, 2 * k + 2) / 2
+    low = np.where(k == 0, 0.0, stats.chi2.ppf(1 - UPPER, 2 * k) / 2)
+    high = stats.chi2.ppf(UPPER, 2 * k + 2) / 2
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(time > 0, low / time, np.nan), np.where(time > 0, high / time, np.nan)
 
@@ -143,23 +140,20 @@ SITES_PER_TARGET = 3
 
 @dataclass(frozen=True)
 class FalseCallRate:
-    """False calls per square metre: estimate, Garwood's two-sided ``interval`` and one-sided ``upper`` bound."""
+    """False calls per square metre: estimate and Garwood's interval."""
 
     rate_per_m2: float
     interval_per_m2: Interval
-    upper_per_m2: float
-    confidence: float
     calls: int
     area_m2: float
 
 
-def false_call_rate(calls: int, area_m2: float, confidence: float = 0.95) -> FalseCallRate:
+def false_call_rate(calls: int, area_m2: float) -> FalseCallRate:
     """State the rate of ``calls`` false calls on ``area_m2`` of unflawed surface as a Poisson count; limits exact."""
     if calls < 0 or not area_m2 > 0:
         raise UserError(f"{calls} false calls on {area_m2:g} m2", legal="no fewer than 0 calls, an area above 0")
-    low, high = poisson_rate(calls, area_m2, confidence)
-    upper = poisson_rate(calls, area_m2, 2 * confidence - 1)[1]
-    return FalseCallRate(calls / area_m2, Interval(float(low), float(high)), float(upper), confidence, calls, area_m2)
+    low, high = poisson_rate(calls, area_m2)
+    return FalseCallRate(calls / area_m2, Interval(float(low), float(high)), calls, area_m2)
 
 
 @dataclass(frozen=True)

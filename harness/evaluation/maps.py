@@ -61,15 +61,14 @@ def maps_of(tables: ResultTables) -> list[MapSetUp]:
         except (TypeError, ValueError, OverflowError):
             return int(seen.get(row["variant"], 0))
 
-    def word(value: Any) -> str:
-        return value if isinstance(value, str) and value != "null" else ""
-
-    def one(row: pd.Series) -> MapSetUp:
+    found = []
+    for _, row in tables.variants.iterrows():
+        named = [row.get(axis) for axis in (REGISTRATION, MERGE)]
+        ways = [name if isinstance(name, str) and name != "null" else "" for name in named]
         place = ", ".join(value_text(path, row[path]) for path in others)
-        told = (str(row["variant"]), views(row), word(row.get(REGISTRATION)), word(row.get(MERGE)), place)
-        return MapSetUp(*told, is_variation=bool(row["is_variation"]), reference=str(row["reference"]))
-
-    return [one(row) for _, row in tables.variants.iterrows()]
+        told = place, bool(row["is_variation"]), str(row["reference"])
+        found.append(MapSetUp(str(row["variant"]), views(row), ways[0], ways[1], *told))
+    return found
 
 
 def compare_maps(tables: ResultTables, summary: pd.DataFrame) -> pd.DataFrame:
@@ -127,10 +126,6 @@ class SizeErrors:
         with np.errstate(invalid="ignore"):
             return change_of(np.where(there, chosen, 0.0).sum(axis=1) / there.sum(axis=1))
 
-    def by_hole(self) -> list[Change]:
-        """Average for each hole alone."""
-        return [change_of(column) for column in self.differences_mm.T]
-
 
 def size_errors(first: pd.DataFrame, second: pd.DataFrame, measure: Measure = "extent") -> SizeErrors:
     """Pair the table of holes' rows of two maps, each of one set-up and one number of frames; see `FEWEST_BOTH`."""
@@ -146,20 +141,14 @@ def size_errors(first: pd.DataFrame, second: pd.DataFrame, measure: Measure = "e
     return SizeErrors(tuple(map(str, holes)), sizes, differences)
 
 
-def run_change(first: pd.DataFrame, second: pd.DataFrame, column: str) -> Change:
-    """Paired change of a column of the table of runs on the damaged board; ``threshold_mm`` is k times the scale."""
-    return change_of((_by_repeat(second, column) - _by_repeat(first, column)).to_numpy(float))
-
-
 def run_ratio(first: pd.DataFrame, second: pd.DataFrame, column: str) -> Change:
-    """Paired change of the natural logarithm of such a column: ``exp`` of it is a ratio."""
-    return change_of(np.log((_by_repeat(second, column) / _by_repeat(first, column)).to_numpy(float)))
+    """Paired change of the natural logarithm of a column of the table of runs on the damaged board: ``exp`` of it is a
+    ratio."""
+    return change_of(np.log((_by_repeat(second)[column] / _by_repeat(first)[column]).to_numpy(float)))
 
 
-def _by_repeat(runs: pd.DataFrame, column: str) -> pd.Series:
-    damaged = runs[runs["role"] == "damaged"]
-    values = damaged["threshold"] * damaged["scale_mm"] if column == "threshold_mm" else damaged[column]
-    return values.set_axis(damaged["repeat"])
+def _by_repeat(runs: pd.DataFrame) -> pd.DataFrame:
+    return runs[runs["role"] == "damaged"].set_index("repeat")
 
 
 @dataclass(frozen=True)
@@ -281,7 +270,8 @@ def against_one(case: MapCase, registration: str, merge: str) -> AgainstOne | No
         tuple(hole for hole, state in here.items() if state == "found" and there.get(hole) == "missed")
         for here, there in (states, states[::-1])
     )
-    threshold, noise = run_change(*runs, "threshold_mm"), run_ratio(*runs, "surface_noise_mm")
+    before_mm, now_mm = (rows["threshold"] * rows["scale_mm"] for rows in map(_by_repeat, runs))
+    threshold, noise = change_of((now_mm - before_mm).to_numpy(float)), run_ratio(*runs, "surface_noise_mm")
     return AgainstOne(frames, sizes, sizes.change(large), sizes.change(~large), threshold, noise, lost, gained)
 
 
@@ -336,16 +326,15 @@ def of_map(registrations: pd.DataFrame, method: str, views: int) -> pd.DataFrame
     return order.drop_duplicates([*UNIT, "view"]).drop(columns="_apart").sort_index()
 
 
-def summarise_registrations(registrations: pd.DataFrame, by: Sequence[str] = ("method", "frames")) -> pd.DataFrame:
-    """Make one row per group, in order of appearance: numbers, failures, and the errors of those that did not fail. For
+def summarise_registrations(registrations: pd.DataFrame) -> pd.DataFrame:
+    """Make one row per method and number of frames: numbers, failures, and the errors of those that did not fail. For
     both `PARTS` median, root mean square, the predicted one (of the covariances) and the ``_ratio`` of actual to
     predicted (1: honest, above 1: too sure) with a bootstrap over repeats; ``guess_mm``: of the starting guess."""
     import pandas as pd
 
-    if registrations.empty:
-        return pd.DataFrame(columns=[*by, "n", "failed"])
-    groups = registrations.groupby(list(by), sort=False)
-    return pd.DataFrame([dict(zip(by, key, strict=True)) | _summary(part) for key, part in groups])
+    groups = registrations.groupby(["method", "frames"], sort=False)
+    rows = [{"method": method, "frames": frames} | _summary(part) for (method, frames), part in groups]
+    return pd.DataFrame(rows)
 
 
 def by_views(registrations: pd.DataFrame, counts: Sequence[int]) -> pd.DataFrame:

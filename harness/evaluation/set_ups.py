@@ -192,10 +192,8 @@ def effect_costs(tables: ResultTables) -> pd.DataFrame:
             there = {str(name): ladder_of(part) for name, part in rows.groupby("variant")}
             ladders = {on: there[variant] for on, variant in by_switches.items() if variant in there}
             for effect, against, off, on in asked:
-                cost = _cost(ladders, off, on)
-                found += (
-                    [{"place": place, "frames": frames, "effect": effect, "against": against, **cost}] if cost else []
-                )
+                if cost := _cost(ladders, off, on):
+                    found.append({"place": place, "frames": frames, "effect": effect, "against": against, **cost})
     return EFFECTS.frame(found)
 
 

@@ -155,18 +155,6 @@ COLUMNS += ["systematic_mm", "displacement_mm", "total_rms_mm"]
 
 
 @dataclass(frozen=True)
-class FloorFit:
-    """``total^2 = white^2 / N + floor^2``: one frame's white noise and what no averaging removes, in mm."""
-
-    white_mm: float
-    floor_mm: float
-
-    def at(self, frames: np.ndarray) -> np.ndarray:
-        """The fitted total error in mm for numbers of frames."""
-        return np.sqrt(self.white_mm**2 / np.asarray(frames, float) + self.floor_mm**2)
-
-
-@dataclass(frozen=True)
 class NoiseLaw:
     """Effect of averaging. ``slope``: exponent of the temporal noise against the number of frames (white noise: -0.5).
     ``systematic_ratio``: systematic error (offset and pattern) of the longest over the shortest average."""
@@ -204,17 +192,16 @@ def noise_against_frames(probes: pd.DataFrame) -> pd.DataFrame:
     return table
 
 
-def fit_floor(frames: Sequence[int] | np.ndarray, total_rms_mm: Sequence[float] | np.ndarray) -> FloorFit | None:
-    """Fit least squares of total^2 on 1/N with both parts non-negative, weighted to equal relative error. None below
-    two different numbers of frames (the two parts cannot be told apart)."""
+def fit_floor(frames: Sequence[int] | np.ndarray, total_rms_mm: Sequence[float] | np.ndarray) -> float:
+    """Return what no averaging removes, in mm, of ``total^2 = white^2 / N + floor^2``: least squares with both parts
+    non-negative, weighted to equal relative error. NaN below two different numbers of frames."""
     n, total2 = np.asarray(frames, float), np.asarray(total_rms_mm, float) ** 2
     usable = np.isfinite(total2) & (total2 > 0)
     if len(np.unique(n[usable])) < 2:
-        return None
+        return np.nan
     n, total2 = n[usable], total2[usable]
     design = np.column_stack([1 / n, np.ones_like(n)]) / total2[:, None]
-    (white2, floor2), _ = nnls(design, np.ones_like(n))
-    return FloorFit(float(np.sqrt(white2)), float(np.sqrt(floor2)))
+    return float(np.sqrt(nnls(design, np.ones_like(n))[0][1]))
 
 
 def noise_law(probes: pd.DataFrame, variant: str) -> NoiseLaw | None:

@@ -18,14 +18,8 @@ from scipy import ndimage
 
 from detectors.recordings import Recording
 from harness.inspection.arguments import opened
-from harness.own_camera.measure import (
-    WIDEST_PX,
-    Characteristics,
-    StillCapture,
-    characteristics,
-    mean_amplitude,
-    surfaces_of,
-)
+from harness.own_camera import measure
+from harness.own_camera.measure import Characteristics, StillCapture
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import write_text
 from harness.vocabulary.geometry import MM, Lens
@@ -195,7 +189,7 @@ def _refitted(like: str, found: Characteristics, albedo: float, source: str) -> 
     camera, gain = _gain(with_number(camera, "engine", "output_step_mm", _step_mm(found)), found, albedo)
     yield Stated("photons", "signal_electrons", gain, f"gives the temporal noise, albedo {albedo:g}; {source}")
     again = simulated(camera, found, albedo, FEW_FRAMES)
-    own = characteristics(again).pattern
+    own = measure.characteristics(again).pattern
     if found.pattern is not None and own is not None:
         times = found.pattern.field.rms_m / max(own.field.rms_m, 1e-9)
         doubt = "; ".join((f"{times:.3g} times the known camera's; {source}", *found.pattern.field.warnings))
@@ -218,7 +212,7 @@ def _gain(camera: Any, found: Characteristics, albedo: float) -> tuple[Any, floa
     gain = start = camera.photons.signal_electrons.value
     for _ in range(STEPS):
         camera = with_number(camera, "photons", "signal_electrons", gain)
-        own = [one for stack in simulated(camera, found, albedo, FEW_FRAMES) for one in surfaces_of(stack)]
+        own = [one for stack in simulated(camera, found, albedo, FEW_FRAMES) for one in measure.surfaces_of(stack)]
         ratios = [np.log(one.temporal.value / wanted[one.capture, one.number]) for one in own]
         tried.append((np.log(gain), float(np.mean(ratios)) if ratios else 1.0))  # too dim to be seen is too noisy
         if abs(tried[-1][1]) < CLOSE:
@@ -245,7 +239,7 @@ def _again(camera: AnyCamera, capture: StillCapture, albedo: float, frames: int,
         for place, (_, mask) in enumerate(capture.planes, start=1):
             labels[mask] = place
         distance, nearest = ndimage.distance_transform_edt(labels == 0, return_indices=True)
-        labels = np.where(distance <= WIDEST_PX / 2, labels[tuple(nearest)], 0)
+        labels = np.where(distance <= measure.WIDEST_PX / 2, labels[tuple(nearest)], 0)
         halves = labels[None]
         if not isinstance(camera, EmpiricalCamera):  # whose edges are steps between pixels
             # half of each pixel along an edge lies on the other surface: the mean over all places of an edge on pixels
@@ -256,10 +250,10 @@ def _again(camera: AnyCamera, capture: StillCapture, albedo: float, frames: int,
     light = albedo * capture.cosine / (z_m * capture.stretch) ** 2 / (z_m.size / capture.cosine.size)
     unit = SimulatedUnit(camera, config, image_view(camera, lens.whole, z_m, light))
     if capture.amplitude is not None:
-        plain = mean_amplitude([next(iter(unit.capture(1, SEED).frames())).amplitude])
+        plain = measure.mean_amplitude([next(iter(unit.capture(1, SEED).frames())).amplitude])
         ratio = capture.amplitude / plain
         ratio = np.clip(np.nan_to_num(ratio / np.nanmedian(ratio[capture.steady]), nan=1.0), 0.02, 50.0)
         unit = SimulatedUnit(camera, config, image_view(camera, lens.whole, z_m, light * ratio))
     taken = list(unit.capture(frames, SEED, "own camera", number).frames())
-    amplitude = mean_amplitude([frame.amplitude for frame in taken]) if capture.amplitude is not None else None
+    amplitude = measure.mean_amplitude([frame.amplitude for frame in taken]) if capture.amplitude is not None else None
     return replace(capture, z_m=np.stack([f.z_m for f in taken]), amplitude=amplitude, step_m=camera.z_step_m)

@@ -121,13 +121,8 @@ def write_certificate(
         body += [note(POD.format(study.hit_radius_mm))]
     body += [heading("Validity"), bullets((share, *CONDITIONS)), note(f"{date.today().isoformat()}: {command}")]
     text = page(f"Certificate of measurement: {about['unit']}", frames, body, warnings=found.doubts)
-    told = {
-        "results_version": RESULTS_VERSION,
-        "about": about,
-        "figures": rows,
-        "surfaces": FLAT_SURFACES.data(surfaces),
-        "conditions": [share, *CONDITIONS],
-    }
+    told = {"results_version": RESULTS_VERSION, "about": about, "figures": rows}
+    told |= {"surfaces": FLAT_SURFACES.data(surfaces), "conditions": [share, *CONDITIONS]}
     told |= {"limits": LIMITS.data(limits), "doubts": found.doubts, "command": command}
     write_text(folder / "certificate.html", text)
     write_text(folder / "certificate.json", json.dumps(told, indent=2, ensure_ascii=False) + "\n")

@@ -33,8 +33,6 @@ CAPTION = (
     "brightness; its correlation between neighbours. Lower row: displacement of whole frames; dropouts against "
     "amplitude; correlation of the fixed pattern. The simulation of the camera's file is orange."
 )
-
-
 Told = tuple[str, str, str, Reading, str]
 """Name, place, unit, value and meaning of a figure."""
 
@@ -124,16 +122,12 @@ def write_page(
     curves = [row for source, one in sources.items() for row in _curves(source, one)]
     write_table(folder, OWN_CURVES, OWN_CURVES.frame(curves))
     drawn = svg("captures", (10.5, 6.4), title, lambda canvas: _draw(canvas, found, curves))
-    body = [
-        figure({"captures": drawn}, "captures", CAPTION),
-        heading("Measured and simulated"),
-        paragraph(
-            "The simulation is of the camera's file, before the same surfaces as fitted planes, and is analysed like"
-            " the captures. A ratio of 1 says that the file repeats the camera."
-        ),
-        OWN_FIGURES.grid(rows, heads=heads).html(),
-        *command_of(command),
-    ]
+    said = (
+        "The simulation is of the camera's file, before the same surfaces as fitted planes, and is analysed like the "
+        "captures. A ratio of 1 says that the file repeats the camera."
+    )
+    body = [figure({"captures": drawn}, "captures", CAPTION), heading("Measured and simulated"), paragraph(said)]
+    body += [OWN_FIGURES.grid(rows, heads=heads).html(), *command_of(command)]
     write_text(path, page(title, answer, body, warnings=warnings))
     origin = {"results_version": RESULTS_VERSION, **record(command), **facts, "warnings": warnings}
     write_text(folder / "provenance.json", json.dumps(origin, indent=2) + "\n")

@@ -26,10 +26,8 @@ def atlas_html(rows: Sequence[Row], warnings: Sequence[str], about: Mapping[str,
     curves: dict[tuple[Any, ...], dict[str, Any]] = {}
     for row in rows:
         place = {axis: value for axis, value in row.place.items() if axis != "distance_m"}
-        of = (row.title, row.damage, row.surface.detector, *place.values())
-        curve = curves.setdefault(
-            of, {"camera": row.title, "damage": row.damage, "detector": row.surface.detector, **place}
-        )
+        named = {"camera": row.title, "damage": row.damage, "detector": row.surface.detector, **place}
+        curve = curves.setdefault(tuple(named.values()), named)
         one = row.answer
         for name, value in (("distance_m", row.place["distance_m"]), ("a90", one.a90_mm), ("low", one.low_mm),
                             ("high", one.high_mm), ("largest", one.largest_mm)):  # fmt: skip

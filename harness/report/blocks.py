@@ -25,10 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 HERE = Path(__file__).parent
-SHOWN_FIRST = (
-    *("commit", "dirty", "seed", "started", "machine", "mitsuba_variant"),
-    *("renders", "versions"),
-)
+SHOWN_FIRST = (*("commit", "dirty", "seed", "started", "machine", "mitsuba_variant"), *("renders", "versions"))
 """Keys of the provenance that a page names in any case, as not recorded where they are missing."""
 MOST_VALUES = 81
 """Points of a line whose values a pointer can read."""

@@ -132,8 +132,7 @@ def examples_figure(name: str, examples: Sequence[StudyExample], title: str, *, 
         for down in range(max(map(len, columns)))
     ]
     every = [one for line in columns for one in line]
-    told = (f"{one.diameter_mm:.1f} mm, {titles[one.where].lower()}, {_outcome(one)}" for one in every)
-    said = "; ".join(told)
+    said = "; ".join(f"{one.diameter_mm:.1f} mm, {titles[one.where].lower()}, {_outcome(one)}" for one in every)
     return _cuts(name, rows, f"{title}: {said}.")
 
 

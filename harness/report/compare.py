@@ -38,10 +38,6 @@ def _tone(row: ComparedSetUps) -> Tone:
     return TONES.get(row.mark, "")
 
 
-def _limit_p(row: ComparedSetUps) -> str:
-    return p_value(row.limit_p[0]) if row.limit else "–"
-
-
 COMPARED = Table(
     "compared",
     "one row per set-up of either study",
@@ -54,7 +50,7 @@ COMPARED = Table(
         Column("", "95 % mm", _interval),
         Column("", "a90/95 mm", lambda row: _both(row, lambda limit: limit.a90_95.value)),
         Column("", "lost, won", lambda row: f"-{row.hits.only_first} +{row.hits.only_second}" if row.hits else "–"),
-        Column("", "p", _limit_p),
+        Column("", "p", lambda row: p_value(row.limit_p[0]) if row.limit else "–"),
         Column(
             "",
             "false calls/m²",
@@ -82,14 +78,9 @@ def compare_html(comparison: Comparison, command: str) -> str:
     """The page as text: answer, table, where both studies come from. It needs no network."""
     names = " and ".join(dict.fromkeys((comparison.first.name, comparison.second.name)))
     origins = zip(("study", "commit", "seed"), _origin(comparison.first), _origin(comparison.second), strict=True)
-    body = [
-        heading("Set-ups"),
-        COMPARED.grid(comparison.rows).html(),
-        fold("What verdicts and columns say", note(rule(comparison)), note(TESTS)),
-        heading("Origin"),
-        Grid.of(("", "first", "second"), origins, left=3).html(),
-        *command_of(command),
-    ]
+    words = fold("What verdicts and columns say", note(rule(comparison)), note(TESTS))
+    body = [heading("Set-ups"), COMPARED.grid(comparison.rows).html(), words, heading("Origin")]
+    body += [Grid.of(("", "first", "second"), origins, left=3).html(), *command_of(command)]
     under = [note(f"{remark[0].upper()}{remark[1:]}.") for remark in remarks(comparison)]
     return page(f"Comparison: {names}", answer(comparison), body, under)
 

@@ -46,16 +46,6 @@ class StudyDesign:
     hole_free: planned.HoleFree | None
 
     @property
-    def size_name(self) -> str:
-        """a90 and its like."""
-        return f"a{100 * self.plans[0].pod:g}"
-
-    @property
-    def limit_name(self) -> str:
-        """a90/95 and its like."""
-        return f"{self.size_name}/{100 * self.plans[0].confidence:g}"
-
-    @property
     def in_unit(self) -> str:
         """The unit in brackets, where there is one."""
         return f" ({self.unit})" if self.unit else ""
@@ -68,7 +58,7 @@ class StudyDesign:
 def design_html(design: StudyDesign, command: str) -> str:
     """The page as text: answer, figure, plans and sizes, hole-free area; it needs no network."""
     caption = (
-        f"Left: the {design.limit_name} that simulated studies demonstrate, with the guess's own size, below which a "
+        "Left: the a90/95 that simulated studies demonstrate, with the guess's own size, below which a "
         "limit should not fall. Right: the guessed curve and the sizes of the recommended plan."
     )
     drawn = blocks.svg("design", SIZE_IN, answer(design), lambda canvas: _draw(canvas, design))
@@ -103,10 +93,10 @@ def answer(design: StudyDesign) -> str:
         reached = "nine of ten studies demonstrate" if design.reaches else "no plan listed is sure to show"
         wish = f"; {reached} the {design.text(design.goal)} that is wanted"
     if not np.isfinite(plan.bound):
-        expects = f"even so most studies would demonstrate no {design.limit_name}"
+        expects = "even so most studies would demonstrate no a90/95"
     else:
         spread = f"between {design.text(plan.low)} and {design.text(plan.high)} in eight of ten studies"
-        expects = f"expect {design.limit_name} at {design.text(plan.bound)}, {spread}"
+        expects = f"expect a90/95 at {design.text(plan.bound)}, {spread}"
     low, high = map(design.text, design.range_of_sizes)
     return f"Make {plan.targets} targets, evenly spread from {low} to {high}: {expects}{wish}."
 
@@ -140,7 +130,7 @@ PLANS = Table(
 def plans_grid(design: StudyDesign) -> Grid:
     """Every plan, the recommended one with a star, and what its studies demonstrate."""
     rows = [(plan, plan is design.recommended) for plan in design.plans]
-    return PLANS.grid(rows, heads={"limit": f"{design.limit_name}{design.in_unit}"})
+    return PLANS.grid(rows, heads={"limit": f"a90/95{design.in_unit}"})
 
 
 def hole_free_lines(design: StudyDesign) -> list[str]:
@@ -164,17 +154,17 @@ def notes(design: StudyDesign) -> list[str]:
     """Return the handbook's minima, Monte Carlo error, and what the plan rests on."""
     plan, (low, high), found = design.recommended, design.range_of_sizes, []
     if not low <= plan.true_size <= high:
-        found.append(f"the guess's own {design.size_name} lies outside the range: it is extrapolated")
+        found.append("the guess's own a90 lies outside the range: it is extrapolated")
     if design.reaches is False and design.goal is not None and np.isfinite(plan.high):
         # The bound's distance from the truth is a multiple of a standard error.
         wanted = plan.targets * ((plan.high - plan.true_size) / (design.goal - plan.true_size)) ** 2
         found.append(
-            f"the limit nears the guess's own {design.size_name} about as one over the root of the targets: for "
+            f"the limit nears the guess's own a90 about as one over the root of the targets: for "
             f"{design.text(design.goal)} some {float(f'{wanted:.2g}'):.0f} would be needed"
         )
     if high < plan.bound < np.inf:
         found.append(
-            f"the {design.limit_name} to expect lies beyond the largest target of {design.text(high)}: it rests on the "
+            f"the a90/95 to expect lies beyond the largest target of {design.text(high)}: it rests on the "
             "curve's shape there; make larger ones"
         )
     if plan.targets < LEAST_TARGETS:
@@ -224,14 +214,14 @@ def _draw(canvas: Figure, design: StudyDesign) -> None:
     for place, bound, end in zip(places, bounds, ends, strict=True):
         said = "none" if not np.isfinite(bound) else "↑" if end > top else ""
         left.text(place, top, said, ha="center", va="top", color=blocks.BLUE)
-    said = plain(f"the guess's {design.size_name}: {design.text(true_size)}")
+    said = plain(f"the guess's a90: {design.text(true_size)}")
     left.axhline(true_size, color=blocks.RED, lw=1.2, label=said)
     if design.goal is not None:
         said = plain(f"wanted: {design.text(design.goal)}")
         left.axhline(design.goal, color=blocks.GREEN, lw=1.2, ls="--", label=said)
     left.set(xlim=(-0.6, len(places) - 0.4), ylim=(0.95 * min(true_size, *lows), max(top, 1.02 * (design.goal or 0))))
     left.set_xticks(places, [str(one.targets) for one in design.plans])
-    left.set(xlabel="targets", ylabel=axis_text(f"{design.limit_name} to expect", design.unit))
+    left.set(xlabel="targets", ylabel=axis_text("a90/95 to expect", design.unit))
     left.set_title(f"{plan.studies} simulated studies each")
     sizes = np.linspace(low, high, 241)[1:]
     right.plot(sizes, design.guess.pod(sizes), color=blocks.INK, label=f"guessed POD, {design.guess.link}")

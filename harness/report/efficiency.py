@@ -92,11 +92,6 @@ def efficiency_html(rows: Sequence[Efficiency], first: str, warnings: Sequence[s
         "Share of damages found against d'; lines are probit curves of ln d', points classes of equally many damages. "
         "Detectors that lose the same share everywhere have one curve for all sizes and kinds."
     )
-    body = [
-        heading("Set-ups"),
-        EFFICIENCY.grid(rows).html(),
-        note(READ),
-        figure({"against-d": efficiency_figure(rows)}, "against-d", caption),
-        *command_of(command),
-    ]
+    drawn = figure({"against-d": efficiency_figure(rows)}, "against-d", caption)
+    body = [heading("Set-ups"), EFFICIENCY.grid(rows).html(), note(READ), drawn, *command_of(command)]
     return page(f"Efficiency: {name}", answer(rows), body, [note(first)], warnings)

@@ -144,10 +144,7 @@ def json_text(judged: Judged, about: Mapping[str, Any]) -> str:
         asdict(finding)
         | {
             "extent": {"diameter_mm": m.extent_diameter_m / MM, "centre_mm": m.extent_centre_m / MM},
-            "model": {
-                **{f"{name}_mm": getattr(m, f"model_{name}_m") / MM for name in MODELLED},
-                "note": m.model_note,
-            },
+            "model": {**{f"{name}_mm": getattr(m, f"model_{name}_m") / MM for name in MODELLED}, "note": m.model_note},
         }
         for finding, m in zip(judged.findings, judged.measurements, strict=True)
     ]

@@ -10,12 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harness.evaluation.set_ups import LIMIT_RULE, set_ups_of
-from harness.evaluation.summary import (
-    MAIN,
-    fit_floor,
-    found_holes,
-    hole_list,
-)
+from harness.evaluation.summary import MAIN, fit_floor, found_holes, hole_list
 from harness.report import blocks, sections
 from harness.report.blocks import COLOURS, MARKERS
 from harness.report.clouds import ExampleCloud, MappedExample, residual_figure
@@ -23,19 +18,11 @@ from harness.report.perspectives import map_files, map_text, perspectives_html
 from harness.report.posterior import posterior_section
 from harness.report.summaries import Summaries, is_thesis, of_set_ups, summaries, verdicts_of
 from harness.report.view3d import write_view3d
+from harness.tables import trials
 from harness.tables.outputs import REPORT
 from harness.tables.study import axis_value
 from harness.tables.text import Grid, inches, many
-from harness.tables.trials import (
-    EFFECTS,
-    ERRORS,
-    FALSE_CALLS,
-    NOISE_BY_FRAMES,
-    POSTERIOR,
-    SET_UPS,
-    SUMMARY,
-    ResultTables,
-)
+from harness.tables.trials import ERRORS, FALSE_CALLS, NOISE_BY_FRAMES, SET_UPS, SUMMARY, ResultTables
 from harness.thesis.claims import Verdict
 from harness.thesis.inference import borne_out_if
 from harness.vocabulary.files import write_text
@@ -88,7 +75,7 @@ def limits_figure(compared: pd.DataFrame, layout: Layout, frames: Sequence[int])
 def noise_figure(noise: pd.DataFrame) -> str:
     """Temporal, systematic and total error of one variant against frames, with the 1/sqrt(N) guide and the floor."""
     frames = noise["frames"].to_numpy(float)
-    fit = fit_floor(frames, noise["total_rms_mm"].to_numpy(float))
+    floor_mm = fit_floor(frames, noise["total_rms_mm"].to_numpy(float))
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
@@ -101,8 +88,8 @@ def noise_figure(noise: pd.DataFrame) -> str:
         ):
             values = noise[column].where(noise[column] > 0)
             axes.plot(frames, values, marker=marker, ms=5, lw=1.4, color=colour, label=label)
-        if fit is not None and fit.floor_mm > 0:
-            axes.axhline(fit.floor_mm, color=blocks.INK, lw=0.8, ls=(0, (6, 3)), label=f"floor {fit.floor_mm:.2f} mm")
+        if floor_mm > 0:
+            axes.axhline(floor_mm, color=blocks.INK, lw=0.8, ls=(0, (6, 3)), label=f"floor {floor_mm:.2f} mm")
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.set_xticks(frames, [f"{n:g}" for n in frames])
@@ -204,7 +191,7 @@ def set_ups_html(
 ) -> str:
     """The page of several set-ups as text; see `write_report`."""
     found = found or summaries(tables, examples, with_claims=about.with_claims)
-    compared, costs, posterior = of_set_ups(found[SET_UPS], tables), found[EFFECTS], found.get(POSTERIOR)
+    compared, costs, posterior = of_set_ups(found[SET_UPS], tables), found[trials.EFFECTS], found.get(trials.POSTERIOR)
     verdict = next(iter(verdicts_of(found)), None)
     layout, frames = Layout.of(tables), sections.shown_frames(compared)
     figures: dict[str, str] = {}
@@ -347,6 +334,5 @@ def answer_sentence(main: pd.DataFrame, verdicts: Sequence[Verdict] = ()) -> str
             drill = f", {inches(least)}" if inches(least) else ""
             text += f" ({hole_list(found)}; the smallest is {least:.2f} mm{drill})"
         text += f", with {hole_list(open_)} undecided" if open_ else ""
-        counted = "one frame" if n == 1 else f"{n} averaged frames"
-        parts.append(f"with {counted} {text}" if parts else f"With {counted} the camera finds {text}")
+        parts.append(f"with {_averaged(n)} {text}" if parts else f"With {_averaged(n)} the camera finds {text}")
     return f"{'; '.join(parts)}.{sections.counted_verdicts(verdicts)}"

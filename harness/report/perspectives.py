@@ -123,9 +123,9 @@ def answer_sentence(cases: Sequence[maps.MapCase], verdicts: Sequence[Verdict] =
 
 
 def map_files(examples: Sequence[MappedExample]) -> dict[str, MappedExample]:
-    """The file of each map that turns in the browser, beside the report."""
+    """The file of each map that turns in the browser, beside the report; the most frames first, then by views, way."""
     files: dict[str, MappedExample] = {}
-    for example in _in_order(examples):
+    for example in sorted(examples, key=lambda e: (-e.frames, e.views, e.registration, e.merge, e.variant)):
         words = f"{example.views} views {example.registration} {example.merge} {example.frames} frames"
         words += f" {example.variant}" if example.is_variation else ""
         stem = re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-")
@@ -136,17 +136,9 @@ def map_files(examples: Sequence[MappedExample]) -> dict[str, MappedExample]:
 
 def map_text(example: MappedExample) -> str:
     """One map in words."""
-    variation = f": {example.variant}" if example.is_variation else ""
-    return f"{many(example.views, 'view')} ({_way(example)}), {maps.frames_text(example.frames)}{variation}"
-
-
-def _way(example: MappedExample) -> str:
-    return ", ".join(part for part in (method_text(example.registration), example.merge) if part)
-
-
-def _in_order(examples: Sequence[MappedExample]) -> list[MappedExample]:
-    """The most frames first, then by views and way."""
-    return sorted(examples, key=lambda e: (-e.frames, e.views, e.registration, e.merge, e.variant))
+    variation, way = f": {example.variant}" if example.is_variation else "", method_text(example.registration)
+    way = maps.label_of(way, example.merge)
+    return f"{many(example.views, 'view')} ({way}), {maps.frames_text(example.frames)}{variation}"
 
 
 METHOD_COLOURS = {
@@ -157,7 +149,7 @@ METHOD_COLOURS = {
     "joint": blocks.RED,
     "odometry": blocks.PURPLE,
 }
-PART_NAMES = {"in_plane": "in the plane of the board", "across": "across it"}
+PART_NAMES = {"in_plane": "In the plane of the board", "across": "Across it"}
 
 
 def method_text(method: str) -> str:
@@ -191,7 +183,7 @@ def tre_figure(registrations: pd.DataFrame, frames: Sequence[int]) -> str:
             axes.set_xticks(range(len(methods)), [method_text(method) for method in methods])
             axes.set_xlim(-0.6, len(methods) - 0.4)
             axes.grid(axis="x", visible=False)
-            axes.set_title(PART_NAMES[part][0].upper() + PART_NAMES[part][1:])
+            axes.set_title(PART_NAMES[part])
             heads = " and ".join(many(n, "frame") for n in frames)
             axes.set_xlabel(f"method ({heads}, left to right)", loc="left")
         panels[0].set_ylabel("target registration error (mm)")

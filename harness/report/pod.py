@@ -10,24 +10,8 @@ import numpy as np
 from harness.evaluation.pod.curve import Bound
 from harness.evaluation.pod.hit_miss import NEAR_DEVIANCE
 from harness.evaluation.pod.statement import POD, PodStatement
-from harness.report.blocks import (
-    BLUE,
-    GREEN,
-    GREY,
-    INK,
-    ORANGE,
-    PURPLE,
-    RED,
-    bullets,
-    command_of,
-    figure,
-    heading,
-    note,
-    page,
-    save_png,
-    subheading,
-    svg,
-)
+from harness.report import blocks
+from harness.report.blocks import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, RED
 from harness.tables.schema import Column, Table
 from harness.tables.text import Grid
 
@@ -65,17 +49,18 @@ def pod_html(statement: PodStatement, command: str) -> str:
             "holds all their bands."
         )
     size_in, draw = _plan(statement)
-    drawn = svg("pod", size_in, f"{answer(statement)} {statement.counts}.", draw)
-    body = [heading("Curve"), figure({"pod": drawn}, "pod", caption), heading("Sizes"), sizes_grid(statement).html()]
-    body += [heading("Models"), note(chosen_by), models_grid(statement).html()]
-    body += [heading("Fit"), fit_grid(statement).html()]
+    drawn = blocks.svg("pod", size_in, f"{answer(statement)} {statement.counts}.", draw)
+    body = [blocks.heading("Curve"), blocks.figure({"pod": drawn}, "pod", caption)]
+    body += [blocks.heading("Sizes"), sizes_grid(statement).html(), blocks.heading("Models")]
+    body += [blocks.note(chosen_by), models_grid(statement).html()]
+    body += [blocks.heading("Fit"), fit_grid(statement).html()]
     if statement.tests:
         rows = [(what, "< 0.001" if p < 0.001 else f"{p:.3f}", reads) for what, p, reads in statement.tests]
-        body += [subheading("Tests"), Grid.of(("test", "p", "reads"), rows, left=3).html()]
-    body += [heading("Notes"), bullets((*statement.notes, VALIDITY)), *command_of(command)]
-    under = [note(f"{statement.kind.capitalize()}: {statement.counts}. Model: {statement.model}.")]
+        body += [blocks.subheading("Tests"), Grid.of(("test", "p", "reads"), rows, left=3).html()]
+    body += [blocks.heading("Notes"), blocks.bullets((*statement.notes, VALIDITY)), *blocks.command_of(command)]
+    under = [blocks.note(f"{statement.kind.capitalize()}: {statement.counts}. Model: {statement.model}.")]
     title = f"Probability of detection: {statement.read.path.name}"
-    return page(title, answer(statement), body, under, statement.doubts)
+    return blocks.page(title, answer(statement), body, under, statement.doubts)
 
 
 def pod_parts(statement: PodStatement) -> list[str | Grid]:
@@ -131,7 +116,7 @@ def _bound_text(bound: Bound, unit: str) -> str:
 def save_pod_png(path: Path, statement: PodStatement) -> None:
     """The figure as a PNG at ``path``; the same bytes for the same statement."""
     size_in, draw = _plan(statement)
-    save_png(path, size_in, draw)
+    blocks.save_png(path, size_in, draw)
 
 
 def answer(statement: PodStatement) -> str:

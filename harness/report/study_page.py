@@ -73,7 +73,7 @@ def draw_overlay(figure: Figure, limits: Sequence[SetUpLimit]) -> None:
     axes.axhline(0.9, color=GREY, lw=0.8, ls=":")
     room = ROW * len(limits)
     axes.set(xlim=_span(limits), ylim=(-room, 1 + room), yticks=np.linspace(0, 1, 6))
-    axes.set(xlabel=_size_axis(limits[0]), ylabel="probability of detection")
+    axes.set(xlabel=f"{limits[0].record.inspected.limit_of} (mm)", ylabel="probability of detection")
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=_names_across(names))
 
 
@@ -99,10 +99,6 @@ def depth_limits_figure(results: Sequence[SetUpResult]) -> str:
     lines = sum(-(-len(name_of(limit)) // LONGEST_NAME) for limit, _ in surfaces)
     alt = "Smallest depth found 90 % of the time against size, as depth_limits.csv says."
     return svg("depth-limits", (7.0, 4.0 + 0.17 * lines), alt, draw)
-
-
-def _size_axis(limit: SetUpLimit) -> str:
-    return f"{limit.record.inspected.limit_of} (mm)"
 
 
 def _span(limits: Sequence[SetUpLimit]) -> tuple[float, float]:
@@ -221,12 +217,8 @@ def axis_figure(axis: study.AxisGroup, name: str) -> str:
         axes.set_ylim(0, top_mm if np.isfinite(top_mm) else None)
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2)
 
-    return svg(
-        name,
-        (7.0, 4.4 + 0.13 * len(shown)),
-        f"Diameter found 90 % of the time (a90) against {axis.title}, as the table says.",
-        draw,
-    )
+    alt = f"Diameter found 90 % of the time (a90) against {axis.title}, as the table says."
+    return svg(name, (7.0, 4.4 + 0.13 * len(shown)), alt, draw)
 
 
 def study_parts(result: StudyResult) -> list[str | Grid]:
@@ -238,11 +230,7 @@ def study_parts(result: StudyResult) -> list[str | Grid]:
 
 
 def study_html(
-    result: StudyResult,
-    examples: Sequence[StudyExample],
-    provenance: Mapping[str, Any],
-    resolved_yaml: str,
-    title: str,
+    result: StudyResult, examples: Sequence[StudyExample], provenance: Mapping[str, Any], resolved_yaml: str, title: str
 ) -> str:
     """Return the page as text; the same input gives the same bytes."""
     limits, rows = result.limits, study.study_tables(result)
@@ -252,7 +240,7 @@ def study_html(
     inspected = [one.limit for one in shown if one.limit.inspections]
     curved = [one for one in shown if one.roc or one.free_response or one.pixels]
     figures = {name: axis_figure(group, name) for name, group in groups.items()}
-    if inspected and len({_size_axis(limit) for limit in inspected}) == 1:  # a depth is not drawn beside a diameter
+    if len({one.record.inspected.limit_of for one in inspected}) == 1:  # a depth is not drawn beside a diameter
         figures["overlay"] = overlay_figure(inspected)
     figures |= {"depth-limits": depth_limits_figure(shown)} if any(one.surface for one in shown) else {}
     figures |= {"operating": operating_figure(curved)} if curved else {}

@@ -15,7 +15,6 @@ from harness.vocabulary.files import write_text
 MOST_POINTS = 150_000
 VIEW_COLOURS = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE, "#F0E442", "#332288", "#882255", "#44AA99")
 """Okabe and Ito's, then four of Tol's muted ones; further views begin anew."""
-SEVERAL = GREY
 SEVERAL_CODE = 255
 RESIDUAL_STEP_MM = 0.01
 NO_RESIDUAL = -32768
@@ -114,7 +113,7 @@ def packed(scene: Scene3d) -> dict[str, Any]:
         "circles": circles,
         "views": [] if view is None else views,
         "residual_step": RESIDUAL_STEP_MM,
-        "several": SEVERAL,
+        "several": GREY,
         "mark": DAMAGE,
         "frame": scene.frame,
         "shown": scene.shown,

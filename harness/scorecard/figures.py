@@ -23,7 +23,6 @@ from harness.evaluation.intervals import Interval
 from harness.scorecard.bench import Bench, Effort, Reading
 from harness.scorecard.quantities import QUANTITIES, Quantity, in_words, scene_of
 from harness.tables.schema import Column, Table
-from harness.tables.text import Tone
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration.diagnose import validated, wrong_choice
 from harness.vocabulary.declaration.shape import child
@@ -265,10 +264,6 @@ def _remarks(score: Score) -> str:
     return why + score.figure.note
 
 
-def _tone(score: Score) -> Tone:
-    return "good" if score.passes else "bad"
-
-
 VERSION = Column("results_version", "", lambda row: RESULTS_VERSION, "version of the tables' meaning")
 SCORES = Table(
     "scorecard",
@@ -285,7 +280,9 @@ SCORES = Table(
         Column("ratio", "ratio", "ratio", "simulated by published, or by the nearer bound", number),
         Column("passes_from", "", lambda score: score.figure.limits[0], "lowest value that passes"),
         Column("passes_to", "", lambda score: score.figure.limits[1], "highest value that passes"),
-        Column("verdict", "verdict", "verdict", "whether the simulated value passes", tone=_tone),
+        Column(
+            "verdict", "verdict", "verdict", "whether it passes", tone=lambda score: "good" if score.passes else "bad"
+        ),
         Column("use", "use", "figure.use", "blind, calibration (the camera's file may be fitted to it) or code"),
         Column("tag", "", "figure.tag", "R read, D derived, S secondary, W measured on captures, M a guess"),
         Column(

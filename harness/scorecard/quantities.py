@@ -59,7 +59,6 @@ ROOM_LIGHT = CameraConfig().ambient_uw_cm2_nm
 Distance = Annotated[float, Field(ge=0.1, le=20.0, description="along the optical axis, in metres")]
 Albedo = Annotated[float, Field(gt=0.0, le=1.0, description="diffuse reflectance, above 0 and up to 1")]
 Lag = Annotated[int, Field(ge=0, le=16, description="pixels from 0 to 16")]
-StepMm = Annotated[float, Field(ge=0.5, le=5e3, description="from front to back, 0.5 to 5000 mm")]
 
 
 class PlaneConditions(Config):
@@ -93,7 +92,7 @@ class StepConditions(Config):
     image axis ``across``; with ``shadow`` the front is on the emitter's side and throws its shadow on the back."""
 
     distance_m: Distance = 0.75
-    step_mm: StepMm = 50.0
+    step_mm: Annotated[float, Field(ge=0.5, le=5e3, description="from front to back, 0.5 to 5000 mm")] = 50.0
     albedo: Albedo = 0.6
     across: Literal["x", "y"] = "x"
     shadow: bool = False

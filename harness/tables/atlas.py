@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from itertools import product
 
 import numpy as np
 
@@ -25,7 +25,7 @@ class Row:
     title: str
     place: Mapping[str, float]
     answer: Answer
-    size_mm: float = float("nan")
+    size_mm: float = np.nan
 
     @property
     def damage(self) -> str:
@@ -80,10 +80,7 @@ ATLAS = Table(
 
 
 def rows_at(
-    surfaces: Iterable[LimitSurface],
-    titles: Mapping[str, str],
-    place: Mapping[str, float],
-    size_mm: float = float("nan"),
+    surfaces: Iterable[LimitSurface], titles: Mapping[str, str], place: Mapping[str, float], size_mm: float = np.nan
 ) -> tuple[list[Row], list[str]]:
     """Return the rows at a place, best first, and why other surfaces say nothing there."""
     rows, refused = [], []
@@ -102,11 +99,10 @@ def curves(surfaces: Sequence[LimitSurface], titles: Mapping[str, str]) -> list[
     rows = []
     for surface in surfaces:
         ends = surface.grid["distance_m"]
-        others: list[dict[str, Any]] = [{}]
-        for axis in (axis for axis in surface.grid if axis != "distance_m"):
-            others = [{**other, axis: value} for other in others for value in surface.grid[axis]]
-        for other in others:
+        others = [axis for axis in surface.grid if axis != "distance_m"]
+        for values in product(*(surface.grid[axis] for axis in others)):
             for distance_m in np.round(np.geomspace(ends[0], ends[-1], DISTANCES), 4):
-                place = {**other, "distance_m": float(np.clip(distance_m, ends[0], ends[-1]))}
+                place = dict(zip(others, values, strict=True))
+                place["distance_m"] = float(np.clip(distance_m, ends[0], ends[-1]))
                 rows.append(Row(surface, titles[surface.camera], place, surface.at(**place)))
     return rows

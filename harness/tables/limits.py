@@ -264,10 +264,9 @@ def limit_sentence(limit: SetUpLimit, *, again: bool = False) -> str:
     elif not is_within_sizes(limit, quote):
         found = f"no limit (a90/95) within the sizes inspected{_sizes(limit)}"
     else:
-        confidence, size = f"{100 * quote.confidence:.0f} %", text.size(quote.value)
-        size = {"depth": "{} mm deep", "width": "{} mm wide", "length": "{} mm long"}.get(
-            limit.record.inspected.limit_of, "of {} mm"
-        ).format(size)
+        confidence = f"{100 * quote.confidence:.0f} %"
+        words = {"depth": "{} mm deep", "width": "{} mm wide", "length": "{} mm long"}
+        size = words.get(limit.record.inspected.limit_of, "of {} mm").format(text.size(quote.value))
         found = f"damage {size} is found 90 % of the time{new} with {confidence} confidence (a90/95)"
         found = size.removeprefix("of ") if again else found
     calls, rate = limit.false_calls, ""

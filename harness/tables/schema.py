@@ -6,14 +6,9 @@ row's attributes (a pair of paths for an estimate and its interval), or a functi
 the same name in a mapping. Its ``note`` says what it means, its ``text`` how a value reads. An estimate with an
 interval fills three columns of a file (``speed_m``, ``speed_low_m``, ``speed_high_m``) and one of a page.
 
-    SPEEDS = Table(
-        "speeds",
-        "one row per animal",
-        (
-            Column("animal", "animal", "species.name", "name of the species"),
-            Column("speed_m", "speed (m/s)", ("speed", "interval"), "metres in a second"),
-        ),
-    )
+    name = Column("animal", "animal", "species.name", "name of the species")
+    speed = Column("speed_m", "speed (m/s)", ("speed", "interval"), "metres in a second")
+    SPEEDS = Table("speeds", "one row per animal", (name, speed))
     SPEEDS.frame(animals)        # a DataFrame; write_table(folder, SPEEDS, frame) makes speeds.csv, speeds.parquet
     SPEEDS.grid(animals).html()  # a page's table; .lines() and .rich() for terminals; harness.tables.text.show prints
     SPEEDS.data(animals)         # JSON's types

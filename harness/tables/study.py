@@ -38,8 +38,6 @@ SHOWN_ROWS = 60
 BOUND = "its upper bound at 95 % confidence; empty where not demonstrated"
 
 SET_UP_OF = Column("set_up", "set-up", "limit.record.label", SET_UP.note, text.unbroken)
-
-
 UNFLAWED = ("chance.of_sites", "chance.sites_interval")
 CHANCE = Table(
     "chance",
@@ -52,15 +50,7 @@ CHANCE = Table(
         Column("expected_share", "from the rate", "chance.expected", "hits, were false calls spread evenly"),
     ),
 )
-
-
-GIVEN = "undamaged runs that set it; 0: given"
-
-
-def _runs(count: int) -> str:
-    return str(count or "none: given")
-
-
+GIVEN, UNSET = "undamaged runs that set it; 0: given", "none: given"
 THRESHOLDS = Table(
     "thresholds",
     "one row per set-up and number of frames: its threshold and the false calls that it lets through on other boards",
@@ -68,7 +58,7 @@ THRESHOLDS = Table(
         SET_UP,
         Column("threshold", "threshold", "record.threshold", "in the detector's units"),
         Column("threshold_mm", "in mm", "record.threshold_mm", "times the mean scale"),
-        Column("calibration_runs", "calibration runs", "record.calibration_runs", GIVEN, _runs),
+        Column("calibration_runs", "calibration runs", "record.calibration_runs", GIVEN, lambda n: str(n or UNSET)),
         replace(CALLS[0], label="per m² (95 %)"),
         replace(CALLS[1], label="false calls on other boards"),
         replace(CALLS[2], label="undamaged m²"),
@@ -322,8 +312,6 @@ DEPTH_LIMITS = Table(
         Column("depth_mm", "depth (mm)", "depth", "found 90 % of the time; inf: none is", interval=True),
     ),
 )
-
-
 STUDY_TABLES = (LIMITS, THRESHOLDS, CHANCE, OPERATING, AXES, DEPTH_LIMITS)
 
 

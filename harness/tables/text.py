@@ -161,9 +161,7 @@ class Grid:
         from markupsafe import Markup
 
         number = [Markup("" if place < self.left else ' class="n"') for place in range(len(self.heads))]
-        heads = Markup("").join(
-            Markup("<th{}>{}</th>").format(kind, head) for kind, head in zip(number, self.heads, strict=True)
-        )
+        heads = Markup("").join(map(Markup("<th{}>{}</th>").format, number, self.heads))
         rows = []
         for row in self.rows:
             cells = [Markup('<th scope="row">{}</th>').format(row[0].text)]

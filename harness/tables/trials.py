@@ -90,6 +90,7 @@ MARKS: dict[str, tuple[str, Tone]] = {
     "not borne out": ("✗", "bad"),
     "undecided": ("?", "open"),
 }
+PITCH = ("pitch_u_mm", "pitch_v_mm")
 LAGS = tuple(f"correlation_{way}{lag}" for way in "uv" for lag in (1, 2, 3))
 
 TRIALS = Table(
@@ -225,10 +226,7 @@ FINDINGS = Table(
 OPERATING = Table(
     "operating",
     "one row per trial of a study and threshold other than the one in use, on a grid",
-    (
-        *(*COMMON, *BOARD, *ROLE),
-        *_columns(threshold="threshold", findings="findings above it", hits="hits among them"),
-    ),
+    (*(*COMMON, *BOARD, *ROLE), *_columns(threshold="threshold", findings="findings above it", hits="hits among them")),
     ("variant", "frames", "role", "board", "repeat"),
     ("parquet",),
     lists=("threshold", "findings", "hits"),
@@ -259,10 +257,6 @@ def _error(of: str, label: str) -> Column:
         return f"{text.plus_minus(row[f'{of}_bias_mm'], row[f'{of}_std_mm'], '+')} ({count})" if count else "–"
 
     return Column("", label, error)
-
-
-def _pitch(row: Mapping[str, Any]) -> str:
-    return " × ".join(text.mm(row.get(f"pitch_{way}_mm", math.nan)) for way in "uv")
 
 
 def _found(row: Mapping[str, Any]) -> Cell:
@@ -362,7 +356,7 @@ SET_UPS = Table(
             for of, label in ERRORS.items()
             for name, note in (("bias_mm", "mean"), ("std_mm", "standard deviation"), ("n", "number"))
         ),
-        Column("", "mm per pixel", _pitch),
+        Column("", "mm per pixel", lambda row: " × ".join(text.mm(row.get(name, math.nan)) for name in PITCH)),
         Column("valid_share", "valid", note=NOISE.columns[3].note, text=_percent),
         *NOISE.columns[4:6],
         Column("single_frame_mm", "one frame (mm)", note=NOISE.columns[6].note),

@@ -52,10 +52,8 @@ def declared() -> dict[str, dict[str, str]]:
 def verdict_of(claim: str, answer: Answer, evidence: str) -> Verdict:
     """The verdict on a claim of claims.yaml."""
     said = declared()[claim]
-    limits = {"MANY": MANY, "RULER_MM": RULER_MM, "SLOPE_MARGIN": SLOPE_MARGIN}
-    limits |= {"UNCHANGED": UNCHANGED, "FEWEST_RANKED": FEWEST_RANKED}
-    limits |= {"FEWEST_UNITS": FEWEST_UNITS, "FEWEST_PAIRS": FEWEST_PAIRS}
-    return Verdict(claim, said["says"], answer, evidence, said["criterion"].format_map(limits))
+    # a criterion names constants of this module
+    return Verdict(claim, said["says"], answer, evidence, said["criterion"].format_map(globals()))
 
 
 def decide(parts: Iterable[bool | None]) -> Answer:
@@ -214,22 +212,13 @@ RULES: dict[str, Callable[[Case], tuple[Answer, str]]] = {
 
 
 def score_claims(
-    tables: ResultTables,
-    variant: str = MAIN,
-    examples: Sequence[Any] = (),
-    summary: pd.DataFrame | None = None,
+    tables: ResultTables, variant: str = MAIN, examples: Sequence[Any] = (), summary: pd.DataFrame | None = None
 ) -> list[Verdict]:
     """A verdict for each of `RULES` on one variant. ``summary`` saves making `summarise_holes` again."""
     summary = summarise_holes(tables.holes) if summary is None else summary
-    holes = with_columns(tables.holes)
-    case = Case(
-        variant=variant,
-        summary=summary[summary["variant"] == variant],
-        holes=holes[holes["variant"] == variant],
-        runs=tables.runs[tables.runs["variant"] == variant],
-        probes=tables.probes[tables.probes["variant"] == variant],
-        examples=[example for example in examples if example.variant == variant],
-    )
+    every = (summary, with_columns(tables.holes), tables.runs, tables.probes)
+    summary, holes, runs, probes = (table[table["variant"] == variant] for table in every)
+    case = Case(variant, summary, holes, runs, probes, [one for one in examples if one.variant == variant])
     return [verdict_of(claim, *rule(case)) for claim, rule in RULES.items()]
 
 

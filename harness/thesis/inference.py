@@ -52,17 +52,13 @@ def posterior_of(summary: pd.DataFrame, axes: Sequence[str]) -> pd.DataFrame | N
     for path, name in names_of(list(axes)).items():
         among, kind = of_set_up, SPEAKS_OF.get(path)
         if kind and KIND in axes:
-            among, name = of_set_up[of_set_up[KIND] == kind], f"{name}{_of_kind(kind)}"
+            among, name = of_set_up[of_set_up[KIND] == kind], f"{name} of {kind} holes"
         for value, there in among.groupby(path, dropna=False):
             own = {"axis": name, "value": value_text(path, value), "prior_share": len(there) / len(among)}
             mean = float(np.exp(logs[there.index]).mean())
             part = float(share[there.index].sum() / share[among.index].sum())
             told.append({**own, "likelihood": mean, "posterior_share": part})
     return pd.DataFrame(told)
-
-
-def _of_kind(kind: str) -> str:
-    return f" of {kind} holes"
 
 
 def borne_out_if(posterior: pd.DataFrame) -> str:
@@ -72,7 +68,7 @@ def borne_out_if(posterior: pd.DataFrame) -> str:
     asked = []
     for name, rows in posterior[posterior["axis"] != SET_UP].groupby("axis", sort=False):
         kept = rows["value"][~doubted[rows.index]]
-        without = any(str(name).endswith(_of_kind(kind)) for kind in posterior["value"][doubted])
+        without = any(str(name).endswith(f" of {kind} holes") for kind in posterior["value"][doubted])
         asked += [f"{name} is {' or '.join(kept)}"] if len(kept) < len(rows) and not without else []
     said = "; ".join(asked) if asked else "nothing in particular holds: every value of every axis remains possible"
     return (

@@ -11,7 +11,7 @@ from scipy import stats
 from harness.evaluation.intervals import threshold_for_rate
 from harness.evaluation.pod.curve import PodCurve, link_ppf
 from harness.evaluation.pod.hit_miss import METHOD, bound, fit_hit_miss
-from harness.evaluation.pod.statement import LEAST_TARGETS
+from harness.evaluation.pod.statement import CONFIDENCE, LEAST_TARGETS, POD
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.seeds import random_stream
 
@@ -54,14 +54,7 @@ def even_sizes(number: int, range_of_sizes: tuple[float, float]) -> np.ndarray:
 
 
 def design(
-    guess: PodCurve,
-    targets: Sequence[int],
-    range_of_sizes: tuple[float, float],
-    *,
-    pod: float = 0.9,
-    confidence: float = 0.95,
-    studies: int = 200,
-    seed: int = 0,
+    guess: PodCurve, targets: Sequence[int], range_of_sizes: tuple[float, float], *, studies: int = 200, seed: int = 0
 ) -> tuple[StudyPlan, ...]:
     """Simulate a `StudyPlan` of evenly spread sizes for each number of targets, analysed with the guess's link, axis. A
     study that found all or nothing, or whose POD does not grow with size, demonstrates nothing."""
@@ -74,10 +67,10 @@ def design(
                 fit = fit_hit_miss(sizes, hits, link=guess.link, log_size=guess.log_size)
             except UserError:  # All or nothing found, or POD does not grow with size: nothing is demonstrated.
                 continue
-            bounds[study] = bound(fit, pod, confidence).value
+            bounds[study] = bound(fit, POD, CONFIDENCE).value
         # Order statistics, as there is no mean between a number and infinity.
         low, median, high = np.quantile(bounds, [0.1, 0.5, 0.9], method="inverted_cdf").tolist()
-        told = (number, pod, confidence, METHOD, studies, guess.size_at(pod))
+        told = (number, POD, CONFIDENCE, METHOD, studies, guess.size_at(POD))
         plans.append(StudyPlan(*told, median, low, high, float(np.mean(np.isfinite(bounds))), sizes))
     return tuple(plans)
 

@@ -146,11 +146,7 @@ def fit_hit_miss(
 
 
 def choose_model(
-    size: ArrayLike,
-    hit: ArrayLike,
-    *,
-    links: Sequence[str] = LINKS,
-    inspections: ArrayLike | None = None,
+    size: ArrayLike, hit: ArrayLike, *, links: Sequence[str] = LINKS, inspections: ArrayLike | None = None
 ) -> tuple[HitMissFit, ...]:
     """Fit every link with a and (where all sizes are positive) ln a, least deviance first. The order knows nothing of
     the limits: a model chosen because its limit is small has no coverage."""

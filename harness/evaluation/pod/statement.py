@@ -10,19 +10,12 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from harness.evaluation.pod import hit_miss
 from harness.evaluation.pod.ahat import LEVEL, AhatFit, ahat_band, ahat_bound, choose_axes, diagnose
 from harness.evaluation.pod.curve import Bound, PodCurve
-from harness.evaluation.pod.hit_miss import (
-    NEAR_DEVIANCE,
-    Beyond,
-    HitMissFit,
-    bound,
-    choose_model,
-    floor_ceiling_tests,
-    near_models,
-    widest_band,
-)
+from harness.evaluation.pod.hit_miss import NEAR_DEVIANCE, Beyond, HitMissFit
 from harness.evaluation.pod.inspections import Inspections
+from harness.tables.schema import jsonable
 from harness.vocabulary.errors import UserError
 
 POD, CONFIDENCE = 0.9, 0.95
@@ -99,7 +92,7 @@ class PodStatement:
         """Lower and upper edges (`DRAWN`,) of the band; made when it is drawn, because it takes long."""
         if self.signal:
             return ahat_band(self.signal, self.sizes, CONFIDENCE)
-        return widest_band(self.fits, self.sizes)
+        return hit_miss.widest_band(self.fits, self.sizes)
 
     @property
     def model(self) -> str:
@@ -128,51 +121,44 @@ class PodStatement:
         curve, read = self.curve, self.read
         of_curve = {name: getattr(curve, name) for name in ("link", "log_size", "mu", "sigma")}
         models = [
-            {"model": row.name, **{name: finite(getattr(row, name)) for name in ("deviance", "a50", "a90")}}
+            {"model": row.name, **{name: getattr(row, name) for name in ("deviance", "a50", "a90")}}
             | {"a90_95": _bound_data(row.bound), "chosen": row.chosen, "in_a90_95": row.near}
             for row in self.models
         ]
-        return {
+        data = {
             "file": str(read.path),
             **{"kind": self.kind, "unit": self.unit, "size_column": read.size_column},
             **{"response_column": read.response_column, "targets": read.targets, "model": self.model},
             "inspections": len(read.size),
             "hits": None if self.signal else int(read.response.sum()),
-            "curve": {**of_curve, "covariance_mu_sigma": np.asarray(curve.covariance).tolist()},
-            "a50": finite(self.a50),
-            "a90": finite(self.a90),
+            "curve": {**of_curve, "covariance_mu_sigma": curve.covariance},
+            **{"a50": self.a50, "a90": self.a90},
             "a90_95": _bound_data(self.bound),
             "models": models,
-            "numbers": {name: finite(value) for name, value in self.numbers.items()},
-            "tests": [{"test": what, "p": finite(p), "reads": reads} for what, p, reads in self.tests],
-            "notes": list(self.notes),
-            "warnings": self.doubts,
+            "numbers": self.numbers,
+            "tests": [{"test": what, "p": p, "reads": reads} for what, p, reads in self.tests],
+            **{"notes": self.notes, "warnings": self.doubts},
         }
+        return dict(jsonable(data))
 
 
 def state_hits(
-    read: Inspections,
-    *,
-    link: str | None = None,
-    log_size: bool | None = None,
-    unit: str = "",
-    tested: bool = True,
+    read: Inspections, *, link: str | None = None, log_size: bool | None = None, unit: str = "", tested: bool = True
 ) -> PodStatement:
     """State the curve of hits and misses: of all links and sizes or their logarithms (of those that ``link``,
     ``log_size`` leave) the fit with the least deviance; its bound is the largest over the `near_models` of those left.
     ``tested``: for hits by chance and misses at any size, which takes most of the time."""
     from threadpoolctl import threadpool_limits
 
-    # L-BFGS-B hands systems of four unknowns to LAPACK, whose threads wait for each other: 9 s, not 0.6 s, on two
-    # busy cores.
+    # L-BFGS-B hands LAPACK systems of four unknowns, whose threads wait for each other: 9 s, not 0.6 s, on busy cores
     with threadpool_limits(1, user_api="blas"):
         size, hit = read.size, read.response
-        tried = choose_model(size, hit, inspections=read.target)
+        tried = hit_miss.choose_model(size, hit, inspections=read.target)
         left = [one for one in tried if link in (None, one.curve.link) and log_size in (None, one.curve.log_size)]
-        fit, near = left[0], near_models(left)
+        fit, near = left[0], hit_miss.near_models(left)
         curve, notes = fit.curve, [*read.notes, *fit.notes]
-        tests = floor_ceiling_tests(fit) if tested else ()
-        models = [(one, bound(one, POD, CONFIDENCE)) for one in tried]
+        tests = hit_miss.floor_ceiling_tests(fit) if tested else ()
+        models = [(one, hit_miss.bound(one, POD, CONFIDENCE)) for one in tried]
         limit = max((limit for one, limit in models if one in near), key=lambda limit: limit.value)
 
     if fit.targets < LEAST_TARGETS:
@@ -189,10 +175,9 @@ def state_hits(
         said.append((TESTED[test.beyond], test.p_value, f"{'needed' if test.needed else 'not needed'} {fitted}"))
     errors = np.sqrt(np.diag(fit.covariance)).tolist()
     numbers = {"b0": fit.b0, "b0's standard error": errors[0], "b1": fit.b1, "b1's standard error": errors[1]}
-    numbers |= {name: getattr(curve, name) for name in ("mu", "sigma")}
-    numbers |= {"deviance": fit.deviance, "deviance of a constant": fit.null_deviance}
-    numbers |= {"log likelihood": fit.log_likelihood, "inspections": float(fit.n)}
-    numbers |= {"targets": float(fit.targets), "hits": float(fit.hits)}
+    numbers |= {"mu": curve.mu, "sigma": curve.sigma, "deviance": fit.deviance}
+    numbers |= {"deviance of a constant": fit.null_deviance, "log likelihood": fit.log_likelihood}
+    numbers |= {"inspections": float(fit.n), "targets": float(fit.targets), "hits": float(fit.hits)}
     numbers |= false_positives(read)
     what = (read, "hit/miss", unit, near, None, _models(models, near), limit)
     return PodStatement(*what, numbers, tuple(notes), tuple(said))
@@ -271,11 +256,6 @@ def false_positives(read: Inspections, fit: AhatFit | None = None) -> dict[str, 
     return found | {"PFP by the noise's normal law": float(law.sf(put(fit.decision)))}
 
 
-def finite(value: float) -> float | None:
-    """The number, or None where JSON has none for it."""
-    return float(value) if np.isfinite(value) else None
-
-
 def drawn_sizes(size: np.ndarray, log_size: bool, marks: tuple[float, ...]) -> np.ndarray:
     """Sizes (`DRAWN`,) from just below the smallest to just above the largest, and past those of ``marks`` that are no
     more than twice the largest size away; in equal steps, or in equal ratios where ``log_size``."""
@@ -291,4 +271,4 @@ def drawn_sizes(size: np.ndarray, log_size: bool, marks: tuple[float, ...]) -> n
 
 def _bound_data(bound: Bound) -> dict[str, Any]:
     told = {name: getattr(bound, name) for name in ("pod", "confidence", "method", "demonstrated", "why")}
-    return {**told, "size": finite(bound.value)}
+    return {**told, "size": bound.value}

@@ -21,7 +21,8 @@ from scipy import stats
 
 from harness.evaluation.pod.curve import CELLS, PodCurve, link_ppf, logs_of_link
 from harness.evaluation.pod.inspections import Inspections
-from harness.evaluation.pod.statement import PodStatement, drawn_sizes, finite, state_hits
+from harness.evaluation.pod.statement import PodStatement, drawn_sizes, state_hits
+from harness.tables.schema import jsonable
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.seeds import random_stream
 
@@ -226,15 +227,15 @@ class Mapod:
     def to_data(self) -> dict[str, Any]:
         """Return the statement as JSON's types; an infinite size becomes None."""
         middle, low, high = self.transfer.band(self.sizes)
-        return {
-            "set_up": self.set_up,
-            "file": str(self.read.path),
+        combined = {"size": self.sizes, "pod": middle, "p5": low, "p95": high}
+        data = {
+            **{"set_up": self.set_up, "file": str(self.read.path)},
             "prior": {"size": PRIOR_SIZE, "width": PRIOR_WIDTH, "freedom": FREEDOM},
             "simulated": self.simulated.to_data(),
             "measured": None if self.measured is None else self.measured.to_data(),
             "no_measured_curve": self.why,
             "after_each_board": [{**asdict(step), "enough": step.enough} for step in self.steps],
             "p_simulation_right": self.agrees,
-            "a90_95": finite(self.a90_95),
-            "combined": {"size": self.sizes.tolist(), "pod": middle.tolist(), "p5": low.tolist(), "p95": high.tolist()},
+            **{"a90_95": self.a90_95, "combined": combined},
         }
+        return dict(jsonable(data))

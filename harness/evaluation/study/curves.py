@@ -131,6 +131,8 @@ def free_response(
     """Draw the free-response curve of one set-up; None where no damage or no hole-free board was inspected, or no other
     threshold was counted. Thresholds with fewer false calls than a higher one has are left out: that far down findings
     run into one another, to one that covers the board, and the curve would fold back."""
+    import pandas as pd
+
     free = runs[runs["role"] == "hole_free"] if len(runs) else runs
     if operating.empty or holes.empty or free.empty:
         return None
@@ -141,7 +143,8 @@ def free_response(
     damaged = operating[operating["role"] == "damaged"]
     of_board = holes.groupby("board", sort=True).size()
     # A board that was too full for any damage has runs, and no inspections.
-    counted = _over_boards(damaged, _counts(damaged["hits"])).reindex(of_board.index, fill_value=0)
+    of_run = pd.DataFrame(_counts(damaged["hits"]), damaged["board"].to_numpy())
+    counted = of_run.groupby(level=0).sum().reindex(of_board.index, fill_value=0)
     hits, inspections = counted.to_numpy(float)[:, ::-1][:, kept], of_board.to_numpy(float)
     blocks = weights_in_blocks(draws, (of_board.index.to_numpy(), "damaged"))
     drawn = np.concatenate([(weights @ hits) / (weights @ inspections)[:, None] for (weights,) in blocks])
@@ -174,10 +177,3 @@ def pixel_curves(pixels: pd.DataFrame) -> PixelCurves | None:
 def _counts(column: pd.Series) -> np.ndarray:
     """Lists (n, k) over the thresholds, ascending, of one set-up."""
     return np.stack(list(column.to_numpy()))
-
-
-def _over_boards(rows: pd.DataFrame, values: np.ndarray) -> pd.DataFrame:
-    """Sums of ``values`` (n, k), one row a board in ascending order."""
-    import pandas as pd
-
-    return pd.DataFrame(values).groupby(rows["board"].to_numpy(), sort=True).sum()

@@ -16,7 +16,7 @@ from harness.evaluation.intervals import UNKNOWN, Interval, percentiles
 from harness.evaluation.pod.curve import HitsAndMisses, PodCurve, maxima
 from harness.evaluation.pod.hit_miss import fit_hit_miss
 from harness.evaluation.study.ideal import SHARES, IdealDamages
-from harness.evaluation.study.limit import DRAWS, SetUpLimit, Targets, crossings, refitted_sizes, row_weights
+from harness.evaluation.study.limit import DRAWS, SetUpLimit, Targets, crossings, refitted_sizes, weights_in_blocks
 from harness.vocabulary.errors import UserError
 
 LINK = "probit"
@@ -92,7 +92,8 @@ def efficiency_of(limit: SetUpLimit, ideal: IdealDamages) -> Efficiency:
     size_mm, pod = seen.diameter_mm[first], ideal.pod[kept]
     index = np.maximum(ideal.index[kept], LEAST_INDEX)
     hits, inspections = np.bincount(which, hit), np.bincount(which).astype(float)
-    weights = np.vstack([np.ones(len(kept)), row_weights(ideal.board[kept])])
+    again = weights_in_blocks(DRAWS, (ideal.board[kept], "damaged"))
+    weights = np.vstack([np.ones(len(kept)), *(weights for (weights,) in again)])
     ideal_mm, ideal_index = expected_sizes(size_mm, pod, weights), _means(ideal.needed[:, kept], weights)
     curve, why, needed = None, "", np.full((2, 1 + DRAWS), np.nan)
     try:
@@ -126,17 +127,9 @@ def _level(ideal_mm: np.ndarray, ideal_index: np.ndarray, needed: np.ndarray, al
     """One share of damages found; arrays (1 + draws,), the estimate first."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         share = (ideal_index / needed) ** 2
-    known = bool(np.isfinite(needed[0]))
-    return Level(
-        ideal_mm=float(ideal_mm[0]),
-        ideal_mm_interval=percentiles(ideal_mm[1:]),
-        at_most=all_found,
-        ideal_index=float(ideal_index[0]),
-        index=float(needed[0]),
-        index_interval=percentiles(needed[1:]) if known else UNKNOWN,
-        efficiency=float(share[0]),
-        interval=percentiles(share[1:]) if known else UNKNOWN,
-    )
+    of_index, of_share = (percentiles(of[1:]) if np.isfinite(needed[0]) else UNKNOWN for of in (needed, share))
+    indices = float(ideal_index[0]), float(needed[0]), of_index
+    return Level(float(ideal_mm[0]), percentiles(ideal_mm[1:]), all_found, *indices, float(share[0]), of_share)
 
 
 def warnings_of(rows: list[Efficiency]) -> list[str]:

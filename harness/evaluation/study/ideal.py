@@ -42,8 +42,6 @@ SHARES = (0.5, 0.9)
 """Shares of damages found at which observers are compared."""
 RANGE = (1.0, 12.0)
 """Thresholds in deviations between which the wanted one is sought."""
-
-
 LAGS = np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1)
 
 
@@ -217,9 +215,8 @@ def detection_probability(needed: np.ndarray, index: float) -> float:
 
 def index_for(needed: np.ndarray, share: float) -> float:
     """Return d' at which a share of damages is found, from `needed_indices`."""
-    return float(
-        optimize.brentq(lambda d: detection_probability(needed, d) - share, needed.min() - 5.0, needed.max() + 5.0)
-    )
+    ends = needed.min() - 5.0, needed.max() + 5.0
+    return float(optimize.brentq(lambda d: detection_probability(needed, d) - share, *ends))
 
 
 # ---------------------------------------------------------------- damages of a set-up

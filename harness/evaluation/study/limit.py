@@ -54,11 +54,6 @@ class Targets:
     inspections: np.ndarray
     unit: np.ndarray | None = None
 
-    @property
-    def boards(self) -> int:
-        """Number of different boards."""
-        return len(np.unique(self.board))
-
 
 def targets_of(board: np.ndarray, hole: np.ndarray, size_mm: np.ndarray, hit: np.ndarray) -> Targets:
     """Join rows (n,) of inspections to targets: repeats of one damage of one board are one target."""
@@ -69,12 +64,6 @@ def targets_of(board: np.ndarray, hole: np.ndarray, size_mm: np.ndarray, hit: np
     return Targets(board[first], size_mm[first], hits, inspections)
 
 
-def row_weights(board: np.ndarray, draws: int = DRAWS, population: str = "damaged") -> np.ndarray:
-    """Draw boards again: (draws, n) how often the ``board`` (n,) of each row is in each draw; alike for as many boards
-    of a population, so that set-ups are paired; two populations ("damaged", "hole-free") are drawn independently."""
-    return np.concatenate([weights for (weights,) in weights_in_blocks(draws, (board, population))])
-
-
 def _drawn(stream: np.random.Generator, boards: int, draws: int) -> np.ndarray:
     if not boards:
         return np.zeros((draws, 0))
@@ -82,7 +71,9 @@ def _drawn(stream: np.random.Generator, boards: int, draws: int) -> np.ndarray:
 
 
 def weights_in_blocks(draws: int, *rows: tuple[np.ndarray, str]) -> Iterator[tuple[np.ndarray, ...]]:
-    """Yield the `row_weights` of one or several (board (n,), population) in blocks of draws, to bound the memory."""
+    """Draw boards again, for one or several (board (n,), population): yield, in blocks of draws to bound the memory,
+    (draws, n) how often the board of each row is in each draw; alike for as many boards of a population, so that
+    set-ups are paired; two populations ("damaged", "hole-free") are drawn independently."""
     found = [(*np.unique(board, return_inverse=True), population) for board, population in rows]
     streams = [random_stream(0, "boards drawn again", of, len(names)) for names, _, of in found]
     at_once = max(1, CELLS // max(1, *(len(which) for _, which, _ in found)))
@@ -135,7 +126,7 @@ def design_effect(targets: Targets, curve: PodCurve, pod: float) -> float:
     """Compute the variance of the size with this POD when boards are the units over that when damages are: 1 where
     damages of one board are no more alike than those of two. Both are sandwich variances (Liang and Zeger, Biometrika
     73 (1986), 13) with G / (G - 1) for G units. NaN below two boards."""
-    if targets.boards < 2 or len(targets.board) < 3:
+    if len(np.unique(targets.board)) < 2 or len(targets.board) < 3:
         return np.nan
     x = np.log(targets.size_mm) if curve.log_size else targets.size_mm
     up, down, _ = slopes_of_link(curve.link, (x - curve.mu) / curve.sigma)
@@ -364,7 +355,7 @@ def limit_of(record: SetUpRecord, *, draws: int = DRAWS, tested: bool = False) -
     calls, calls_interval = _false_calls(record.unflawed, draws, "hole-free")
     beside, _ = _false_calls(record.beside, draws, "damaged")
     ends = (UNKNOWN, UNKNOWN) if statement is None else (percentiles(of_a50), percentiles(of_a90))
-    counts = (targets.boards, len(targets.board), int(seen.hit.sum()), n)
+    counts = (len(np.unique(targets.board)), len(targets.board), int(seen.hit.sum()), n)
     estimates = (a90_95, a50, a90, of_a90, *ends, over_boards, effect)
     largest_mm = float(seen.size_mm.max()) if n else np.nan
     return SetUpLimit(record, statement, why, *estimates, *counts, calls, calls_interval, largest_mm, units, beside)

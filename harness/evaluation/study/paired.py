@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.stats import betabinom, binomtest, hypergeom, norm, t
+from scipy.stats import betabinom, hypergeom, norm, t
 
 from harness.evaluation.intervals import Interval, percentiles
 from harness.evaluation.study.limit import SetUpLimit
@@ -178,15 +178,13 @@ def _threshold_error(record: SetUpRecord) -> float:
 @dataclass(frozen=True)
 class CallsChange:
     """``calls`` on ``areas_m2`` of hole-free boards, ``calling`` of ``boards`` with a call (first repeat of each), each
-    (first, second). ``counts_p``: binomial test of two Poisson counts, as if thresholds were known. ``more_p``,
-    ``fewer_p``: one-sided, they decide, by ``way``: signs of boards tossed (same frames and threshold), two draws of
-    the calibration (different frames), or the larger of both."""
+    (first, second). ``more_p``, ``fewer_p``: one-sided, by ``way``: signs of boards tossed (same frames and threshold),
+    two draws of the calibration (different frames), or the larger of both."""
 
     calls: tuple[int, int]
     areas_m2: tuple[float, float]
     boards: tuple[int, int]
     calling: tuple[int, int]
-    counts_p: float
     more_p: float
     fewer_p: float
     way: Literal["signs", "calibrations", "both"]
@@ -215,7 +213,6 @@ def calls_change(first: SetUpRecord, second: SetUpRecord, wanted_per_m2: float |
     if not min(areas) > 0:
         return None
     calls = (int(one.calls.sum()), int(two.calls.sum()))
-    counts = float(binomtest(calls[1], sum(calls), areas[1] / sum(areas)).pvalue) if sum(calls) else 1.0
     (boards_1, calling_1), (boards_2, calling_2) = _calling(one), _calling(two)
     # Scores on identical frames are alike if the calibration took the same number for threshold, which two ways of
     # scoring do by chance only where scores are few whole numbers. A given threshold had no luck.
@@ -243,7 +240,7 @@ def calls_change(first: SetUpRecord, second: SetUpRecord, wanted_per_m2: float |
             chance = chance / chance.sum()
         by_draws = _tails(chance, calling_2) if total else (1.0, 1.0)
     fewer, more = (max(pair) for pair in zip(by_signs, by_draws, strict=True))
-    return CallsChange(calls, areas, (boards_1, boards_2), (calling_1, calling_2), counts, more, fewer, way)
+    return CallsChange(calls, areas, (boards_1, boards_2), (calling_1, calling_2), more, fewer, way)
 
 
 def _calling(table: Unflawed) -> tuple[int, int]:
