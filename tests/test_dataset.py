@@ -161,7 +161,7 @@ def test_a_killed_run_goes_on_and_writes_equal_bytes(home, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--set", "seed=4"], "holds another data set"),
+        (["--set", "seed=4"], "holds a data set of another experiment"),
         (["--boards", "9"], "10 to 10000 boards"),
         (["--set", "source.target={name: thesis}", "--set", "study=null"], "no random boards"),
     ],

@@ -11,8 +11,9 @@ from harness.evaluation.study.limit import SetUpLimit
 from harness.evaluation.study.record import StudyRecord
 from harness.evaluation.study.verdict import MARGIN, SIGNS, ComparedSetUps, Comparison, Mark
 from harness.report.blocks import command_of, fold, heading, note, page
-from harness.tables.schema import Column, Table, jsonable
+from harness.tables.schema import Column, Table
 from harness.tables.text import Grid, Tone, mm, p_value
+from harness.vocabulary.files import jsonable
 
 COMPARISON_VERSION = 1
 SAID: tuple[Mark, ...] = ("newly failing", "newly working", "no limit", "not comparable")

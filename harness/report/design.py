@@ -14,8 +14,9 @@ from harness.evaluation.pod.curve import PodCurve
 from harness.evaluation.pod.statement import LEAST_TARGETS
 from harness.report import blocks
 from harness.report.pod import axis_text, plain
-from harness.tables.schema import Column, Table, jsonable
+from harness.tables.schema import Column, Table
 from harness.tables.text import Grid
+from harness.vocabulary.files import jsonable
 
 if TYPE_CHECKING:
     from pathlib import Path

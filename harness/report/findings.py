@@ -17,8 +17,7 @@ import numpy as np
 from detectors.interface import Detection, Evidence, Measurement, MissingReturns
 from harness.report.clouds import residual_bar, residual_norm
 from harness.tables import outputs, trials
-from harness.tables.schema import jsonable
-from harness.vocabulary.files import atomic_path
+from harness.vocabulary.files import atomic_path, jsonable
 from harness.vocabulary.geometry import MM, Cloud
 
 if TYPE_CHECKING:

@@ -27,7 +27,7 @@ import numpy as np
 
 from harness.tables import text
 from harness.tables.text import Cell, Grid, Tone
-from harness.vocabulary.files import atomic_path, write_text
+from harness.vocabulary.files import atomic_path, jsonable, write_text
 from harness.vocabulary.seeds import canonical_json
 
 if TYPE_CHECKING:
@@ -247,17 +247,6 @@ def _unfolded(frame: pd.DataFrame, lists: Sequence[str]) -> pd.DataFrame:
     whole = np.zeros(0, int)  # makes counts whole numbers of 64 bits
     elements = {name: np.concatenate([*frame[name].to_numpy(), whole]) for name in lists}
     return frame.drop(columns=list(lists)).iloc[rows].assign(**elements)[list(frame.columns)]
-
-
-def jsonable(value: Any) -> Any:
-    """Return plain data, tuples, arrays and NumPy's numbers as JSON's types: None for what is no finite number."""
-    if isinstance(value, Mapping):
-        return {str(key): jsonable(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [jsonable(item) for item in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _attribute(row: Any, path: str) -> Any:

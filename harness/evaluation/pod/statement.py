@@ -15,8 +15,8 @@ from harness.evaluation.pod.ahat import LEVEL, AhatFit, ahat_band, ahat_bound, c
 from harness.evaluation.pod.curve import Bound, PodCurve
 from harness.evaluation.pod.hit_miss import NEAR_DEVIANCE, Beyond, HitMissFit
 from harness.evaluation.pod.inspections import Inspections
-from harness.tables.schema import jsonable
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import jsonable
 
 POD, CONFIDENCE = 0.9, 0.95
 """The field's customary statement, a90/95."""

@@ -22,8 +22,8 @@ from scipy import stats
 from harness.evaluation.pod.curve import CELLS, PodCurve, link_ppf, logs_of_link
 from harness.evaluation.pod.inspections import Inspections
 from harness.evaluation.pod.statement import PodStatement, drawn_sizes, state_hits
-from harness.tables.schema import jsonable
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import jsonable
 from harness.vocabulary.seeds import random_stream
 
 FREEDOM = 3.0

@@ -83,8 +83,8 @@ class Comparison:
 
 def fewest_boards(set_ups: int, alpha: float = ALPHA) -> int:
     """Shared boards from which on the tests can convict one of so many set-ups at all: if every board is worse, one
-    toss in 2^boards says as much, and that p is multiplied by all set-ups' questions."""
-    return int(np.floor(np.log2(QUESTIONS * set_ups / alpha))) + 1
+    toss in 2^boards says as much, and that p is multiplied by all set-ups' questions, and by the limit's two tests."""
+    return int(np.floor(np.log2(2 * QUESTIONS * set_ups / alpha))) + 1
 
 
 def compare_studies(first: StudyRecord, second: StudyRecord, alpha: float = ALPHA) -> Comparison:
