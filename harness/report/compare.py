@@ -66,9 +66,10 @@ COMPARED = Table(
     kind="limits compared",
 )
 TESTS = (
-    "Lost, won: inspections that the first alone, and the second alone, found. The p beside them: a sign-flip test of "
-    "hits, with boards, not damages, as the units; where the studies have different boards, of a90 with boards drawn "
-    "again for each (500 draws). The p of false calls is of a sign-flip test where frames and threshold are the same; "
+    "Lost, won: inspections that the first alone, and the second alone, found. The p beside them is twice the smaller "
+    "of two: of a sign-flip test of hits, with boards, not damages, as the units, and of Student's t of the change of "
+    "a90 over 500 draws of boards; where the studies have different boards, the share of draws of a90. The p of false "
+    "calls is of a sign-flip test where frames and threshold are the same; "
     "else it allows for the luck of each calibration. Signal: median change of the signals of damage over the signal "
     "from which damage is found; its p is of a normal test with the scatter over boards and of both calibrations. All "
     "are one-sided, of being worse, and adjusted. 95 %: of the change of a90, boards drawn again."
