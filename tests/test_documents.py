@@ -118,7 +118,11 @@ SMALL_REPEATS = ("repeats=2", "threshold.calibrate.repeats=2", "source.render={b
 SMALL = {
     "detection_limit": (*SMALL_STUDY, "source.target.damage={kind: through, per_board: 4, diameter_mm: [2, 12]}"),
     "detectors": (*SMALL_STUDY, "sweep={detector.name: [thesis, matched]}"),
-    "today": (*SMALL_STUDY, "sweep={source.camera.name: [azure_kinect_nfov, pmd_flexx2]}"),
+    "today": (
+        *SMALL_STUDY[:3],
+        "source.render={bounces: 0}",
+        "sweep={source.camera.name: [azure_kinect_nfov, pmd_flexx2]}",
+    ),
     "pipe": (*SMALL_STUDY[:3], "source.render={bounces: 0}"),
     "averaging": (*SMALL_REPEATS, "sweep={capture.frames: [1, 5]}"),
     "cameras": (*SMALL_REPEATS, "sweep={source.camera.name: [azure_kinect_nfov, kinect_v2]}"),

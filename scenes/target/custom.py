@@ -34,19 +34,19 @@ class FlatConfig(Config):
     kind: Literal["flat"] = "flat"
 
 
-class _RoundConfig(Config):
+class _CurvedConfig(Config):
     radius_mm: Annotated[float, Field(ge=10.0, le=1e6)]
     bulge: Literal["towards", "away"] = Field(default="towards", description="towards or away from the camera")
 
 
-class CylinderConfig(_RoundConfig):
+class CylinderConfig(_CurvedConfig):
     """A face bent about one axis: z = +-(sqrt(R^2 - s^2) - R), s the co-ordinate across the straight direction."""
 
     kind: Literal["cylinder"]
     straight_along: Literal["x", "y"] = "y"
 
 
-class SphereConfig(_RoundConfig):
+class SphereConfig(_CurvedConfig):
     """A face that is part of a sphere: z = +-(sqrt(R^2 - x^2 - y^2) - R)."""
 
     kind: Literal["sphere"]
