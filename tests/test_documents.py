@@ -49,6 +49,8 @@ ONLY_PARSED = {
     "check experiments/regression.yaml": "takes minutes; .ci/run runs it as it stands",
     "--camera ./blaze101.yaml": "needs captures by that camera; test_validate and test_validate_capture run these",
     "validate --board plate": "takes minutes; test_validate_board runs --board on a smaller plate",
+    "compare A B": "stands for two folders; test_compare runs the program",
+    "yours.yaml": "stands for the reader's own file",
 }
 
 
