@@ -128,7 +128,7 @@ class Candidate:
 @dataclass(frozen=True)
 class Choice:
     """``candidates``: the proposal first; ``taken``: number, from 1, of the one that was taken. ``mask`` (h, w) bool:
-    valid pixels inside its outline. ``grid``: the cloud, or its raster. ``warnings``: why the choice is doubtful."""
+    valid pixels inside its outline. ``grid``: the cloud, or its raster. ``warnings``: doubts of the choice."""
 
     candidates: tuple[Candidate, ...]
     taken: int
@@ -205,8 +205,8 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
     order = sorted(numbers, key=lambda number: (-odds[number], number))
     candidates = []
     for number in order:
-        # with holes whose rim the edge cuts; without what it encloses and what stands before it as a target of its
-        # own; a thing that lies on it stays
+        # Holes whose rim the edge cuts are taken in. What stands before it as a target of its own is left out; a thing
+        # that lies on it stays.
         outline = described[number].outline
         for radius_px in NOTCHES_PX:
             outline = notches_filled(outline, radius_px)
@@ -221,8 +221,9 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
     doubts = [f"it is doubtful which surface is the target: {'; '.join(doubts)}"] if doubts else []
     further = [str(n) for n, each in enumerate(candidates[1:], 2) if candidates[0].continues(each, surfaces.contact_m)]
     if further:
-        also = f"target {' and '.join(further)} lies in the plane of target 1 and may be a part of it"
-        doubts.append(f"{also}: it is not judged (--target takes it)")
+        also = "targets {} lie" if len(further) > 1 else "target {} lies"
+        part = f"{also.format(' and '.join(further))} in the plane of target 1 and may belong to it"
+        doubts.append(f"{part}: only target 1 is judged (--target takes another)")
     return tuple(candidates), doubts
 
 
