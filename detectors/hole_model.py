@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
+import scipy.linalg
 
 from detectors.clusters import PLAIN
 from detectors.whitening import correlated_products, noise_factor
@@ -178,23 +179,17 @@ def fit_hole(patch: HolePatch, u: float, v: float, radius_m: float, depth_m: flo
     Fitted are (u, v, ln radius, depth * radius^2, offset, x) with the wall sin^2(pi x / 2), which has `WALL_PRIOR`. The
     fourth is the hole's volume, which the blur keeps, so that of a small hole only the radius is ill determined.
     """
-    h, w = patch.used.shape
-    # keeps a wild trial step finite: no disc is larger than ten patches
-    low = np.array([-10.0 * w, -10.0 * h, -20.0])
-    high = np.array([10.0 * w, 10.0 * h, math.log(10.0 * (h + w) * math.sqrt(patch.metric_m2.max()))])
     used, data, error_m = patch.used, patch.residual_m[patch.used], MODEL_ERROR * np.abs(patch.residual_m - offset_m)
     factor = noise_factor(used, patch.correlation, max(patch.noise_m, LEAST_M), error_m)
     weight = patch.prior_weight if factor is None else 1.0 / WALL_PRIOR[1]
     start = np.array([u, v, math.log(radius_m), depth_m * radius_m**2, offset_m, WALL_PRIOR[0]])
-    view = patch.sights, patch.metric_m2, *patch.blur_px, h, w
-    known = np.zeros((0, 0)) if factor is None else factor
-    hole, offset, by, left, converged = _descent(start, data, np.flatnonzero(used), known, weight, low, high, view)
+    hole, offset, by, left, converged = _descent(patch, data, factor, weight, start)
     u, v, radius, depth, wall = hole.tolist()
-    square = float((left**2).sum())
+    square = float(left @ left)
     if factor is None:
-        return HoleFit(u, v, radius, depth, offset, wall, sandwich_covariance(patch, by.T, square), converged, 0.0)
+        return HoleFit(u, v, radius, depth, offset, wall, sandwich_covariance(patch, by, square), converged, 0.0)
     # the information's inverse times the variance of what is left, and the model's own errors
-    variance, information = square / max(len(data) - 6, 1), by.T @ by
+    variance, information = square / max(len(data) - 6, 1), by @ by.T
     information[5, 5] += WALL_PRIOR[1] ** -2
     covariance = np.linalg.pinv(information, hermitian=True) * variance
     covariance[2, 2] += RADIUS_ERROR_PX**2 * float(np.trace(patch.metric_m2)) / 2.0
@@ -202,85 +197,64 @@ def fit_hole(patch: HolePatch, u: float, v: float, radius_m: float, depth_m: flo
     return HoleFit(u, v, radius, depth, offset, wall, covariance, converged, math.sqrt(variance))
 
 
-@numba.njit(**PLAIN)
-def _descent(  # type: ignore[no-untyped-def]
-    q, data, used, factor, weight, low, high, view
-):
-    """Return the best hole (5,), its offset, derivatives (n, 6) of the ``used`` pixels by (u, v, radius, depth, offset,
-    wall), what is left of the ``data`` (n, 1), both whitened by the noise's ``factor`` (n, n) where there is any, and
-    whether the descent from ``q`` (6,) has converged. ``weight``: of the prior; ``low``, ``high`` (3,): limits."""
-    hole, left, prior = _left(q, data, used, factor, weight, low, high, view)
-    square, damping = (left**2).sum() + prior**2, DAMPING
-    by = _slopes(hole, used, factor, view)
-    converged = False
+def _descent(
+    patch: HolePatch, data: np.ndarray, factor: np.ndarray | None, weight: float, q: np.ndarray
+) -> tuple[np.ndarray, float, np.ndarray, np.ndarray, bool]:
+    """Return the best hole (5,), its offset, derivatives (6, n) of the used pixels by (u, v, radius, depth, offset,
+    wall), what is left of the ``data`` (n,), both whitened by the noise's ``factor`` (n, n) where there is any, and
+    whether the descent from ``q`` (6,) has converged. ``weight``: of the prior."""
+    h, w = patch.used.shape
+    # keeps a wild trial step finite: no disc is larger than ten patches
+    low = np.array([-10.0 * w, -10.0 * h, -20.0])
+    high = np.array([10.0 * w, 10.0 * h, math.log(10.0 * (h + w) * math.sqrt(patch.metric_m2.max()))])
+
+    def left_by(q: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return the hole (5,) of the parameters, what it leaves of the data (n,), whitened, and of the prior."""
+        u, v, log_radius = np.clip(q[:3], low, high).tolist()
+        radius = math.exp(log_radius)
+        hole = np.array([u, v, radius, q[3] / radius**2, math.sin(0.5 * math.pi * q[5]) ** 2])
+        left = pictures(patch, hole[None])[0][patch.used] + q[4] - data
+        return hole, _whitened(factor, left), weight * (hole[4] - WALL_PRIOR[0])
+
+    def slopes_of(hole: np.ndarray) -> np.ndarray:
+        depth = hole[3] if hole[3] != 0.0 else STEP
+        steps = STEP * np.array([1.0, 1.0, hole[2], depth, -1.0 if hole[4] >= 0.5 else 1.0])
+        images = pictures(patch, hole + np.vstack([np.diag(steps), np.zeros(5)]))[:, patch.used]
+        slopes = (images[:5] - images[5]) / steps[:, None]
+        # the offset moves all pixels alike
+        return _whitened(factor, np.insert(slopes, 4, 1.0, axis=0))
+
+    hole, left, prior = left_by(q)
+    square, damping, by, converged = left @ left + prior**2, DAMPING, slopes_of(hole), False
     for _ in range(MOST_STEPS):
         # derivatives by q from those by the hole's numbers
         chain = np.eye(6)
         chain[2, 2], chain[3, 2], chain[3, 3] = hole[2], -2.0 * hole[3], hole[2] ** -2
         chain[5, 5] = 0.5 * math.pi * math.sin(math.pi * q[5])
-        information, pull = chain.T @ (by.T @ by) @ chain, chain.T @ (by.T @ left)
+        information, pull = chain.T @ (by @ by.T) @ chain, chain.T @ (by @ left)
         information[5, 5] += (weight * chain[5, 5]) ** 2
         pull[5] += weight * chain[5, 5] * prior
-        for k in range(6):
-            information[k, k] *= 1.0 + damping
-            information[k, k] = max(information[k, k], SMALLEST)
-        step = np.linalg.solve(information, -pull)[:, 0]
-        tried = q + step
-        new_hole, new_left, new_prior = _left(tried, data, used, factor, weight, low, high, view)
-        new_square, enough = (new_left**2).sum() + new_prior**2, TOLERANCE * square + SMALLEST
-        converged = -(step * pull[:, 0]).sum() < enough or 0.0 <= square - new_square < enough
+        np.fill_diagonal(information, np.maximum(information.diagonal() * (1.0 + damping), SMALLEST))
+        step = np.linalg.solve(information, -pull)
+        new_hole, new_left, new_prior = left_by(q + step)
+        new_square, enough = new_left @ new_left + new_prior**2, TOLERANCE * square + SMALLEST
+        converged = bool(-(step @ pull) < enough or 0.0 <= square - new_square < enough)
         if new_square < square:
-            q, hole, left, prior, square = tried, new_hole, new_left, new_prior, new_square
-            by = _slopes(hole, used, factor, view)
+            q, hole, left, prior, square = q + step, new_hole, new_left, new_prior, new_square
+            by = slopes_of(hole)
             damping *= 0.1
         else:
             damping *= 10.0
         if converged:
             break
-    return hole, q[4], by, left, converged
+    return hole, float(q[4]), by, left, converged
 
 
-@numba.njit(**PLAIN)
-def _left(q, data, used, factor, weight, low, high, view):  # type: ignore[no-untyped-def]
-    """Return the hole (5,) of the parameters, what it leaves of the data (n, 1), whitened, and of the prior."""
-    hole = np.empty(5)
-    for k in range(3):
-        hole[k] = min(max(q[k], low[k]), high[k])
-    hole[2] = math.exp(hole[2])
-    hole[3], hole[4] = q[3] / hole[2] ** 2, math.sin(0.5 * math.pi * q[5]) ** 2
-    image, left = _painted(hole.reshape(1, 5), *view).ravel(), np.empty((len(data), 1))
-    for i in range(len(data)):
-        left[i, 0] = image[used[i]] + q[4] - data[i]
-    _whiten(factor, left)
-    return hole, left, weight * (hole[4] - WALL_PRIOR[0])
-
-
-@numba.njit(**PLAIN)
-def _slopes(hole, used, factor, view):  # type: ignore[no-untyped-def]
-    depth, holes = hole[3] if hole[3] != 0.0 else STEP, np.empty((6, 5))
-    steps = STEP * np.array([1.0, 1.0, hole[2], depth, -1.0 if hole[4] >= 0.5 else 1.0])
-    for k in range(6):
-        holes[k] = hole
-        if k < 5:
-            holes[k, k] += steps[k]
-    images, by = _painted(holes, *view).reshape(6, -1), np.ones((len(used), 6))
-    for i in range(len(used)):
-        for k in range(5):
-            # the offset stands before the wall, and moves all pixels alike
-            by[i, k if k < 4 else 5] = (images[k, used[i]] - images[5, used[i]]) / steps[k]
-    _whiten(factor, by)
-    return by
-
-
-@numba.njit(**PLAIN)
-def _whiten(factor: np.ndarray, columns: np.ndarray) -> None:
-    """Solve factor x = columns (n, k) in place, for a lower factor (n, n) or none."""
-    for i in range(len(factor)):
-        for j in range(i):
-            for k in range(columns.shape[1]):
-                columns[i, k] -= factor[i, j] * columns[j, k]
-        for k in range(columns.shape[1]):
-            columns[i, k] /= factor[i, i]
+def _whitened(factor: np.ndarray | None, rows: np.ndarray) -> np.ndarray:
+    """Return the inverse of a lower factor (n, n) times each of the rows (n,) or (k, n); the rows without a factor."""
+    if factor is None:
+        return rows
+    return np.asarray(scipy.linalg.solve_triangular(factor, rows.T, lower=True, check_finite=False).T)
 
 
 def sandwich_covariance(patch: HolePatch, by: np.ndarray, square_m2: float) -> np.ndarray:

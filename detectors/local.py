@@ -10,8 +10,8 @@ has in common with damage, and steps of the noise within a window.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any, ClassVar, NamedTuple
 
 import cv2
@@ -25,7 +25,7 @@ from detectors.crop import AutoCrop, CropConfig, crop
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.measure import HoleModelConfig, measure_detection
 from detectors.noise import average_variance_m2, median_of, rounding_variances, sigma_of
-from detectors.score_map import above, on_grid
+from detectors.score_map import Findings, above, on_grid
 from detectors.smooth_surfaces import raster
 from detectors.surface import SurfaceConfig
 from harness.vocabulary.config import Config
@@ -144,25 +144,32 @@ class LocalDetector:
     def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
         """Return peaks of the score with the pixels above the threshold that belong to each, strongest first. The
         centre is the mean of a finding's core, each pixel weighted by how far its score exceeds the core's least."""
+        return self.findings(cloud, evidence, [threshold])[0].detections
+
+    def findings(self, cloud: Cloud, evidence: Evidence, thresholds: Sequence[float]) -> list[Findings]:
+        """Return what `find` returns at each of the thresholds, which rise."""
         assert isinstance(evidence, LocalEvidence)
         sizes = np.abs(evidence.signed).ravel()
-        # saddles below the threshold part or join peaks as those above it do, or a peak would be two at some thresholds
-        cells = np.flatnonzero(sizes > max(min(SADDLE * threshold, threshold - PROMINENCE), 0.0))
+        # saddles below a threshold part or join peaks as those above it do, or a peak would be two at some thresholds;
+        # the lowest threshold's saddles decide nothing of the peaks above a higher one
+        cells = np.flatnonzero(sizes > max(min(SADDLE * thresholds[0], thresholds[0] - PROMINENCE), 0.0))
         order = cells[np.argsort(-sizes[cells], kind="stable")]
         peak_of = np.full(sizes.size, -1, dtype=np.int64)
         peak_of[order] = _peaks(evidence.signed, order, SADDLE, PROMINENCE)
-        pixels = above(evidence, threshold)
-        labels = peak_of[evidence.cell.reshape(-1)[pixels]]
-        by_label = np.argsort(labels, kind="stable")
-        bounds = np.flatnonzero(np.diff(labels[by_label], prepend=-1, append=-1))
+        pixels = above(evidence, thresholds[0])
+        peaks, scores = peak_of[evidence.cell.reshape(-1)[pixels]], evidence.score.reshape(-1)[pixels]
         found = []
-        for start, end in pairwise(bounds):
-            group = pixels[by_label[start:end]]
-            scores = evidence.score.reshape(-1)[group]
-            excess = np.maximum(scores - CORE * scores.max(), 0.0)
-            centre = excess @ cloud.points_m.reshape(-1, 3)[group] / excess.sum()
-            found.append(Detection(float(scores.max()), group, centre))
-        return tuple(found)
+        for threshold in thresholds:
+            kept = scores > threshold
+            pixels, peaks, scores = pixels[kept], peaks[kept], scores[kept]
+            labels = np.unique(peaks, return_inverse=True)[1]
+            strengths = np.zeros(int(labels.max(initial=-1)) + 1)
+            np.maximum.at(strengths, labels, scores)
+            excess = np.maximum(scores - CORE * strengths[labels], 0.0)
+            moments = (np.bincount(labels, excess * at) for at in cloud.points_m.reshape(-1, 3)[pixels].T)
+            centres_m = np.stack(list(moments), axis=-1) / np.bincount(labels, excess)[:, None]
+            found.append(Findings(strengths, pixels, labels, centres_m))
+        return found
 
     def quiet_threshold(self, cloud: Cloud, evidence: Evidence) -> float:
         """Return the highest score."""

@@ -122,8 +122,9 @@ class Findings:
 
 def findings_at(detector: Detector, cloud: Cloud, evidence: Evidence, thresholds: Sequence[float]) -> list[Findings]:
     """Return a detector's findings at thresholds, which rise."""
-    if isinstance(detector, ScoreMapDetector) and type(detector).find is ScoreMapDetector.find:
-        return detector.findings(cloud, evidence, thresholds)
+    own = next(vars(each) for each in type(detector).__mro__ if "find" in vars(each))
+    if "findings" in own:
+        return list(own["findings"](detector, cloud, evidence, thresholds))
     return [Findings.of(detector.find(cloud, evidence, threshold)) for threshold in thresholds]
 
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import scipy.fft
+import scipy.linalg
 
 SMALL_RADII_PX, HALVES_PX = (0.5, 1.5), ((0.0, 0.0), (0.5, 0.5), (0.0, 0.5), (0.5, 0.0))
 """Radii of small discs, and the places between pixels at which they are compared: through a window with sharp sides
@@ -291,15 +292,21 @@ def noise_factor(
     """Return Cholesky's lower factor (n, n) of the covariance of the ``used`` pixels (r, c), whose inverse times values
     has independent errors of deviation 1; None where there are too many pixels, or the correlation is not known or
     none. Errors are noise of one ``deviation`` and the model's own (r, c), both correlated by lag (odd, odd)."""
-    rows, columns = np.nonzero(used)
-    if correlation is None or len(rows) > MOST_WHITENED:
+    count, (h, w) = int(used.sum()), used.shape
+    if correlation is None or count > MOST_WHITENED:
         return None
-    reach = correlation.shape[0] // 2
-    lags = np.stack([rows[:, None] - rows, columns[:, None] - columns]) + reach
-    inside = ((lags >= 0) & (lags <= 2 * reach)).all(axis=0)
-    alike = np.where(inside, correlation[tuple(np.clip(lags, 0, 2 * reach))], 0.0)
+    # the correlation at all lags of the patch, in which the lag of two pixels is the difference of their flat indices
+    lags, (down, right) = np.zeros((2 * h - 1, 2 * w - 1)), (side // 2 for side in correlation.shape)
+    reach = min(down, h - 1), min(right, w - 1)
+    within = tuple(slice(middle - far, middle + far + 1) for middle, far in zip((h - 1, w - 1), reach, strict=True))
+    known = tuple(slice(middle - far, middle + far + 1) for middle, far in zip((down, right), reach, strict=True))
+    lags[within] = correlation[known]
+    rows, columns = np.nonzero(used)
+    places, error = rows * lags.shape[1] + columns, model_error[used]
+    covariance = lags.ravel()[places[:, None] - places + (h - 1) * lags.shape[1] + w - 1]
+    covariance *= deviation**2 + np.outer(error, error)
     try:
-        return np.linalg.cholesky(alike * (deviation**2 + np.outer(model_error[used], model_error[used])))
+        return np.asarray(scipy.linalg.cholesky(covariance.T, lower=True, overwrite_a=True, check_finite=False))
     except np.linalg.LinAlgError:
         return None
 

@@ -235,3 +235,16 @@ def test_a_real_drilled_plate(detector: LocalDetector, shared_data: Path) -> Non
     assert hit.sum() >= len(MOUTHS_PX) - 1
     # the plate has some 60 holes behind its face
     assert len(holes) <= 75
+
+
+def test_findings_at_many_thresholds_are_those_of_each(detector: LocalDetector) -> None:
+    """Among noise, where peaks join and part by the threshold."""
+    cloud = with_gaps(seen(disc(120, 100, 6.0, 2.0 * NOISE_M)), seed=3)
+    evidence, thresholds = detector.analyse(cloud), [0.8, 1.1, 1.6, 2.2, 3.1, 4.4]
+    for together, threshold in zip(detector.findings(cloud, evidence, thresholds), thresholds, strict=True):
+        alone = detector.find(cloud, evidence, threshold)
+        assert len(together.detections) == len(alone)
+        for one, other in zip(together.detections, alone, strict=True):
+            assert one.score == other.score
+            np.testing.assert_array_equal(one.pixels, other.pixels)
+            np.testing.assert_allclose(one.centre_m, other.centre_m, atol=1e-12)
