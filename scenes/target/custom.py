@@ -274,10 +274,11 @@ class RoomConfig(Config):
 
 
 class WavelengthConfig(Config):
-    """Albedos at another wavelength than 850 nm, of every surface that the target has; ``tape`` of all strips."""
+    """Albedos at another wavelength than 850 nm, of every surface that the target has; ``tape`` of all strips. A
+    ``board`` that is ``as_at_850`` follows the target's material."""
 
     wavelength_nm: Annotated[float, Field(ge=300.0, le=2000.0)]
-    board: Albedo
+    board: Albedo | Literal["as_at_850"]
     tape: Albedo | None = None
     backing: Albedo | None = None
     floor: Albedo | None = None
@@ -383,7 +384,8 @@ class TargetConfig(SetUpConfig):
         if lacking:
             told = f"other_wavelengths: at {albedos.wavelength_nm:g} nm there is no albedo for {', '.join(lacking)}"
             raise UserError(told, legal="an albedo for every surface that the target has")
-        changed: dict[str, Any] = {"material": self.material.model_copy(update={"albedo_850": albedos.board})}
+        board = self.material.albedo_850 if albedos.board == "as_at_850" else albedos.board
+        changed: dict[str, Any] = {"material": self.material.model_copy(update={"albedo_850": board})}
         changed["tapes"] = tuple(tape.model_copy(update={"albedo_850": albedos.tape}) for tape in self.tapes)
         if self.backing is not None:
             changed["backing"] = self.backing.model_copy(update={"albedo_850": albedos.backing})
