@@ -8,6 +8,7 @@ import re
 import shlex
 import sys
 from collections.abc import Iterable, Sequence
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +33,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--depth", metavar="LENGTH", help="the damage's depth, where the atlas has several")
     add("--distance", metavar="LENGTH", help="from camera to target, as 1m")
     add("--frames", type=int, metavar="N", help="frames averaged (default: the least and the most of the atlas)")
-    add("--albedo", type=float, metavar="A", help="of the target, where the atlas has several")
+    add("--albedo", type=float, metavar="A", help="of the target (default: the least and the most of the atlas)")
     add("--camera", action="append", metavar="NAME", help="only this camera; may be repeated")
     add("--detector", metavar="NAME", help=f"only this detector (default: {BEST}, else the first)")
     add("--atlas", type=Path, metavar="PATH", help="limits.parquet of a study, or its folder (default: the stored one)")
@@ -117,23 +118,22 @@ def _answer(options: argparse.Namespace, surfaces: Sequence[LimitSurface], title
     size_mm, distance_m = 1e3 * length_m("--size", options.size), length_m("--distance", options.distance)
     kind = KINDS.get(options.damage, options.damage)
     asked = _chosen(options, surfaces, kind)
-    place = {"distance_m": distance_m}
+    given = {"distance_m": [distance_m], "frames": [options.frames], "albedo": [options.albedo], "depth_mm": [None]}
     if options.depth is not None:
-        place["depth_mm"] = 1e3 * length_m("--depth", options.depth)
-    if options.albedo is not None:
-        place["albedo"] = options.albedo
-    for axis, option in (("depth_mm", "--depth"), ("albedo", "--albedo")):
-        values = sorted({value for surface in asked for value in surface.grid.get(axis, ())})
-        if axis in place and not values:
+        given["depth_mm"] = [1e3 * length_m("--depth", options.depth)]
+    for axis, values in given.items():
+        computed = sorted({value for surface in asked for value in surface.grid.get(axis, ())})
+        option = f"--{axis.partition('_')[0]}"
+        if values == [None]:
+            if axis == "depth_mm" and len(computed) > 1:
+                raise UserError(f"{option} is missing", legal=f"{computed[0]:g} to {computed[-1]:g} in this atlas")
+            given[axis] = sorted({computed[0], computed[-1]}) if computed else []
+        elif not computed:
             raise UserError(f"{option}: the atlas has none for {damage_words(kind)}s", fix=f"leave {option} out")
-        if values and axis not in place:
-            if len(values) > 1:
-                raise UserError(f"{option} is missing", legal=f"{values[0]:g} to {values[-1]:g} in this atlas")
-            place[axis] = values[0]
-    computed = sorted({int(value) for surface in asked for value in surface.grid["frames"]})
+    places = [dict(zip(filter(given.get, given), each, strict=True)) for each in product(*filter(None, given.values()))]
     rows, refused = [], []
-    for frames in [options.frames] if options.frames else sorted({computed[0], computed[-1]}):
-        found, why = rows_at(asked, titles, {**place, "frames": frames}, size_mm)
+    for place in places:
+        found, why = rows_at(asked, titles, place, size_mm)
         rows += found
         refused += [reason for reason in why if reason not in refused]
     if not rows:
@@ -148,10 +148,12 @@ def _answer(options: argparse.Namespace, surfaces: Sequence[LimitSurface], title
     errors = [row.surface.error for row in rows if np.isfinite(row.surface.error)]
     left_out = f"the surfaces miss set-ups left out by {100 * max(errors, default=0):.0f} % of a90 at the most (rms)"
     missed = f"; {left_out}" if errors else ""
-    study = about.get("experiment", "the study")
+    study, heads = about.get("experiment", "the study"), {} if len(given["albedo"]) > 1 else {"albedo": ""}
     notes = [f"Simulated: one unit of each camera, under the conditions of {study}.yaml{missed}."]
     notes += [f"not answered: {reason}" for reason in refused]
-    show([answer, ATLAS.grid(rows, terminal=True), *notes, f"computed exactly: {_exactly(rows[0], about)}"])
+    show(
+        [answer, ATLAS.grid(rows, heads=heads, terminal=True), *notes, f"computed exactly: {_exactly(rows[0], about)}"]
+    )
 
 
 def _chosen(options: argparse.Namespace, surfaces: Sequence[LimitSurface], kind: str) -> list[LimitSurface]:

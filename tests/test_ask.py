@@ -127,6 +127,28 @@ def test_answer_page_and_data_say_the_same(stored: Path, capsys: pytest.CaptureF
     assert "http" not in re.sub(r"http://www.w3.org/2000/svg", "", page)
 
 
+def test_both_ends_of_the_albedo_are_answered_unless_one_is_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    dark, bright = (limits().assign(**{"source.target.material.albedo_850": albedo}) for albedo in (0.2, 0.6))
+    sizes = ["a90_mm", "a90_low_mm", "a90_high_mm"]
+    dark[sizes] *= 2.0
+    pd.concat([dark, bright]).to_parquet(tmp_path / "limits.parquet")
+    question = ["--size", "7mm", "--distance", "1m", "--atlas", str(tmp_path)]
+    assert main([*question, "--out", str(tmp_path / "out")]) == 0
+    told = capsys.readouterr().out
+    assert told.startswith(
+        "Through-holes of 7 mm at 1 m are found nine times out of ten in 2 of 4 set-ups (no for 1, undecided for 1)."
+    )
+    assert re.search(r"distance \(m\) +frames +albedo +a90", told)
+    assert main([*question, "--albedo", "0.6"]) == 0
+    told = capsys.readouterr().out
+    assert "in 2 of 2 set-ups" in told and "albedo  " not in told
+    page = (tmp_path / "out" / "atlas.html").read_text()
+    curves = json.loads(re.search(r"const .* = (\{.*\});", page)[1])["curves"]  # type: ignore[index]
+    assert {curve["albedo"] for curve in curves} == {0.2, 0.6}
+
+
 def test_the_exact_command_is_a_valid_experiment(stored: Path, capsys: pytest.CaptureFixture[str]):
     import shlex
 

@@ -222,6 +222,14 @@ def test_the_nearest_declared_albedo_counts():
     assert target.at_wavelength(850.0).material.albedo_850 == 0.6
 
 
+def test_a_board_s_albedo_elsewhere_may_follow_its_own():
+    entry = {"wavelength_nm": 940.0, "board": "as_at_850", "tape": 0.4, "backing": 0.3, "floor": 0.2, "back_wall": 0.1}
+    for albedo in (0.2, 0.6):
+        board = {"name": "custom", "board": {"width_mm": 90.0, "height_mm": 80.0, "thickness_mm": 9.0}}
+        target = target_from_data({**board, "material": {"albedo_850": albedo}, "other_wavelengths": [entry]})
+        assert target.at_wavelength(940.0).material.albedo_850 == albedo
+
+
 def test_a_target_out_of_sight_or_range_is_told_before_anything_runs():
     optics = load_camera("azure_kinect_nfov").optics
     check_in_view(thesis(), optics)

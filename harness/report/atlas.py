@@ -48,7 +48,10 @@ def atlas_html(rows: Sequence[Row], warnings: Sequence[str], about: Mapping[str,
 
 
 def save_atlas_png(path: Path, rows: Sequence[Row]) -> None:
-    """Draw a90 against distance for each camera, with the least and the most frames: one panel for each damage."""
+    """Draw a90 against distance for each camera, with the least and the most frames: one panel for each damage. Of
+    several albedos the brightest target is drawn."""
+    albedos = sorted({row.place["albedo"] for row in rows if "albedo" in row.place})
+    rows = [row for row in rows if row.place.get("albedo") in (None, *albedos[-1:])]
     damages = list(dict.fromkeys(row.damage for row in rows if np.isfinite(row.answer.a90_mm)))
     titles = list(dict.fromkeys(row.title for row in rows))
     counts = sorted({int(row.place["frames"]) for row in rows})
@@ -73,6 +76,8 @@ def save_atlas_png(path: Path, rows: Sequence[Row]) -> None:
             panel.set(title=damage, xlabel="distance (m)", yscale="log")
             plain_decades(panel.yaxis)
         axes[0].set_ylabel("diameter found 90 % of the time (mm)")
+        if len(albedos) > 1:
+            figure.suptitle(f"target of albedo {albedos[-1]:g}", fontsize="medium")
         axes[-1].plot([], [], "--", color=GREY, label=f"{counts[0]} frame{'s' * (counts[0] > 1)} (lines: {counts[-1]})")
         figure.legend(*axes[-1].get_legend_handles_labels(), loc="outside lower center", ncols=3)
 

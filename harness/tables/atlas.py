@@ -55,7 +55,7 @@ ATLAS = Table(
         Column("detector", "detector", "surface.detector", "name of the detector"),
         Column("distance_m", "distance (m)", lambda row: row.place["distance_m"], "distance of the target"),
         Column("frames", "frames", lambda row: int(row.place["frames"]), "frames averaged"),
-        Column("albedo", "", lambda row: row.place.get("albedo"), "the target's, where the atlas has several"),
+        Column("albedo", "albedo", lambda row: row.place.get("albedo"), "the target's, where the atlas has several"),
         Column("depth_mm", "", lambda row: row.place.get("depth_mm"), "depth of the damage, where it has one"),
         Column(
             "a90_mm",
