@@ -59,8 +59,10 @@ def save_atlas_png(path: Path, rows: Sequence[Row]) -> None:
     detector = rows[0].surface.detector
 
     def draw(figure: Figure) -> None:
-        axes = figure.subplots(1, len(damages), sharey=True, squeeze=False)[0]
-        for panel, damage in zip(axes, damages, strict=True):
+        axes = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False)
+        for panel in axes.ravel()[len(damages) :]:
+            panel.set_axis_off()
+        for panel, damage in zip(axes.ravel(), damages, strict=False):
             for frames, style in shown.items():
                 for title, colour in zip(titles, PALETTE, strict=False):
                     of = (damage, title, detector)
@@ -73,12 +75,17 @@ def save_atlas_png(path: Path, rows: Sequence[Row]) -> None:
                     panel.plot(x, middle, style, color=colour, label=label)
                     if frames == counts[-1]:
                         panel.fill_between(x, low, high, color=colour, alpha=0.12, linewidth=0)
-            panel.set(title=damage, xlabel="distance (m)", yscale="log")
+            panel.set(title=damage, yscale="log")
             plain_decades(panel.yaxis)
-        axes[0].set_ylabel("diameter found 90 % of the time (mm)")
+        for panel in axes[-1]:
+            panel.set_xlabel("distance (m)")
+        for panel in axes[:, 0]:
+            panel.set_ylabel("size found 90 % of the time (mm)")
         if len(albedos) > 1:
             figure.suptitle(f"target of albedo {albedos[-1]:g}", fontsize="medium")
-        axes[-1].plot([], [], "--", color=GREY, label=f"{counts[0]} frame{'s' * (counts[0] > 1)} (lines: {counts[-1]})")
-        figure.legend(*axes[-1].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+        axes[0, 0].plot([], [], "--", color=GREY, label=f"{counts[0]} frame{'s' * (counts[0] > 1)} (lines: {counts[-1]})")
+        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
 
-    save_png(path, (3.6 * max(len(damages), 2), 5.2), draw)
+    columns = max(1, min(len(damages), 2))
+    lines = max(1, -(-len(damages) // columns))
+    save_png(path, (3.6 * max(columns, 2), 1.4 + 2.8 * lines), draw)
