@@ -12,6 +12,7 @@ from markupsafe import Markup
 
 from harness.report.blocks import COLOURS, GREY, INK, plain_decades, save_png, template
 from harness.tables.atlas import Row
+from harness.tables.text import many
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -83,7 +84,8 @@ def save_atlas_png(path: Path, rows: Sequence[Row]) -> None:
             panel.set_ylabel("size found 90 % of the time (mm)")
         if len(albedos) > 1:
             figure.suptitle(f"target of albedo {albedos[-1]:g}", fontsize="medium")
-        axes[0, 0].plot([], [], "--", color=GREY, label=f"{counts[0]} frame{'s' * (counts[0] > 1)} (lines: {counts[-1]})")
+        dashed = f"{many(counts[0], 'frame')} (lines: {counts[-1]})"
+        axes[0, 0].plot([], [], "--", color=GREY, label=dashed)
         figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
 
     columns = max(1, min(len(damages), 2))
