@@ -2,6 +2,8 @@
 # Both set up .venv from the lock first, once.   make test-all: every test, with the long Monte Carlo and fault campaigns.
 PYTHON ?= python3
 BIN := .venv/bin
+# Each of the many processes that tests start would compile all modules anew.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: sweep test test-all lint smoke validate check benchmarks strangers docs lock clean
 sweep: .venv/.ready

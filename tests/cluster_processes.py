@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -138,7 +139,7 @@ def threads() -> dict[str, int]:
 
 def note_node_and_sleep(path: str, seconds: float) -> int:
     """Note the dask worker that this process belongs to."""
-    Path(path).write_text(str(os.getppid()))
+    Path(path).write_text(str(multiprocessing.parent_process().pid))  # type: ignore[union-attr]
     time.sleep(seconds)
     return 0
 

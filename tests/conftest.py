@@ -49,6 +49,13 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
     return home
 
 
+@pytest.fixture
+def unpictured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the files that a detection writes the pictures take longest: left empty by tests that look at the others."""
+    monkeypatch.setattr("harness.report.findings._figure", lambda *_: None)
+    monkeypatch.setattr("harness.report.findings._save", lambda path, _: path.write_bytes(b""))
+
+
 @pytest.fixture(scope="session")
 def tiny_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished sweep before the thesis' target, by worker processes, with tiny.yaml beside it; not to be changed."""

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
+import subprocess
+import sys
 import time
 from multiprocessing.connection import Connection
 from pathlib import Path
 
 import faulty_jobs
 import pytest
+from tiny_sweep import ROOT
 
 from harness.engine.processes import LocalEngine, SerialEngine
 from harness.engine.work import STATES, Ended, Job, JobEngine, Limits, attempt
@@ -102,6 +106,31 @@ def test_trial_processes_load_neither_mitsuba_nor_open3d():
     assert run(LocalEngine(1, Limits()), [job(faulty_jobs.imported)])["imported"].value == []
 
 
+OTHER_FOLDER = """
+from harness.engine.processes import LocalEngine
+from harness.engine.work import Job, Limits
+import os, sys
+
+os.chdir(sys.argv[1])
+with LocalEngine(1, Limits()) as engine:
+    engine.submit(Job("where", "trials", eval, ("__import__('sys').modules['harness.engine.trial'].__file__",)))
+    print(engine.ended()[0][1])
+"""
+
+
+def test_processes_run_the_drivers_code_whatever_lies_in_the_folder_they_start_in(tmp_path):
+    """A second `harness`, as another checkout has it, would be found first in the folder where a sweep is started."""
+    other = tmp_path / "harness" / "engine"
+    other.mkdir(parents=True)
+    for folder in (other, other.parent):
+        (folder / "__init__.py").touch()
+    (other / "preloaded.py").write_text("from harness.engine import trial\n")
+    (other / "trial.py").touch()
+    given = {"cwd": ROOT, "capture_output": True, "text": True, "timeout": 900}
+    done = subprocess.run([sys.executable, "-c", OTHER_FOLDER, str(tmp_path)], **given)
+    assert str(ROOT / "harness" / "engine" / "trial.py") in done.stdout, done.stdout + done.stderr
+
+
 def test_serial_runs_here_and_in_order():
     jobs = [Job("pid", "trials", os.getpid, ()), *doubles(3), job(faulty_jobs.raises)]
     found = run(SerialEngine(), jobs)
@@ -133,8 +162,9 @@ def test_a_process_killed_between_jobs_costs_nothing():
         engine.submit(Job("pid", "trials", os.getpid, ()))
         ((_, first),) = engine.ended()
         os.kill(first.value, signal.SIGKILL)
-        while "Z (zombie)" not in Path(f"/proc/{first.value}/status").read_text():
-            time.sleep(0.01)
+        with contextlib.suppress(FileNotFoundError):
+            while "Z (zombie)" not in Path(f"/proc/{first.value}/status").read_text():
+                time.sleep(0.01)
         states = []
         for one in doubles(2):
             engine.submit(one)

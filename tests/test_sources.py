@@ -34,20 +34,23 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+def forget() -> None:
+    for cached in (reached_sources, source_digest, provenance._content):
+        cached.cache_clear()
+
+
 def fresh(*modules: str) -> str:
-    reached_sources.cache_clear()
-    source_digest.cache_clear()
+    forget()
     try:
         return source_digest(modules, ("numpy",))
     finally:
-        reached_sources.cache_clear()
-        source_digest.cache_clear()
+        forget()
 
 
 def test_what_a_module_reaches_counts_and_nothing_else(project: Path) -> None:
     before = fresh("harness.trial")
     reached = {path.relative_to(project).as_posix() for path in reached_sources(("harness.trial",))}
-    reached_sources.cache_clear()
+    forget()
     assert reached == set(FILES) - {"harness/page.py", "harness/engine/other.py", "detectors/blind.py"}
     for name in FILES:
         path = project / name
@@ -78,3 +81,13 @@ def test_a_trial_reaches_what_it_runs_and_not_what_evaluates_or_draws() -> None:
     assert {"detectors/thesis.py", "detectors/average.py", "scenes/sensor/amcw/imager.py"} <= names
     assert {"harness/engine/trial.py", "harness/evaluation/match.py", "detectors/registration/by_points.py"} <= names
     assert not [name for name in names if name.startswith(("harness/report/", "harness/evaluation/pod/"))]
+
+
+def test_a_digest_is_of_what_is_loaded_not_of_what_was_edited_since(project: Path) -> None:
+    forget()
+    provenance.remember_loaded()  # of this test's project what has the name of a loaded module: harness, scenes, ...
+    before = source_digest(("harness.trial",), ("numpy",))
+    (project / "harness" / "engine" / "judge.py").write_text("K = 5\n")
+    reached_sources.cache_clear()
+    source_digest.cache_clear()
+    assert source_digest(("harness.trial",), ("numpy",)) == before != fresh("harness.trial")

@@ -5,7 +5,6 @@ The standard library's executors give up all jobs when a process dies; here a th
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import faulthandler
 import importlib
 import multiprocessing
@@ -13,6 +12,7 @@ import os
 import pickle
 import queue
 import signal
+import sys
 import tempfile
 import threading
 import time
@@ -28,17 +28,22 @@ from harness.engine.work import TRACEBACK_CHARACTERS, Code, Ended, Job, Limits, 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.provenance import source_digest
 
-ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-"""One thread a process: sums then have one order on every machine, and processes do not compete for cores."""
+ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMBA")}
+"""One thread a process: sums then have one order on every machine, and processes do not compete for cores. Libraries
+read this part of the environment as they load."""
 MOST_RENDERERS = 2  # processes that render, of 2 GB each
-PR_SET_PDEATHSIG = 1  # an option of Linux' prctl(2)
 LOOKS_S = 1.0  # interval at which a driver looks at the clock
 START_S = 300.0  # time for a process to load what it needs: seconds, but from a network's disk more
 DUMP_S = 0.3  # time that a hanging process gets to write its traceback; its signal handler needs a millisecond
 STOPPED_S = 2.0  # a wait of `LOOKS_S` that takes so much longer was no waiting: Ctrl-Z, or a suspended machine
 IDLE_S: dict[Stage, float] = {"trials": 300.0, "renders": 10.0}  # idle processes end then; renderers hold 2 GB
 FALSE_STARTS = 3  # processes in a row that died before they could take a job: then none will start
-_SPAWNING = threading.Lock()
+_STARTING = threading.Lock()
+CAN_FORK = "forkserver" in multiprocessing.get_all_start_methods()
+PROCESSES: Any = multiprocessing.get_context("forkserver" if CAN_FORK else "spawn")
+"""Processes fork from a small one of their own, which imports once what each would spend a second on."""
+if CAN_FORK:
+    PROCESSES.set_forkserver_preload(["harness.engine.preloaded"])
 
 
 @dataclass(eq=False)
@@ -182,12 +187,12 @@ class _Worker(threading.Thread):
     def _start(self) -> None:
         """Start a process that can take jobs. Raises UserError where it runs other sources, or none can start."""
         engine = self._engine
-        self._pipe, theirs = multiprocessing.get_context("spawn").Pipe()
-        arguments = (theirs, self._label, self.stage, str(self._said), engine.code.get(self.stage))
-        process = multiprocessing.get_context("spawn").Process(target=serve, args=arguments, daemon=True)
-        with _spawning():
+        self._pipe, theirs = PROCESSES.Pipe()
+        arguments = (theirs, self._label, self.stage, str(self._said), engine.code.get(self.stage), dict(os.environ))
+        process = PROCESSES.Process(target=serve, args=arguments, daemon=True)
+        with _starting(), contextlib.suppress(OSError, EOFError):  # where the process to fork from has died
             process.start()
-        self._process = process
+            self._process = process
         theirs.close()
         if engine.is_over:
             self.strike()
@@ -229,6 +234,8 @@ class _Worker(threading.Thread):
 
     def _last_words(self) -> str:
         """The cause of the process' death, as far as can be known."""
+        if self._process is None:
+            return "the process that it forks from has died"
         self._process.join(timeout=1.0)
         code = self._process.exitcode
         why = f"its process ended itself with code {code}"
@@ -254,23 +261,27 @@ class _Worker(threading.Thread):
 
 
 @contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Hold the environment in which a process starts that computes in one thread; libraries read it as they load."""
-    before = os.environ.copy()
-    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
+def _environment(stated: Mapping[str, str]) -> Iterator[None]:
+    """Hold a part of the environment: processes inherit it as they start, libraries read it as they load."""
+    before = {name: os.environ.get(name) for name in stated}
+    os.environ.update(stated)
     try:
         yield
     finally:
-        for name in ONE_THREAD:
-            os.environ.pop(name, None)
-            os.environ.update({name: before[name]} if name in before else {})
+        for name, text in before.items():
+            os.environ.pop(name)
+            os.environ.update({} if text is None else {name: text})
 
 
 @contextlib.contextmanager
-def _spawning() -> Iterator[None]:
-    """Start a process in one thread that never hears Ctrl-C; also from a dask worker, a daemon."""
+def _starting() -> Iterator[None]:
+    """Start a process that never hears Ctrl-C; also from a dask worker, a daemon. The one to fork from finds modules
+    where this one does, not first in the folder that it starts in."""
     config: dict[str, Any] = multiprocessing.current_process()._config  # type: ignore[attr-defined]
-    with _SPAWNING, _one_thread():
+    here = multiprocessing.process.ORIGINAL_DIR  # type: ignore[attr-defined]
+    own = os.pathsep.join(path or here for path in sys.path)
+    paths = {"PYTHONPATH": own, "PYTHONSAFEPATH": "1"}
+    with _STARTING, _environment(ONE_THREAD | paths):
         daemon, config["daemon"] = config.get("daemon"), False
         has_masks = hasattr(signal, "pthread_sigmask")
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if has_masks else set()
@@ -285,8 +296,12 @@ def _spawning() -> Iterator[None]:
 # ---------------------------------------------------------------- in the process
 
 
-def serve(pipe: Connection[Any, Any], name: str, stage: Stage, said: str, code: Code | None) -> None:
+def serve(
+    pipe: Connection[Any, Any], name: str, stage: Stage, said: str, code: Code | None, environment: dict[str, str]
+) -> None:
     """Carry out jobs until the driver closes the pipe. What kills this process stands in the file ``said``."""
+    os.environ.clear()
+    os.environ.update(environment | ONE_THREAD)
     words = _prepare(said)
     try:
         if stage == "trials":  # before time counts
@@ -316,9 +331,14 @@ def serve(pipe: Connection[Any, Any], name: str, stage: Stage, said: str, code: 
 
 def _prepare(said: str) -> IO[str]:
     """Ignore Ctrl-C, end without a driver, and write to the file ``said`` where a crash or a hang happens."""
-    # Linux ends this process with its driver, whatever it does; elsewhere it ends where it next hears or tells anything
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    # POSIX ends this process with its driver, whatever it does: a pipe that loses its writer sends SIGIO. On Windows it
+    # ends where it next hears or tells anything
+    with contextlib.suppress(ImportError, AttributeError, OSError):
+        import fcntl
+
+        drivers_end = multiprocessing.parent_process().sentinel  # type: ignore[union-attr]
+        fcntl.fcntl(drivers_end, fcntl.F_SETOWN, os.getpid())
+        fcntl.fcntl(drivers_end, fcntl.F_SETFL, fcntl.fcntl(drivers_end, fcntl.F_GETFL) | os.O_ASYNC)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     words = open(said, "w")  # noqa: SIM115 (open as long as the process lives)
     faulthandler.enable(words)
@@ -363,7 +383,7 @@ class SerialEngine:
         from threadpoolctl import threadpool_limits
 
         # libraries that are loaded later read the environment, those that are loaded by now are asked
-        self._pinned.enter_context(_one_thread())
+        self._pinned.enter_context(_environment(ONE_THREAD))
         self._pinned.enter_context(threadpool_limits(1))
         self._pinned.callback(cv2.setNumThreads, cv2.getNumThreads())
         cv2.setNumThreads(1)

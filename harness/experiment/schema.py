@@ -276,7 +276,7 @@ def point_of(label: str, variant: str, values: Mapping[str, Any], config: Experi
     source = config.source
     if isinstance(source, CaptureSource):
         files = [[file.name, file_digest(file)] for file in recording_of(source).files]
-        camera_name = lens_names().get(source.intrinsics or "")
+        camera_name = lens_names().get(source.intrinsics) if source.intrinsics else None
         named = load_camera(camera_name).lens.to_data() if camera_name else None
         frames = {"kind": source.kind, "files": files, "unit": source.unit, "lens": named}
     else:

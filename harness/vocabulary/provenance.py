@@ -13,8 +13,9 @@ import os
 import platform
 import re
 import subprocess
+import sys
 from collections.abc import Iterable, Iterator
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -115,7 +116,7 @@ def source_digest(modules: tuple[str, ...], packages: tuple[str, ...]) -> str:
     for name in sorted(set(modules) - set(own)):
         files |= {f"{name}/{relative}": path for relative, path in _foreign_sources(name)}
     for shown, path in sorted(files.items()):
-        content = path.read_bytes()
+        content = _content(path)
         state.update(f"{shown} {len(content)}\n".encode())
         state.update(content)
     for package in packages:
@@ -136,8 +137,20 @@ def reached_sources(modules: tuple[str, ...]) -> tuple[Path, ...]:
             continue
         found[name] = path
         waiting.append(name.rpartition(".")[0])  # a package runs before its modules
-        waiting += _imported(path.read_text(encoding="utf-8"))
+        waiting += _imported(_content(path).decode())
     return tuple(sorted(found.values()))
+
+
+def remember_loaded() -> None:
+    """Keep the sources of what this process has loaded of the project: digests in it, and in processes that fork from
+    it, are then of what they run, though the files are edited."""
+    for path in filter(None, map(_source_of, tuple(sys.modules))):
+        _content(path)
+
+
+@cache
+def _content(path: Path) -> bytes:
+    return path.read_bytes()
 
 
 def _source_of(name: str) -> Path | None:

@@ -196,12 +196,17 @@ def _completed(source: Source, depth: int = 0) -> Source:
         problem = Problem(message, source.place_of(("like",)), legal=f"one of {', '.join(camera_names())}")
         raise DeclarationError(source.origin, [problem])
     beside = Path(source.origin).parent / name
-    base = _completed(read_yaml(beside if is_camera_path(name) else camera_file(name)), depth + 1)
+    base = _completed(read_yaml(beside), depth + 1) if is_camera_path(name) else _named(name, depth + 1)
     found = replace(source, data={key: value for key, value in base.data.items() if key != "modes"})
     found = replace(found, values={**base.values, (): source.place_of(())}, keys=base.keys)
     for path, value in _stated({key: value for key, value in source.data.items() if key != "like"}):
         found = found.with_value(path, with_value_at(found.data, path, value), source, path)
     return found
+
+
+@lru_cache
+def _named(name: str, depth: int) -> Source:
+    return _completed(read_yaml(camera_file(name)), depth)
 
 
 def _stated(data: Mapping[str, Any], prefix: KeyPath = ()) -> Iterator[tuple[KeyPath, Any]]:

@@ -18,6 +18,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent, NodeEvent
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+from ruamel.yaml.parser import Parser
 from ruamel.yaml.reader import ReaderError
 
 from harness.vocabulary.errors import UserError
@@ -184,22 +185,17 @@ def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = Fa
     if version := _OTHER_VERSION.search(text):
         at = place(version.start() - start, version.end())
         raise DeclarationError(origin, [Problem("only YAML 1.2 is read", at)])
-    depth = nodes = 0
+    reader = YAML(typ="safe", pure=True)
+    reader.Parser = _BoundedParser
     try:
-        for event in YAML(typ="safe", pure=True).parse(text[start:]):
-            # composing recurses, scanning slows with depth, nodes take memory; keys are nodes, too
-            depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
-            nodes += isinstance(event, NodeEvent)
-            if depth > MAX_DEPTH or nodes > 2 * MAX_NODES:
-                at = place(event.start_mark.index, event.start_mark.index + 1)
-                message, limit = ("nested too deep", MAX_DEPTH) if depth > MAX_DEPTH else ("too many values", MAX_NODES)
-                raise DeclarationError(origin, [Problem(message, at, legal=f"at most {limit}")])
-        root = YAML(typ="safe", pure=True).compose(text[start:])
+        root = reader.compose(text[start:])
         builder = _Builder(place)
         data = None if root is None else builder.build(root, (), ())
         if not builder.problems:
             return Source(origin, text, data, {(): place(0, 0), **builder.values}, builder.keys)
         raise DeclarationError(origin, builder.problems)
+    except _TooMuch as error:
+        problem = Problem(error.message, place(error.index, error.index + 1), legal=f"at most {error.limit}")
     except MarkedYAMLError as error:
         mark, context = error.problem_mark or error.context_mark, error.context_mark
         where = place(mark.index, mark.index + 1) if mark else None
@@ -221,6 +217,29 @@ def to_yaml(data: Any) -> str:
     writer.default_flow_style, writer.width = False, 120
     writer.dump(data, stream)
     return stream.getvalue()
+
+
+class _TooMuch(Exception):
+    """More than a declaration may hold, at a character of its text."""
+
+    def __init__(self, message: str, limit: int, index: int) -> None:
+        super().__init__(message)
+        self.message, self.limit, self.index = message, limit, index
+
+
+class _BoundedParser(Parser):
+    """Refuses before composing recurses too deep, scanning gets slow, as it does with depth, or nodes fill memory."""
+
+    depth = nodes = 0
+
+    def get_event(self) -> Any:
+        event = super().get_event()
+        self.depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
+        self.nodes += isinstance(event, NodeEvent)  # keys, too
+        if self.depth > MAX_DEPTH or self.nodes > 2 * MAX_NODES:
+            told = ("nested too deep", MAX_DEPTH) if self.depth > MAX_DEPTH else ("too many values", MAX_NODES)
+            raise _TooMuch(*told, event.start_mark.index)
+        return event
 
 
 class _Builder:
