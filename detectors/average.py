@@ -48,6 +48,19 @@ class AverageConfig(Config):
     median_memory_mb: float = Field(default=2000.0, gt=0)
 
 
+MOST_LEFT_OUT = 0.25  # share of the frames from which on more than an accident disturbed a recording
+RECORDED = AverageConfig(disturbed_fraction=0.01)
+"""For recordings, in which a camera may be knocked: a shift by 2 % of the picture's width changes some 2 % of the
+pixels, and frames of static real cameras differ from the first by 0.3 % beyond what those show."""
+
+
+def unsteadiness(cloud: Cloud) -> str:
+    """Return a sentence where so many frames are left out of an average that the recording was not steady, else ""."""
+    out, frames = len(cloud.left_out), cloud.n_frames + len(cloud.left_out)
+    what = f"{out} of {frames} frames differ from the others and are left out: the camera or the scene moved"
+    return what if out > MOST_LEFT_OUT * frames else ""
+
+
 def average(source: FrameSource, config: AverageConfig) -> Cloud:
     """Average a source's frames. Raises UserError where it has too few frames, frames of different sizes, no valid
     pixel at all, or more frames than the median's memory allows."""

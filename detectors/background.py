@@ -22,6 +22,7 @@ from detectors.masks import grown, on_grid
 from detectors.noise import median_of, sigma_of
 from detectors.reference import laid_on
 from detectors.surface import BISQUARE_TUNING, Fit, SurfaceConfig, bisquare_weights, fit_surface, polynomial, quadric
+from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud
 
 MOST_CELLS, CELL_POINTS, EVEN_CELL_POINTS, ENOUGH_CELLS, FEW_CELLS = 3600, 16, 64, 600, 40
@@ -142,6 +143,9 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
         near = _incidence_deg(cells.points, fit, cells.side) > STEEPEST_DEG - 20.0
         looked = np.flatnonzero((cells.of < 0) | near[cells.of])
         unseen[looked] |= ~(_incidence_deg(points[looked], fit, 0.1 * cells.side) < STEEPEST_DEG)
+    if unseen.all():
+        what = f"the whole target is seen at more than {STEEPEST_DEG:g} degrees, where nothing is judged"
+        raise UserError(what, fix="choose another target or crop, or record it from its front")
     fitted[unseen] = np.nan
     cells = cells.refreshed(residuals, fit)
     warning, notes = _misfit(cells, fit, name)

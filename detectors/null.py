@@ -36,6 +36,7 @@ CROWDED, LADDER = 0.6, 1.06
 """Share of the most findings that any threshold gives, and the ratio of the thresholds that are tried for the floor."""
 LEAST = 3.0
 """Units of score below which no threshold goes: bounded errors end so near that one side says nothing of the other."""
+MOST = 10.0  # units of score above which noise alone needs no threshold: it needs 4 to 7 on all that was recorded
 OBJECT_MARGIN_PX = 6  # margin around an object: its edge is mixed over 3 pixels, and its shadow lies beside it
 PATCH_PX, LEAST_OBJECT_PX = 5, 100
 """Side of the square that residual and picture are smoothed over, and pixels of an object: four such squares."""
@@ -99,6 +100,9 @@ def own_threshold(detector: Detector, cloud: Cloud, evidence: Evidence, false_ca
         falling, floor = falling[:half], float(falling[half])
     threshold = max(tail.threshold(number), LEAST)
     rim = _mixed_rim(detector, cloud, evidence, threshold) if cloud.organised else np.zeros(known.shape, bool)
+    if threshold > MOST:
+        why = f"bumps or structure of the surface raise it, where noise needs some {LEAST + 2:g} units of score"
+        doubts.append(f"{why}, and fainter damage is not found (--threshold states another)")
     low, high = (2.0 * bound for bound in tail.interval(threshold))
     hidden = int((covered & known).sum())
     if hidden > MOST_MASKED * known.sum():

@@ -274,7 +274,7 @@ def _smoothed_descent(
 
 def bisquare_weights(r: np.ndarray, limit: float) -> np.ndarray:
     """Return Tukey's weights (1 - (r / limit)^2)^2 inside the limit, 0 outside."""
-    return np.asarray(np.maximum(1.0 - (r / limit) ** 2, 0.0) ** 2)
+    return np.asarray(np.maximum(1.0 - (r / max(limit, TINY_M)) ** 2, 0.0) ** 2)
 
 
 def _bisquare(basis: np.ndarray, z: np.ndarray, start: np.ndarray | None, note: str) -> Solution:

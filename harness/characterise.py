@@ -47,7 +47,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     import numpy as np
 
     from harness.evaluation.study.record import read_record
-    from harness.inspection.arguments import read_poses
+    from harness.inspection.arguments import read_poses, refuse_repeats
     from harness.inspection.told import print_notes, print_warnings
     from harness.own_camera.camera_file import Stated, camera_of_size, opened_as, simulated, with_lens, write_camera
     from harness.own_camera.certificate import write_certificate
@@ -65,6 +65,7 @@ def main(options: argparse.Namespace, command: str) -> int:
         raise UserError(f"--rate {options.rate:g}", legal="above 0 frames per second")
     study = read_record(options.study) if options.study else None
     poses = read_poses(options.poses, len(options.paths)) if options.poses else None
+    refuse_repeats(options.paths)
     recordings = [opened_as(options.like, [path], options.intrinsics, unit=options.unit) for path in options.paths]
     captures = list(map(read_still, recordings))
     if options.like:
@@ -84,7 +85,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     with suppress(UserError):  # none is as large, or it sees nothing of the surfaces
         known = known or camera_of_size(captures[0].lens)
         sources[KNOWN] = characteristics(simulated(with_lens(known, captures[0].lens), found, options.albedo), poses)
-    rows = beside(found, twin, sources.get(KNOWN))
+    rows, label = beside(found, twin, sources.get(KNOWN)), load_camera(known).title if known else ""
     noise = ", ".join(f"{one.temporal.value:.3g} mm at {one.distance_m:.2f} m" for one in found.surfaces[:3])
     answer = f"Temporal noise of single pixels: {noise}." if noise else "No flat surface was found."
     off = [abs(row.ratio - 1) for row in rows if row.figure == "temporal noise"]
@@ -101,7 +102,7 @@ def main(options: argparse.Namespace, command: str) -> int:
         print_notes(recording.notes)
     page, title = options.out / "characterise.html", f"{options.title}, characterised"
     facts = {"like": options.like, "camera_file": CAMERA_FILE}
-    write_page(page, sources, rows, title, answer, known or "", command, facts, warnings)
+    write_page(page, sources, rows, title, answer, label, command, facts, warnings)
     if options.certificate:
         lens = captures[0].lens
         size = f"{lens.width} x {lens.height} pixels" + (f", as {options.like}" if options.like else "")

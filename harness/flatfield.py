@@ -59,18 +59,19 @@ def main(options: argparse.Namespace, command: str) -> int:
 
     if options.out.suffix.lower() != ".npz":
         raise UserError(f"--out {options.out}: is no name of a flat field", legal="a name that ends in .npz")
-    lens, captures = _captures(options)
+    lens, captures, doubted = _captures(options)
     found = separated(captures, lens)
-    near, far = found.field.distances_m
+    field = replace(found.field, warnings=(*doubted, *found.field.warnings))
+    near, far = field.distances_m
     at = f"{near:.2f} m" if far < near * 1.01 else f"{near:.2f} to {far:.2f} m"
-    answer = f"fixed pattern {mm(found.field.rms_m)} rms at {at}, known to {mm(found.noise_m)}"
-    figures, error_m = list(figures_of(found)), found.field.error_m
-    print_warnings(found.field.warnings)
+    answer = f"fixed pattern {mm(field.rms_m)} rms at {at}, known to {mm(found.noise_m)}"
+    figures, error_m = list(figures_of(found)), field.error_m
+    print_warnings(field.warnings)
     print(answer)
     show([FLAT_CAPTURES.grid(captures, terminal=True), FLAT_FIGURES.grid(figures, terminal=True)])
     data, picture = (options.out.with_suffix(suffix) for suffix in (".json", ".png"))
-    save_flat_field(options.out, found.field)
-    told = {"results_version": RESULTS_VERSION, "answer": answer, "warnings": found.field.warnings}
+    save_flat_field(options.out, field)
+    told = {"results_version": RESULTS_VERSION, "answer": answer, "warnings": field.warnings}
     told |= {"figures": FLAT_FIGURES.data(figures), "captures": FLAT_CAPTURES.data(captures)}
     write_text(data, plain_json({**told, "provenance": record(command)}))
     save_png(picture, (7.0, 5.4), lambda figure: _draw(figure, error_m, answer))
@@ -89,18 +90,20 @@ def _draw(figure: Figure, error_m: np.ndarray, title: str) -> None:
     figure.suptitle(title, fontsize=10, parse_math=False)
 
 
-def _captures(options: argparse.Namespace) -> tuple[Lens, list[FlatCapture]]:
-    """Return the lens and the captures, less their smooth fits; a lone capture as its two halves, which show whether
-    the pattern is stable. Raises UserError for faults of the files, and for captures of different cameras."""
-    from detectors.average import AverageConfig, average
+def _captures(options: argparse.Namespace) -> tuple[Lens, list[FlatCapture], list[str]]:
+    """Return the lens, the captures less their smooth fits (a lone capture as its two halves, which show whether the
+    pattern is stable), and doubts about the recordings. Raises UserError for faults of the files, and for captures of
+    different cameras."""
+    from detectors.average import RECORDED, average
     from detectors.crop import crop
     from detectors.flat_captures import flattened
     from detectors.local import LocalConfig
-    from harness.inspection.arguments import crop_from_text, opened, read_poses
+    from harness.inspection.arguments import crop_from_text, opened, read_poses, refuse_repeats
     from harness.vocabulary.declaration.diagnose import settings_of
 
     config = settings_of(LocalConfig, {"crop": crop_from_text(options.crop)}, f"--crop {options.crop}").crop
     poses = read_poses(options.poses, len(options.paths)) if options.poses else (None,) * len(options.paths)
+    refuse_repeats(options.paths)
     recordings = [opened([path], options.intrinsics, unit=options.unit) for path in options.paths]
     first = recordings[0]
     for path, recording in zip(options.paths, recordings, strict=True):
@@ -112,14 +115,19 @@ def _captures(options: argparse.Namespace) -> tuple[Lens, list[FlatCapture]]:
     found = []
     for recording, pose in zip(recordings, poses, strict=True):
         for part in _halves(recording) if len(recordings) == 1 else (recording,):
-            cloud = average(part, AverageConfig())
+            cloud = average(part, RECORDED)
             found.append(flattened(cloud, crop(cloud, config), part.name, pose))
     assert first.lens is not None
-    return first.lens, found
+    return first.lens, found, [doubt for recording in recordings for doubt in recording.warnings]
 
 
 def _halves(recording: Recording) -> Iterator[Recording]:
+    from detectors.noise import LEAST_FRAMES
+
     count = sum(1 for _ in recording.selected())
+    if count < 2 * LEAST_FRAMES:
+        yield recording
+        return
     for name, part in (("first half", slice(count // 2)), ("second half", slice(count // 2, None))):
         yield replace(recording, name=f"{recording.name}, {name}", selection=part)
 

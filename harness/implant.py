@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harness.inspection.arguments import DEFAULT_DETECTOR, DEFAULT_FALSE_CALLS, LEGAL_CROP, detector_of, opened
+from harness.inspection.arguments import (
+    DEFAULT_DETECTOR,
+    DEFAULT_FALSE_CALLS,
+    LEGAL_CROP,
+    detector_of,
+    opened,
+    refuse_repeats,
+)
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM
 from harness.vocabulary.program import program
@@ -102,6 +109,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
     how = (options.hit_radius * MM, options.threshold, own_threshold)
     judging = Judging(options.detector, canonical_json(settings), *how)
+    refuse_repeats(options.paths)
     scans = [Scan(opened([path], options.intrinsics, unit=options.unit), judging) for path in options.paths]
     family = _family(options, scans)
     cache = options.out / ".cache" / "renders"
@@ -112,6 +120,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     longest = max(len(scan.frames) for scan in scans)
     frames = sorted(set(options.frames or (1, longest)))
     tables, set_ups, warnings = judge_scans(scans, made, family, options.camera, judging, frames)
+    warnings = (*(doubt for scan in scans for doubt in scan.recording.warnings), *warnings)
 
     area_m2 = sum(scan.area_m2 for scan in scans)
     said = f"{len(scans)} recording{'s' * (len(scans) > 1)} of {longest} frames, {area_m2:.3g} m² judged"

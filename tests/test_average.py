@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from detectors.average import AverageConfig, average, prefix_averages
+from detectors.average import RECORDED, AverageConfig, average, prefix_averages, unsteadiness
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Frame, Lens, Reason, Region
 
@@ -156,6 +156,16 @@ def test_flickering_validity_is_usual_and_no_disturbance() -> None:
     flicker = np.random.default_rng(5).random(stack.z_m.shape) < 0.3
     stack.z_m[flicker] = np.nan
     assert average(stack, AverageConfig()).left_out == ()
+
+
+def test_a_knocked_camera_is_told() -> None:
+    """A step of 0.3 m at a board's edge moves by two of fifty columns."""
+    stack = noisy()
+    z_m = stack.z_m + 0.3 * (np.arange(50) > 30).astype(np.float32)
+    z_m[8:] = np.roll(z_m[8:], 2, axis=2)
+    cloud = average(replace(stack, z_m=z_m), RECORDED)
+    assert len(cloud.left_out) == 4 and unsteadiness(cloud).startswith("4 of 12 frames differ")
+    assert unsteadiness(average(stack, RECORDED)) == ""
 
 
 def test_judging_can_be_switched_off() -> None:

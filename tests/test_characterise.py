@@ -222,4 +222,6 @@ def test_bad_input_is_one_message(tmp_path, capsys):
     ):
         assert characterise.main([str(tmp_path / name), *lens, *more]) == 2
         assert message in capsys.readouterr().err
+    assert characterise.main([str(tmp_path / "equal.npz")] * 2 + lens) == 2
+    assert "is named twice" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -288,10 +288,14 @@ def test_the_program_writes_map_and_figures_and_detect_uses_it(recorded, tmp_pat
 
 def test_the_program_refuses_what_makes_no_flat_field(recorded, tmp_path, capsys):
     one, lens = str(recorded / "wall0.npy"), ["--unit", "m", "--intrinsics", str(recorded / "lens.json")]
+    single = tmp_path.parent / "single.npy"
+    np.save(single, np.load(one)[:1])
     for arguments, message in (
         ([one, "--unit", "m", "--out", "unit.npz"], "nothing says which lens"),
         ([one, *lens, "--out", "unit.png"], "a name that ends in .npz"),
         ([one, *lens, "--crop", "sphere", "--out", "unit.npz"], "no such crop"),
+        ([one, one, *lens, "--out", "unit.npz"], "is named twice"),
+        ([str(single), *lens, "--out", "unit.npz"], "record 50 frames"),
     ):
         assert flatfield.main(arguments) == 2
         assert message in capsys.readouterr().err

@@ -12,7 +12,7 @@ from validation.own_null import boards
 
 from detectors import load_detector
 from detectors.interface import Evidence
-from detectors.null import FEWEST_PEAKS, Tail, each_object_once, own_threshold, skew_of
+from detectors.null import FEWEST_PEAKS, MOST, Tail, each_object_once, own_threshold, skew_of
 from harness.vocabulary.geometry import Cloud, Region
 
 PITCH_M, DISTANCE_M, SIGMA_M = 2e-3, 0.7, 1e-3
@@ -157,6 +157,16 @@ def test_it_says_what_it_cannot_know() -> None:
         "not symmetric" in doubt and "behind" in doubt
         for doubt in own_threshold(DETECTOR, skewed, evidence, 1.0).doubts
     )
+
+
+def test_bumps_that_raise_the_threshold_are_told() -> None:
+    """Sixty bumps of some 8 mm, smaller than an object: holes below their score would not be found."""
+    detector = load_detector("matched", {"crop": {"kind": "none"}, "surface": {"degree": 1}})
+    bumps = np.zeros((110, 150))
+    bumps.ravel()[np.random.default_rng(1).choice(bumps.size, 60, replace=False)] = 8e-3 * 2 * np.pi * 4
+    cloud = plane(noise("normal", 4) - ndimage.gaussian_filter(bumps, 2.0))
+    own = own_threshold(detector, cloud, detector.analyse(cloud), 1.0)
+    assert own.threshold > MOST and "bumps or structure of the surface raise it" in own.doubts[0]
 
 
 def test_an_object_is_one_finding_and_holes_apart_from_it_stay() -> None:

@@ -73,6 +73,16 @@ def npz_metres(tmp: Path) -> Recording:
     return open_capture([tmp / "d.npz"], lens=plane.LENS)
 
 
+def npy_as_networks_take_it(tmp: Path) -> Recording:
+    np.save(tmp / "d.npy", np.stack([STORED] * 2)[:, None])
+    return open_capture([tmp / "d.npy"], lens=plane.LENS)
+
+
+def npz_with_its_matrix_and_times(tmp: Path) -> Recording:
+    np.savez(tmp / "d.npz", K=plane.LENS.matrix, depth_image=STORED, stamps=np.arange(3.0))
+    return open_capture([tmp / "d.npz"], lens=plane.LENS)
+
+
 def npy_points(tmp: Path) -> Recording:
     np.save(tmp / "p.npy", TRUE_M)
     return open_capture([tmp / "p.npy"])
@@ -127,7 +137,8 @@ def stray_scanner(tmp: Path) -> Recording:
 
 
 FORMATS = (
-    open3d, tum, sdk_names, file_list, npy_depth, npz_metres, npy_points, mat_grid, mat_frames_last,
+    open3d, tum, sdk_names, file_list, npy_depth, npy_as_networks_take_it, npz_metres, npz_with_its_matrix_and_times,
+    npy_points, mat_grid, mat_frames_last,
     mat_lists_on_a_lens, pcd, ply, xyz_with_a_stated_grid, csv_with_names_and_commas, raw_numbers, chosen_array,
     stray_scanner,
 )  # fmt: skip
@@ -172,6 +183,7 @@ def test_frames_stream_in_the_order_of_their_numbers_and_start_again(tmp_path: P
     for i in (2, 10, 9):
         cv2.imwrite(str(tmp_path / f"{i}.png"), plane.depth_mm() + i)
     cv2.imwrite(str(tmp_path / "wall_mask.png"), np.full((72, 96), 255, np.uint8))
+    (tmp_path / "._9.png").write_bytes(b"\0\5\x16\7")  # beside each file that a Mac copied
     recording = open_capture([tmp_path], lens=plane.LENS)
     names = [frame.name.split("/")[1] for frame in recording.frames()]
     assert names == ["2.png", "9.png", "10.png"]

@@ -172,11 +172,30 @@ def test_a_lens_of_another_size_is_refused(tmp_path: Path) -> None:
         (np.zeros(7), "axes"),
         (np.zeros((2, 2, 3, 4, 5)), "axes"),
         (np.zeros((0, 4, 5)), "empty"),
+        (np.zeros((7000, 4)), "array[:, :3]"),
+        (np.zeros((3, 7000)), "axes"),
+        (np.zeros(9, [("x", "f4"), ("z", "f4")]), "plain numbers"),
     ),
 )
 def test_an_array_that_is_no_capture_is_refused(tmp_path: Path, array: np.ndarray, told: str) -> None:
     np.save(tmp_path / "a.npy", array)
     assert told in refusal(tmp_path / "a.npy", lens=plane.LENS)
+
+
+@pytest.mark.parametrize("planes", ("x y z", "red green blue depth", "depth confidence"))
+@pytest.mark.parametrize("axis", (0, -1))
+def test_planes_that_are_no_frames_of_one_scene_are_refused(tmp_path: Path, planes: str, axis: int) -> None:
+    x, y, z = np.moveaxis(np.nan_to_num(plane.points_m(STORED)), -1, 0)
+    red, green, blue = np.random.default_rng(3).random((3, *z.shape))
+    values = {"x": x, "y": y, "z": z, "red": red, "green": green, "blue": blue, "depth": z, "confidence": 0.1 + 0 * z}
+    names = planes.split()
+    number = names.index("z" if "z" in names else "depth")
+    np.save(tmp_path / "a.npy", np.stack([values[name] for name in names], axis=axis))
+    if (planes, axis) != ("x y z", -1):  # these are points
+        message = refusal(tmp_path / "a.npy", lens=plane.LENS)
+        assert f"{len(names)} planes" in message and "--array :N" in message
+        frame = open_capture([tmp_path / "a.npy"], lens=plane.LENS, array=f":{number}").first_frame()
+        np.testing.assert_allclose(np.nan_to_num(frame.z_m), z, rtol=1e-6)
 
 
 def test_arrays_of_objects_are_never_unpickled(tmp_path: Path) -> None:
@@ -237,7 +256,7 @@ def test_a_file_of_bare_numbers_needs_its_layout(tmp_path: Path) -> None:
     assert "needs 615680" in refusal(path, raw="640x481")
     # planes of depth, brightness and confidence
     path.write_bytes(STORED.tobytes() + (STORED // 9).tobytes() + np.full(STORED.shape, 200, np.uint8).tobytes())
-    assert "--array :0" in refusal(path, raw="96x72", lens=plane.LENS)
+    assert "--array :N" in refusal(path, raw="96x72", lens=plane.LENS)
     recording = open_capture([path], raw="96x72", lens=plane.LENS, array=":0")
     assert len(list(recording.frames())) == 1
     # the same pixel by pixel
@@ -335,6 +354,14 @@ def test_a_cloud_on_both_sides_of_the_camera_is_refused(tmp_path: Path) -> None:
     points[:20] *= [1, -1, -1]
     message = refusal(plane.write_pcd(tmp_path / "c.pcd", points))
     assert "behind the camera" in message and "negate" in message
+    centred = plane.points_m(STORED) - np.nanmean(plane.points_m(STORED), axis=(0, 1))
+    assert "behind the camera" in refusal(plane.write_pcd(tmp_path / "d.pcd", centred))
+    assert "behind the camera" in refusal(plane.write_pcd(tmp_path / "e.pcd", plane.points_m(STORED)[..., [2, 0, 1]]))
+
+
+def test_a_cloud_far_off_the_axis_stands_in_another_frame(tmp_path: Path) -> None:
+    message = refusal(plane.write_pcd(tmp_path / "c.pcd", plane.points_m(STORED) + np.array([431.0, 58.0, 0.0])))
+    assert "off the camera's axis" in message and "another frame" in message
 
 
 # ---- lenses ----------------------------------------------------------------------------------------------------------

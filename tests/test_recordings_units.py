@@ -143,6 +143,28 @@ def test_a_file_beside_the_pictures_states_the_unit(tmp_path: Path, key: str, va
     assert np.nanmedian(recording.first_frame().z_m) == pytest.approx(0.9, rel=0.02)
 
 
+def test_inches_are_asked_for_and_read(tmp_path: Path) -> None:
+    np.save(tmp_path / "d.npy", noisy(1.1, 1e-5) / 2540)
+    with pytest.raises(UserError, match=r"--unit in \(1\.1 m\)"):
+        open_capture([tmp_path / "d.npy"], lens=plane.LENS)
+    z_m = open_capture([tmp_path / "d.npy"], lens=plane.LENS, unit="in").first_frame().z_m
+    assert np.nanmedian(z_m) == pytest.approx(1.1, rel=0.02)
+
+
+def test_lengths_along_the_rays_are_told_from_z(tmp_path: Path) -> None:
+    z_m = 0.7 + np.random.default_rng(2).normal(0, 1e-4, (72, 96)) + 0.1 * plane.slopes()[..., 0]
+    along = z_m * np.linalg.norm(np.dstack([plane.slopes(), np.ones_like(z_m)]), axis=-1)
+    for name, stored, told in (("z", z_m, 0), ("range", along, 1)):
+        np.save(tmp_path / f"{name}.npy", stored)
+        warnings = open_capture([tmp_path / f"{name}.npy"], lens=plane.LENS).warnings
+        assert sum("lengths along the rays" in text for text in warnings) == told
+
+
+def test_a_repeated_frame_is_told(tmp_path: Path) -> None:
+    np.save(tmp_path / "d.npy", np.stack([noisy(0.7, 1e-3, seed) for seed in (1, 1, 2)]).astype(np.uint16))
+    assert "first two frames are equal" in open_capture([tmp_path / "d.npy"], lens=plane.LENS).warnings[0]
+
+
 # ---- named cameras and lenses of other sizes -------------------------------------------------------------------------
 
 

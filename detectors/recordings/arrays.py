@@ -106,7 +106,8 @@ SENSOR_SIZES = (
     *((640, 576), (320, 288), (512, 512), (1024, 1024), (640, 480), (512, 424), (320, 240), (224, 172), (224, 171)),
     *((256, 192), (160, 120), (240, 180), (1024, 768), (1280, 720), (848, 480), (1280, 960), (1280, 1024)),
 )  # (width, height) of the depth images of usual cameras
-SAME_SCENE = 0.05  # part of its distance by which the median pixel of two frames of one scene differs at most
+SAME_SCENE, SEVERAL = 0.05, 8
+"""Part of its distance by which the median pixel of two successive frames differs at most, and frames looked at."""
 NEIGHBOURS = 0.1
 """The same of neighbouring pixels: rows of a floor seen flat differ by 1 %, noise by less; a wrong layout by 100 %."""
 
@@ -147,19 +148,13 @@ class RawLoader:
         strides = (frame, self.width * self.step, self.step)
         return {"": np.ndarray((size // frame, self.height, self.width), kind, content, strides=strides)}
 
-    def refuse_doubtful(self, path: Path, frames: np.ndarray) -> None:
-        """Raise UserError where neighbours differ as no surface's do, or the planes are no frames of one scene."""
-        first, last = frames[0], frames[-1]
-        rough, changed = _apart(first[:, 1:], first[:, :-1]), _apart(first, last)
+    def refuse_doubtful(self, path: Path, frames: np.ndarray) -> int:
+        """Return the bytes left over after the frames. Raises UserError where neighbours differ as no surface's do."""
+        rough = _apart(frames[0][:, 1:], frames[0][:, :-1])
         if not rough < NEIGHBOURS:
             what = f"in this layout the median pixel differs from its neighbour by {100 * rough:.3g} %"
             raise UserError(f"{path}: {what}: the layout is another", legal=LEGAL_RAW, fix=raw_layout_of(path).fix)
-        left_over = (path.stat().st_size - self.offset) % (self.width * self.height * self.step)
-        if len(frames) > 1 and (left_over or not changed < SAME_SCENE):
-            what = f"{path}: {len(frames)} planes and {left_over} bytes more; the median pixel differs by"
-            what += f" {100 * changed:.3g} % between the first and the last: depth beside brightness and confidence?"
-            fix = "choose the plane with the depth: --array :0"
-            raise UserError(what, legal="frames of one scene, or one plane", fix=fix)
+        return (path.stat().st_size - self.offset) % (self.width * self.height * self.step)
 
 
 def raw_layout_of(path: Path) -> UserError:
@@ -180,6 +175,7 @@ DISTANCE_NAMES = ("depth", "z", "z_mm", "depth_mm", "xyz", "points", "location")
 COLOUR_NAMES = ("rgb", "color", "colour", "colors")
 AMPLITUDE_NAMES = ("amplitude", "ir", "intensity")
 LEGAL_AXES = "depth (h, w) or (n, h, w); points (h, w, 3), (n, h, w, 3) or, without a pixel grid, (n_points, 3)"
+FEWEST_ROWS = 8  # of an image: fewer are the columns of a table of points
 FRAMES_OF_POINTS = 20
 """(a, b, 3) is taken for a frames of b points, not for a grid, from b = 20 a on: no sensor is that wide."""
 
@@ -193,8 +189,9 @@ def open_arrays(path: Path, asked: Asked) -> Recording:
     if asked.pitch is not None:
         return _open_height_map(path, load, asked)
     distances, _, _, organised, note = _stack(path, load, asked)
-    if isinstance(load, RawLoader):
-        load.refuse_doubtful(path, distances)
+    left_over = load.refuse_doubtful(path, distances) if isinstance(load, RawLoader) else 0
+    if distances.ndim == 3:
+        _refuse_other_planes(str(path), asked.array or "", distances, left_over)
     height, width = distances.shape[1:3]
     lens: Lens | None = None
     files: tuple[Path, ...] = ()
@@ -226,6 +223,17 @@ def open_array_list(paths: Sequence[Path], asked: Asked, name: str) -> Recording
     return replace(first, name=name, read=read, files=(*paths, *first.files[1:]))
 
 
+def _refuse_other_planes(name: str, key: str, frames: np.ndarray, left_over: int) -> None:
+    """Raise UserError where the first planes (n, h, w) are no frames of one scene, but x and y, colour or amplitude."""
+    changed = [each for each in map(_apart, frames[:SEVERAL], frames[1:SEVERAL]) if math.isfinite(each)]
+    worst = max(changed, default=0.0)
+    if len(frames) > 1 and (left_over or not worst < SAME_SCENE):
+        what = f"{name}: {len(frames)} planes and {left_over} bytes more; the median pixel differs by"
+        what += f" {100 * worst:.3g} % from plane to plane: depth beside x and y, colour, brightness or confidence?"
+        fix = f"choose the plane with the depth by its number from 0: --array {key}:N"
+        raise UserError(what, legal="frames of one scene, or one plane", fix=fix)
+
+
 def _stack(path: Path, load: ArraysLoader, asked: Asked) -> Stack:
     """Find the distances among a file's arrays, with colour and amplitude, and put the frame axis first."""
     arrays = load(path)
@@ -233,6 +241,8 @@ def _stack(path: Path, load: ArraysLoader, asked: Asked) -> Stack:
     if array.size == 0:
         raise UserError(f"{name}: is empty {array.shape}", legal=LEGAL_AXES)
     note = ""
+    if array.ndim == 4 and 1 in array.shape[1::2]:  # (n, 1, h, w) or (n, h, w, 1), as networks take images
+        array = array.squeeze(axis=1 if array.shape[1] == 1 else 3)
     if _frames_are_last(array):
         note = f"{name} {array.shape}: the frames are taken to lie along the last axis"
         array = np.moveaxis(array, -1, 0)
@@ -256,9 +266,13 @@ def _stack(path: Path, load: ArraysLoader, asked: Asked) -> Stack:
 def _frames_are_last(array: np.ndarray) -> bool:
     """Return whether an array (h, w, n) holds depth images along its last axis, as MATLAB stacks them. Of three planes
     the content tells: x, y and z of points are not nearly equal everywhere, repeated distances are."""
-    if array.ndim != 3 or not 2 * array.shape[2] <= min(array.shape[:2]):
+    if not _is_deep(array):
         return False
     return array.shape[2] != 3 or all(_apart(array[..., k], array[..., 2]) < SAME_SCENE for k in (0, 1))
+
+
+def _is_deep(array: np.ndarray) -> bool:
+    return array.ndim == 3 and 2 * array.shape[2] <= min(array.shape[:2])
 
 
 def _apart(first: np.ndarray, second: np.ndarray) -> float:
@@ -273,7 +287,8 @@ def _named_array(name: str, arrays: Arrays, usual: Sequence[str], asked: str | N
     held = ", ".join(f"{key} {value.shape}".strip() for key, value in arrays.items()) or "nothing"
     key, _, number = (asked or "").partition(":")
     if not key:
-        found = [key for key in arrays if key.lower() in usual] or list(arrays)
+        found = [key for key in arrays if key.lower() in usual]
+        found = found or [key for key in arrays if "depth" in key.lower()] or list(arrays)
         if len(found) != 1:
             what = f"{name}: no array, or several arrays, that could be the depth (it holds {held})"
             fix = f"choose one, for instance --array {found[0]} (of a height map with --pitch)" if found else None
@@ -283,6 +298,7 @@ def _named_array(name: str, arrays: Arrays, usual: Sequence[str], asked: str | N
         raise UserError(f"{name}: holds no array {key}", legal=held, fix=f"--array {next(iter(arrays), '')}")
     array, name = arrays[key], f"{name}: {key}" if key else name
     if number:
+        array = np.moveaxis(array, -1, 0) if _is_deep(array) and array.shape[2] != 3 else array
         if not number.isdigit() or array.ndim < 3 or int(number) >= len(array):
             raise UserError(f"--array {asked}: no such part of {name} {array.shape}", legal="NAME, or NAME:0 and up")
         array, name = array[int(number)], f"{name if key else name + ': '}:{number}"
@@ -300,8 +316,10 @@ def _axes(name: str, shape: tuple[int, ...], lens: Lens | None) -> tuple[bool, t
         return True, (frames, 1, points), False
     has_points = len(shape) in (3, 4) and shape[-1] == 3
     n, *grid = (1, 1, *(shape[:-1] if has_points else shape))[-3:]
-    if (len(shape) == 4 and not has_points) or len(shape) not in (2, 3, 4) or (len(shape) == 2 and min(shape) < 2):
-        raise UserError(f"{name}: axes {shape} are no capture's", legal=LEGAL_AXES)
+    is_table = len(shape) == 2 and min(shape) < FEWEST_ROWS
+    if (len(shape) == 4 and not has_points) or len(shape) not in (2, 3, 4) or is_table:
+        fix = "of points in rows with more numbers, save x, y and z alone: array[:, :3]" if is_table else None
+        raise UserError(f"{name}: axes {shape} are no capture's", legal=LEGAL_AXES, fix=fix)
     return has_points, (n, grid[0], grid[1]), True
 
 

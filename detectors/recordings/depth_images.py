@@ -87,8 +87,8 @@ def open_depth_folder(folder: Path, asked: Asked) -> Recording:
     is_tum = any((place / "depth.txt").is_file() for place in (folder, folder.parent))
 
     colour_folder = next((root / name for name in COLOUR_FOLDERS if (root / name).is_dir()), None)
-    beside = (path for path in root.iterdir() if re.search("colou?r|rgb", path.stem.lower()) and path not in depths)
-    found = beside if colour_folder is None else colour_folder.iterdir()
+    beside = [path for path in shown(root) if re.search("colou?r|rgb", path.stem.lower()) and path not in depths]
+    found = beside if colour_folder is None else shown(colour_folder)
     pictures = [path for path in found if path.suffix.lower() in COLOUR_SUFFIXES]
     # the colour picture of each depth picture: the same number in its name, or the nearest time stamp
     stamps = {number: path for path in pictures if (number := _last_number(path)) is not None}
@@ -140,9 +140,14 @@ def _frames(depths: Sequence[Path], colours: Sequence[Path | None], scale_m: flo
         yield frame_of(f"{depth.parent.name}/{depth.name}", read_depth_png(depth), scale_m, rgb)
 
 
+def shown(folder: Path) -> list[Path]:
+    """Return what a folder holds, in order, without the hidden files that systems leave beside each picture."""
+    return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+
+
 def depth_files(folder: Path) -> tuple[Path, ...]:
     """Return a folder's depth pictures in the order of their numbers, without masks. Raises UserError where none is."""
-    pictures = [path for path in folder.iterdir() if path.suffix.lower() == ".png"]
+    pictures = [path for path in shown(folder) if path.suffix.lower() == ".png"]
     numbered = [path for path in pictures if NUMBER.fullmatch(path.stem)]
     # a 16-bit infrared picture looks like depth
     chosen = depth_named(pictures, numbered or [path for path in pictures if png_kind(path)[2:] == (16, 0)])

@@ -11,13 +11,17 @@ import numpy as np
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Frame, Reason
 
-UNITS_M = {"mm": 1e-3, "m": 1.0, "cm": 1e-2, "um": 1e-6, "tum": 1 / 5000}
+UNITS_M = {"mm": 1e-3, "m": 1.0, "cm": 1e-2, "um": 1e-6, "in": 0.0254, "tum": 1 / 5000}
 """Metres in one stored unit; ``tum`` is the scale of the TUM RGB-D benchmark, 5000 to the metre."""
-LEGAL_UNITS = "mm, cm, m, um, tum (5000 to the metre), or N/m for N to the metre (4000/m)"
+LEGAL_UNITS = "mm, cm, m, um, in (inch), tum (5000 to the metre), or N/m for N to the metre (4000/m)"
 NEAREST_M, FARTHEST_M = 0.05, 20.0
 """Bounds of a plausible median distance: nearer than any time-of-flight camera works, farther than any of them sees."""
+FARTHEST_ASIDE = 4.0  # times its z that the median point may lie off the axis: 76 degrees
+RAYS_TELL = 3.0
+"""Ratio of bends that tells lengths along rays from z: 0.1 to 0.5 of real captures' z, up to 2 of a pipe's."""
 COMMON_STEPS_M = (1e-3, 2.5e-4, 2e-4, 1e-4)
 """Rounding steps that cameras store: 1 mm (Kinects), 0.25 mm (L515), 0.2 mm (TUM), 0.1 mm."""
+CAMERA_FRAME = "the camera's frame: x right, y down, z forward from the lens"
 TURNED_SHARE = 0.99
 """Part of the points that must have z below 0 before they are turned: no camera measures behind itself."""
 
@@ -43,7 +47,8 @@ def refuse_narrow(name: str, dtype: np.dtype) -> None:
     if is_narrow or dtype.kind not in "iuf":
         what = "8-bit numbers, which is a picture or a mask" if is_narrow else f"{dtype}, not numbers"
         legal = "integers of 16 bits or more, or floating point"
-        raise UserError(f"{name}: holds {what}", legal=legal, fix="export the depth itself, not a preview")
+        fix = "export the depth itself, not a preview" if is_narrow else "save an array of plain numbers"
+        raise UserError(f"{name}: holds {what}", legal=legal, fix=fix)
 
 
 def frame_of(
@@ -68,10 +73,10 @@ def frame_of(
         share = f"z is negative in {100 * behind.sum() / valid.sum():.3g} % of the points"
         notes.append(f"{share}: turned by half a turn about x (y up and z back became y down and z forward)")
         behind = ~behind & valid
-    elif behind.sum() > 0.5 * valid.sum():
-        what = f"{name}: most points lie behind the camera (z below 0), but not all"
-        legal = "the camera's frame: x right, y down, z forward from the lens"
-        raise UserError(what, legal=legal, fix="turn the cloud (with y up and z back: negate y and z)")
+    elif behind.sum() > max((0.5 if stored.ndim == 2 else 1 - TURNED_SHARE) * valid.sum(), SHARED_CODE):
+        what = f"{name}: {100 * behind.sum() / valid.sum():.0f} % of the points lie behind the camera (z below 0)"
+        fix = "turn and move the cloud (of y up and z back: negate y and z; of x forward and z up: take -y, -z, x)"
+        raise UserError(what, legal=CAMERA_FRAME, fix=fix)
     reason[behind] = Reason.OUT_OF_RANGE
     xy_m = None
     if stored.ndim == 3:
@@ -130,7 +135,7 @@ UNIT_KEYS = ("depthscale", "depthunits", "depthunit", "depthfactor", "depthmapfa
 UNIT_NAMES = {"mm": 1e-3, "millimeter": 1e-3, "millimetre": 1e-3, "cm": 1e-2, "m": 1.0, "meter": 1.0, "metre": 1.0}
 READINGS = {
     **{"mm": (0.867, 0.15), "4000/m": (0.08, 0.0), "tum": (0.03, 0.0), "10000/m": (0.015, 0.0)},
-    **{"cm": (0.003, 0.04), "um": (0.005, 0.01), "m": (0.0, 0.8)},
+    **{"cm": (0.003, 0.04), "um": (0.005, 0.01), "in": (0.0003, 0.01), "m": (0.0, 0.8)},
 }  # units and how common each is among integers and floating-point numbers: guesses that hardly move a decision
 NEAR_M = (0.8, 1.8)
 """Middle and spread (a factor) of the distances at which targets are looked at: 95 % within 0.25 to 2.6 m."""
@@ -245,3 +250,35 @@ def refuse_implausible(frame: Frame, scale_m: float) -> None:
     what = f"{frame.name}: the median distance would be {median_m:.4g} m, which speaks for a wrong unit"
     fix = "pass " + " or ".join(fitting) if fitting else f"state the unit with --unit: {LEGAL_UNITS}"
     raise UserError(what, legal=f"a median between {NEAREST_M:g} m and {FARTHEST_M:g} m", fix=fix)
+
+
+def refuse_far_aside(frame: Frame) -> None:
+    """Raise UserError where half of the points lie farther off the axis than in any camera's picture."""
+    if frame.xy_m is None:
+        return
+    aside = float(np.nanmedian(np.hypot(*np.moveaxis(frame.xy_m, -1, 0)) / frame.z_m))
+    if aside > FARTHEST_ASIDE:
+        what = f"{frame.name}: half of the points lie more than {math.degrees(math.atan(aside)):.0f} degrees"
+        what += " off the camera's axis: the cloud stands in another frame, or z is in another unit than x and y"
+        raise UserError(what, legal=CAMERA_FRAME, fix="move the cloud into the frame of the camera that took it")
+
+
+def ray_lengths_doubt(z_m: np.ndarray, slopes: np.ndarray) -> str:
+    """Return a sentence where ``z_m`` (h, w) looks like lengths along the rays of ``slopes`` (h, w, 2), else "".
+
+    Of a plane, 1/z is a plane over the slopes, whose bends over an eighth of the picture are noise; if z is a length
+    along the ray, that holds for 1/z times the ray's length at z = 1."""
+    with np.errstate(invalid="ignore"):
+        inverse = 1.0 / z_m.astype(np.float64)
+        bends = [_bend(inverse), _bend(inverse * np.sqrt(1.0 + (slopes**2).sum(axis=-1)))]
+    if not bends[0] > RAYS_TELL * bends[1]:
+        return ""
+    what = f"the numbers look like lengths along the rays, not like z: surfaces are {bends[0] / bends[1]:.0f} times as"
+    return f"{what} flat so; places and sizes are wrong then: store z, which is the length times the ray's cosine"
+
+
+def _bend(image: np.ndarray) -> float:
+    far = [(each, max(len(each) // 8, 1)) for each in (image, image.T)]
+    bends = [each[2 * n :] - 2 * each[n:-n] + each[: -2 * n] for each, n in far]
+    some = np.abs(np.concatenate([each[np.isfinite(each)] for each in bends]))
+    return float(np.median(some)) if some.size else math.nan

@@ -13,9 +13,9 @@ import numpy as np
 from detectors.recordings.arrays import LOADERS, open_array_list, open_arrays, raw_layout_of
 from detectors.recordings.bags import BAG_SUFFIXES, ROS1_SUFFIX, is_bag, open_bag
 from detectors.recordings.clouds import CLOUDS, POINT_LISTS, open_clouds
-from detectors.recordings.depth_images import depth_named, open_depth_folder, open_depth_list, png_kind
+from detectors.recordings.depth_images import depth_named, open_depth_folder, open_depth_list, png_kind, shown
 from detectors.recordings.devices import is_stray, open_mkv, open_r3d, open_stray
-from detectors.recordings.distances import UNITS_M, Unit, decided_unit, metres_per_unit, scale_in
+from detectors.recordings.distances import UNITS_M, Unit, decided_unit, metres_per_unit, ray_lengths_doubt, scale_in
 from detectors.recordings.intrinsics import mappings, parsed_lens
 from detectors.recordings.recording import Asked, Recording, damage_told
 from harness.vocabulary.errors import UserError
@@ -60,8 +60,13 @@ def open_capture(paths: Sequence[Path], *, unit: str | None = None, **statements
         said = _unit_not_stated(recording)
         if said.scale_m != recording.scale_m:
             recording = replace(_opened(paths, replace(asked, scale_m=said.scale_m)), selection=asked.frames)
-    first, given = recording.first_frame(), recording.lens
-    notes, warnings = [*recording.notes, *first.notes], [*recording.warnings, said.warning]
+    first, *second = islice(recording.frames(), 2)
+    given, doubts = recording.lens, [said.warning]
+    if second and np.array_equal(first.z_m, second[0].z_m, equal_nan=True):
+        doubts += ["the first two frames are equal: repeated frames lower no noise, and count as more than they are"]
+    if recording.slopes is not None and first.xy_m is None:
+        doubts += [ray_lengths_doubt(first.z_m, recording.slopes)]
+    notes, warnings = [*recording.notes, *first.notes], [*recording.warnings, *doubts]
     if isinstance(given, OtherLens):
         notes, warnings = [*notes, given.note], [*warnings, given.warning]
         recording = replace(recording, lens=given.plain)
@@ -130,7 +135,7 @@ def _opened(paths: list[Path], asked: Asked) -> Recording:
 
 def _open_folder(folder: Path, asked: Asked) -> Recording:
     with damage_told(f"{folder}: cannot be read", LEGAL_FORMATS, "check its permissions"):
-        inside = sorted(folder.iterdir())
+        inside = shown(folder)
     if is_stray(folder):
         return open_stray(folder, asked)
     for suffix in (*CLOUDS, *POINT_LISTS[:3]):

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from detectors.recordings.distances import refuse_implausible, rounding_step_m
+from detectors.recordings.distances import refuse_far_aside, refuse_implausible, rounding_step_m
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import limited_memory
 from harness.vocabulary.geometry import Frame, Lens, Reason, Region, slopes_of
@@ -125,6 +125,8 @@ class Recording:
                     frame = replace(frame, z_m=z_m, reason=reason)
             if not judged and np.isfinite(frame.z_m).any():
                 refuse_implausible(frame, self.scale_m)
+                if self.projection == "central":
+                    refuse_far_aside(frame)
                 judged = True
             yield frame
         if not judged:

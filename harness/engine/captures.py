@@ -46,7 +46,8 @@ def judge_captures(experiment: Experiment, out: Path, command: str) -> int:
         row = {"point": name, "variant": point.variant, "what": point.label, "frames_used": cloud.n_frames}
         row |= {"frames_left_out": len(cloud.left_out), "findings": len(found.findings), "threshold_k": k}
         rows.append(row | {"threshold_mm": round(k * found.evidence.scale_m / MM, 4)})
-        print_warnings(f"{name}: {text}" for text in (*(choice.warnings if choice else ()), *found.evidence.warnings))
+        warnings = (*recording.warnings, *(choice.warnings if choice else ()), *found.evidence.warnings)
+        print_warnings(f"{name}: {text}" for text in warnings)
         print(f"{name} {point.label}: {len(found.findings)} findings beyond {rows[-1]['threshold_mm']:.2f} mm")
         for left in cloud.left_out:
             print(f"  left out: {left.name}: {left.why}")

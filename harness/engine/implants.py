@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 from scipy import ndimage
 
-from detectors.average import AverageConfig, average
+from detectors.average import RECORDED, average
 from detectors.noise import REACH_FRAMES, noise_reach_px
 from detectors.recordings import Recording
 from harness.engine.judge import STUDY_TABLES, Rows, detector_of, judge, study_rows
@@ -141,7 +141,7 @@ class Scan:
 
     def averaged(self, frames: Sequence[Frame]) -> Cloud:
         """Return the average of some frames, as `harness.detect` takes it."""
-        cloud = average(replace(self.recording, read=lambda: iter(frames), selection=None), AverageConfig())
+        cloud = average(replace(self.recording, read=lambda: iter(frames), selection=None), RECORDED)
         return replace(cloud, projection="central", noise_reach_px=getattr(self, "reach_px", 0.0))
 
     def place(self, x_m: float, y_m: float, rim_px: float) -> tuple[np.ndarray, np.ndarray] | None:

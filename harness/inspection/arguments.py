@@ -49,16 +49,21 @@ def refuse_misfits(arguments: argparse.Namespace, paths: list[Path]) -> None:
     if len(paths) < 2:
         fix = "name the other views, or leave out --register"
         raise UserError(f"{len(paths)} view to register: there is nothing to register it to", fix=fix)
-    places = [path.resolve() for path in paths]
-    for path, place in zip(paths, places, strict=True):
-        if places.count(place) > 1:
-            legal = "captures from different places, each named once"
-            raise UserError(f"{path}: is named twice; the same noise counted twice would pass for less", legal=legal)
+    refuse_repeats(paths)
     if arguments.register == "nominal" and arguments.poses is None:
         raise UserError("--register nominal takes the poses as they are, and there are none", fix="give --poses FILE")
     if arguments.quiet_capture is not None:
         what = "--quiet-capture is one cloud, and its noise is not that of a cloud merged from several views"
         raise UserError(what, fix="give a threshold that is silent on undamaged views as --threshold")
+
+
+def refuse_repeats(paths: Sequence[Path]) -> None:
+    """Raise UserError where a capture is named twice."""
+    places = [path.resolve() for path in paths]
+    for path, place in zip(paths, places, strict=True):
+        if places.count(place) > 1:
+            legal = "captures from different places, each named once"
+            raise UserError(f"{path}: is named twice; the same noise counted twice would pass for less", legal=legal)
 
 
 def detector_of(

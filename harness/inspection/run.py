@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from detectors.average import AverageConfig, average
+from detectors.average import RECORDED, average, unsteadiness
 from detectors.background import misfit
 from detectors.crop import Choice
 from detectors.flat_field import FlatField, corrected, doubts, load_flat_field
@@ -45,7 +45,6 @@ if TYPE_CHECKING:
 
 DEFAULT_K = 5.0  # Robust standard deviations, where the capture cannot tell; 0.6 of a million normal pixels lie beyond
 FAINT_CALLS = 0.05  # Expected false calls as strong as a finding, from which on noise explains the finding
-FAINT_PEAKS = 20  # peaks below which their number does not tell how fast it falls with the score
 THRESHOLDS = ("threshold", "quiet_capture", "false_calls")  # arguments of which each sets the threshold
 
 
@@ -128,7 +127,7 @@ def with_faint_told(judged: Judged, threshold: float) -> Judged:
     own threshold. The logarithm of their number is taken to fall with the square of the score, as normal
     noise's does, through the peaks above the floor and the upper 95 % bound of what is expected at the threshold."""
     null = judged.evidence.notes.get("own_null", {"threshold": None})
-    if threshold != null["threshold"] or null["peaks"] < FAINT_PEAKS or not FAINT_CALLS < null["high"] < null["peaks"]:
+    if threshold != null["threshold"] or not FAINT_CALLS < null["high"] < null["peaks"]:
         return judged
     rate = math.log(2 * null["peaks"] / null["high"]) / (threshold**2 - null["floor"] ** 2)
     sure = math.sqrt(threshold**2 + math.log(null["high"] / FAINT_CALLS) / rate)
@@ -228,9 +227,10 @@ def inspect(arguments: argparse.Namespace) -> int:
         return threshold, f"the lowest that is silent on {arguments.quiet_capture}, one repeat of {frames}"
 
     evidence = analysed(detector, cloud)
+    doubted = dict.fromkeys(doubt for view in views if (doubt := unsteadiness(view.cloud)))
     if field is not None:
-        doubted = dict.fromkeys(each for view in views for each in doubts(view.cloud, field, arguments.flat_field))
-        evidence = replace(evidence, warnings=(*doubted, *evidence.warnings))
+        doubted |= dict.fromkeys(each for view in views for each in doubts(view.cloud, field, arguments.flat_field))
+    evidence = replace(evidence, warnings=(*doubted, *evidence.warnings))
     threshold, origin, evidence = threshold_of(arguments, detector, cloud, evidence, silent_threshold)
     result = judged(detector, cloud, evidence, threshold)
     result = with_cut_told(result if mapped else with_faint_told(result, threshold))
@@ -253,7 +253,7 @@ def _opened(arguments: argparse.Namespace, paths: Sequence[Path]) -> Recording:
 
 def _averaged(arguments: argparse.Namespace, recording: Recording, field: FlatField | None) -> Cloud:
 
-    cloud = average(recording, AverageConfig(method=arguments.average))
+    cloud = average(recording, RECORDED.model_copy(update={"method": arguments.average}))
     reach_px = noise_reach_px(list(islice(recording.frames(), REACH_FRAMES))) if cloud.organised else 0.0
     cloud = replace(cloud, projection=recording.projection, noise_reach_px=reach_px)
     return cloud if field is None else corrected(cloud, field)

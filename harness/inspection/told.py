@@ -50,7 +50,7 @@ def print_capture(recording: Recording, cloud: Cloud, name: str, kept: np.ndarra
     """Print the frames, those left out, and the points that the crop keeps (``kept``, of the cloud), a line each."""
     height, width = cloud.valid.shape
     size = f"{width} x {height} pixels" if cloud.organised else f"{width} points"
-    print(f"{name}: {cloud.n_frames} frames averaged, {size}")
+    print(f"{name}: {cloud.n_frames} frame{'s' * (cloud.n_frames != 1)} averaged, {size}")
     print(recording.unit_text)
     print_notes(recording.notes)
     if cloud.noise_reach_px > WIDEST_NATIVE_PX:

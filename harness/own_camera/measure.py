@@ -455,6 +455,9 @@ class Characteristics:
         if sigma_m < COARSE * first.step_m:
             said.append(f"the noise ({sigma_m / MM:.2g} mm) is hidden by the rounding to {first.step_m / MM:.3g} mm,"
                         " and its size before rounding is uncertain")  # fmt: skip
+        if drifted := [one.name for one in self.captures if abs(one.drift_m) > JUMP_M]:
+            said.append(f"the distance drifts by more than {JUMP_M / MM:g} mm during {', '.join(drifted)}: the camera"
+                        " warmed up, or moved")  # fmt: skip
         if jumped := len(self.jumps_m):
             said.append(f"{jumped} of {self.frames} frames are displaced as a whole and are left out of the noise")
         return (*said, *(self.pattern.field.warnings if self.pattern is not None else ()))
@@ -479,7 +482,7 @@ def characteristics(
             flat.append(flattened(capture.cloud(), use, capture.name, pose))
     pattern = separated(flat, first.lens) if flat else None
     surfaces = tuple(figures for capture in captures for figures in surfaces_of(capture))
-    shared = _pattern_correlation(pattern, correlation) if pattern is not None else None
+    shared = _pattern_correlation(pattern, correlation) if pattern is not None and pattern.field.rms_m > 0 else None
     told = dropouts_of(captures), surfaces, edge_of(captures), pattern, shared
     return Characteristics(tuple(captures), cells, noise_law(cells), correlation, *told)
 

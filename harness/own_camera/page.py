@@ -71,9 +71,10 @@ def shared_figures(found: Characteristics) -> Iterator[Told]:
     yield "rounding step", "all", "mm", step, "of the stored distance along the axis"
     share = Reading(len(found.jumps_m) / found.frames)
     yield "displaced frames", "all", "1", share, "share of frames that are displaced as a whole"
-    if found.pattern is not None and found.pattern_correlation is not None:
+    if found.pattern is not None:
         rms = Reading(found.pattern.field.rms_m / MM)
         yield "fixed pattern", "all", "mm", rms, "error of range that all frames share, less a smooth fit"
+    if found.pattern_correlation is not None:
         for axis, name in enumerate("xy"):
             for lag in SHOWN_PATTERN_LAGS:
                 alike = Reading(float(found.pattern_correlation[axis, lag]))

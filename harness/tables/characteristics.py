@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 from harness.tables.schema import Column, Estimate, Table
 
-NOT_SIMULATED = float("nan")
+LEAST = {"mm": 0.01, "px": 0.05, "1": 0.05}
+"""Measured values below these, by unit, are as good as none: a ratio to them says nothing."""
 
 
 @dataclass(frozen=True)
@@ -23,13 +24,17 @@ class OwnFigure:
 
     @property
     def ratio(self) -> float:
-        """Simulated by measured."""
-        return self.simulated / self.measured.value if self.measured.value else NOT_SIMULATED
+        """Simulated by measured; NaN where next to nothing is measured."""
+        return self._by_measured(self.simulated)
 
     @property
     def known_ratio(self) -> float:
-        """The known camera's by measured."""
-        return self.known / self.measured.value if self.measured.value else NOT_SIMULATED
+        """The known camera's by measured, likewise."""
+        return self._by_measured(self.known)
+
+    def _by_measured(self, value: float) -> float:
+        measured = self.measured.value
+        return value / measured if abs(measured) >= LEAST[self.unit] else float("nan")
 
 
 OWN_FIGURES = Table(

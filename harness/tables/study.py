@@ -275,13 +275,13 @@ def axis_grid(group: AxisGroup) -> Grid:
 def axis_note(group: AxisGroup) -> str:
     """Return how the changes are to be read."""
     steps = [step for line in group.lines.values() for step in line.steps]
-    paired = "same boards, drawn again together" if all(step.paired for step in steps) else "not all of the same boards"
+    paired = "the same boards, resampled together" if all(step.paired for step in steps) else "not all of them the same"
     beyond = sum(step.beyond_chance for step in steps)
     rows = sum(len(line.values) for line in group.lines.values())
     cut = f" The first {SHOWN_ROWS} of {rows} rows are shown." if rows > SHOWN_ROWS else ""
     return (
-        f"Ratio of a90 with its 95 % interval over boards ({paired}); {beyond} of {len(steps)} leave out 1 (*). Each "
-        f"interval is taken for itself and a little narrow: of ratios that are 1, 8 to 9 % get a *, not 5 %.{cut}"
+        f"Ratio of a90 with its 95 % interval over boards ({paired}). A * marks an interval without 1: {beyond} of "
+        f"{len(steps)}. The intervals are a little narrow: 8 to 9 % of equal pairs get a *, not 5 %.{cut}"
     )
 
 

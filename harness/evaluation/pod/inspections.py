@@ -62,7 +62,7 @@ def read_inspections(
 ) -> Inspections:
     """Read the named columns; ``responses``: one, or one for each inspector. ``hits``: responses are words or 0/1, else
     signals. Raises UserError, with the line, for what cannot be read."""
-    (_, header), *rows = _rows(path)
+    (_, header), *rows = _rows(path, size)
     notes: list[str] = []
     header = [name.strip() for name in header]
     columns = [_column(path, header, name, (size, *responses, target)) for name in (size, *responses, target) if name]
@@ -85,6 +85,9 @@ def read_inspections(
     names = None if names is None else np.tile(names, count)
     if missing := int(np.isnan(response).sum()):
         notes.append(f"{missing} of {len(response)} inspections state no result: left out")
+    if (below := sizes < 0).any():
+        said = f"{path}, line {lines[below][0]}: {size} is {sizes[below][0]:g}, and no size is below 0"
+        raise UserError(said, fix="give the sizes, not their logarithms: --log takes these")
     seen, flawed = ~np.isnan(response), np.nan_to_num(sizes) != 0
     if sites := int((seen & ~flawed).sum()):
         notes.append(f"{sites} of {len(response)} inspections are of unflawed sites (size 0 or none): not in the curve")
@@ -101,7 +104,7 @@ def read_inspections(
 
 def texts_of(read: Inspections, column: str) -> np.ndarray:
     """Return (n,) the text of another column in the rows that were read. Raises UserError where there is none."""
-    (_, header), *rows = _rows(read.path)
+    (_, header), *rows = _rows(read.path, read.size_column)
     header = [name.strip() for name in header]
     at, row_of = _column(read.path, header, column, (column,)), dict(rows)
     return np.array([row_of[line][at].strip() for line in read.line.tolist()], dtype=str)
@@ -207,20 +210,22 @@ def _thousands(path: Path, name: str, texts: list[str]) -> tuple[set[str], str]:
     return parts, next((text for mark, text in grouped.items() if mark not in parts | decimals), "")
 
 
-def _rows(path: Path) -> Rows:
-    """Return (line, fields) of every row that is not blank, the header first."""
+def _rows(path: Path, column: str) -> Rows:
+    """Return (line, fields) of every row that is not blank, the header first: the first row with the ``column``, where
+    titles stand before it."""
     try:
         content = bounded_bytes(path, TABLE_BYTES)
     except OSError as error:
         reason = (error.strerror or "no reason given").lower()
         raise UserError(f"{path}: cannot be read ({reason})", fix="name a CSV or Excel file") from error
-    rows = _sheet_rows(path, content) if content.startswith(b"PK\x03\x04") else _text_rows(path, content)
+    rows = _sheet_rows(path, content) if content.startswith(b"PK\x03\x04") else _text_rows(path, content, column)
     if not rows:
         raise UserError(f"{path}: is empty", legal=LEGAL)
-    return rows
+    heads = (k for k, (_, row) in enumerate(rows) if column in map(str.strip, row))
+    return rows[next(heads, 0) :]
 
 
-def _text_rows(path: Path, content: bytes) -> Rows:
+def _text_rows(path: Path, content: bytes, column: str) -> Rows:
     """Return the rows of a CSV file: UTF-8, UTF-16 or Latin-1; separated as ``sep=`` says, else as suits its header."""
     try:
         text = content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
@@ -233,9 +238,10 @@ def _text_rows(path: Path, content: bytes) -> Rows:
     skipped = next((k for k, line in enumerate(lines) if line.strip()), len(lines))
     stated = re.fullmatch(r"\"?sep=(.)\"?", lines[skipped].strip("\r\n")) if skipped < len(lines) else None
     skipped += stated is not None
-    first = next((line for line in lines[skipped:] if line.strip()), "")
-    if not first:
+    filled = [line for line in lines[skipped:] if line.strip()]
+    if not filled:
         return []
+    first = next((line for line in filled if column in line), filled[0])
     separator = (
         stated.group(1) if stated else max(SEPARATORS, key=lambda one: len(next(csv.reader([first], delimiter=one))))
     )

@@ -330,7 +330,7 @@ def limit_of(record: SetUpRecord, *, draws: int = DRAWS, tested: bool = False) -
         if record.units > 1:
             unit, ones = seen.repeat % record.units, np.ones(n)
             apart = Targets(seen.board, seen.size_mm, seen.hit.astype(float), ones, unit)
-        of_a50, of_a90 = refitted_sizes(apart, statement.curve, (0.5, POD), draws)
+        of_a50, of_a90 = np.maximum(refitted_sizes(apart, statement.curve, (0.5, POD), draws), 0.0)
         over_boards = a90_95
         if statement.fits[0].method == "ML":
             effects = [design_effect(targets, fit.curve, POD) for fit in statement.fits]
