@@ -101,8 +101,6 @@ def _curve(options: argparse.Namespace) -> PodCurve:
 
 def _laid_out(options: argparse.Namespace, sizes: np.ndarray) -> Gauge:
     """Return boards with these holes: as many boards as hold them, sizes spread over all boards, in random order."""
-    import numpy as np
-
     from harness.inspection.gauge import Gauge, GaugeBoard, GaugeHole, GaugeMark
     from harness.vocabulary.seeds import random_stream
 

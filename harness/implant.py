@@ -31,7 +31,7 @@ DAMAGES = ("through", "blind", "dent", "pressed_dent", "pressed_bump", "protrusi
 MOST_AT_ONCE, FILLED = 8, 0.25  # Damages of one placement; share of the scan within half of --apart from them
 COMPARED = (
     "virtual damage may be harder to find than real damage: on the one drilled plate where both were compared 7 of 23"
-    " virtual holes were found, and 26 of 26 real ones that looked as wide; check the limit with a gauge board"
+    " virtual holes were found, and 50 of 56 real ones that looked as wide; check the limit with a gauge board"
 )
 
 
@@ -161,7 +161,6 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 def _family(options: argparse.Namespace, scans: list[Scan]) -> DrawnTargetConfig:
     """Return the damage as a family of boards as large as the largest scan. Raises UserError for what is not legal."""
-
     from harness.vocabulary.declaration.diagnose import settings_of
     from scenes.sensor.camera import CameraConfig, camera_of
     from scenes.target.drawn import DrawnTargetConfig
@@ -195,7 +194,6 @@ def _family(options: argparse.Namespace, scans: list[Scan]) -> DrawnTargetConfig
 
 def _shares(options: argparse.Namespace, said: str, peaks_mm: list[float]) -> list[str]:
     """Return sentences on what is measured and simulated, and for what the limit holds; ``peaks_mm``: depths shown."""
-
     low, middle, high = np.quantile(peaks_mm, (0.1, 0.5, 0.9))
     return [
         f"Measured: {said}, with their surface, noise, fixed pattern, texture and missing returns.",

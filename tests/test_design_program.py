@@ -63,7 +63,7 @@ def test_logit_by_hand() -> None:
 
 def plans(*told: tuple[int, float]) -> list[StudyPlan]:
     """(targets, 90 % quantile)."""
-    first = StudyPlan(60, 0.9, 0.95, "likelihood ratio", 20, 7.0, 7.5, 7.0, 8.0, 1.0, np.arange(60.0))
+    first = StudyPlan(60, 20, 7.0, 7.5, 7.0, 8.0, 1.0, np.arange(60.0))
     return [replace(first, targets=n, high=high) for n, high in told]
 
 

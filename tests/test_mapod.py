@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
 from synthetic_study import SetUp, Study, study_record
+from validation.mapod_coverage import coverage, wrong_by
 
 from harness import pod
 from harness.evaluation.pod.curve import PodCurve
 from harness.evaluation.pod.design import curve_through, even_sizes
-from harness.evaluation.pod.inspections import Inspections
-from harness.evaluation.pod.statement import state_hits
-from harness.evaluation.pod.transfer import Mapod, Transfer
+from harness.evaluation.pod.transfer import Transfer
 from harness.evaluation.study.record import record_text
 
 
@@ -24,13 +24,6 @@ def simulated(log_size: bool = False) -> PodCurve:
     curve = curve_through(5.0, 7.0, log_size=log_size)
     deviations = np.array([0.02 * (1.0 if log_size else curve.mu), 0.1 * curve.sigma])
     return replace(curve, covariance=np.diag(deviations**2))
-
-
-def wrong_by(curve: PodCurve, k: float, w: float) -> PodCurve:
-    """The true curve of a simulation that is wrong by factors k in size and w in the width of the rise."""
-    if curve.log_size:
-        return replace(curve, mu=curve.mu + np.log(k), sigma=curve.sigma * w)
-    return replace(curve, mu=curve.mu * k, sigma=curve.sigma * k * w)
 
 
 def campaign(size: np.ndarray, hit: np.ndarray, curve: PodCurve) -> Transfer:
@@ -64,31 +57,24 @@ def test_agreement_is_as_rare_as_it_says():
     assert below <= 4
 
 
+def test_a_rise_steeper_than_the_simulated_one_is_credited_only_within_the_study_s_uncertainty():
+    size = np.linspace(1.0, 12.0, 60)
+    known, hardly_known = (
+        campaign(size, size > 5.0, replace(simulated(), covariance=np.diag([1e-6, sigma**2]))).steps()[-1]
+        for sigma in (1e-3, 0.6 * simulated().sigma)
+    )
+    assert hardly_known.a90 - hardly_known.a50 < 1.4 < 1.8 < known.a90 - known.a50
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(("k", "w", "least"), [(0.7, 1.0, 0.95), (1.0, 1.0, 0.9), (1.5, 1.0, 0.9), (1.5, 1.5, 0.9)])
-def test_the_limit_covers_the_truth_whatever_the_camera(k: float, w: float, least: float):
-    """Share of campaigns of 30 holes whose quoted limit is no less than the true a90; 0.95 is what it says, and 120
-    campaigns know it to 0.02."""
-    curve, truth = simulated(), wrong_by(simulated(), k, w)
-    size = even_sizes(30, (2.0, 12.0))
-    random, covered, shorter = np.random.default_rng(5), [], []
-    for _ in range(120):
-        hit = (random.random(30) < truth.pod(size)).astype(float)
-        read = Inspections(Path("campaign"), "size", "hit", size, hit, None, np.arange(30))
-        stated = statement_of(curve)
-        found = Mapod.of("one", replace(stated, fits=(replace(stated.fits[0], curve=curve),)), "", read)
-        covered.append(found.a90_95 >= truth.size_at(0.9))
-        if found.measured is not None:
-            shorter.append(found.steps[-1].a90_95 / found.measured.bound.value)
-    print(f"k {k}, w {w}: covered {np.mean(covered):.3f}, combined by measured {np.median(shorter):.2f}")
-    assert np.mean(covered) >= least
-    assert np.median(shorter) < 1.0
-
-
-def statement_of(curve: PodCurve):
-    size = np.linspace(2.0, 12.0, 60)
-    hit = (np.random.default_rng(1).random(60) < curve.pod(size)).astype(float)
-    return state_hits(Inspections(Path("s"), "size", "hit", size, hit, None, np.arange(60)), tested=False)
+@pytest.mark.parametrize("curve", [curve_through(4.0, 5.0, log_size=True), curve_through(4.0, 5.0, "cloglog")])
+def test_the_limit_covers_the_truth_whatever_the_camera(curve: PodCurve):
+    """100 campaigns of 24 holes know the share of a case to 0.02; the docs' table has 300 of a case."""
+    cases = list(product((1.0, 1.25, 1.5, 2.0), (0.6, 1.0, 1.6)))
+    rows = coverage(curve, cases, 24, studies=10, each=10)
+    print("\n".join(map(str, rows)))
+    assert min(row.covered for row in rows) >= 0.9 and np.mean([row.covered for row in rows]) >= 0.95
+    assert np.median([row.median / row.measured for row in rows]) < 0.95
 
 
 def test_the_program_corrects_a_study(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -131,7 +131,6 @@ class GaugeSeen:
 
 def seen_on(gauge: Gauge, judged: Judged) -> GaugeSeen:
     """Find the boards in a judged capture by their marks, match findings to holes. Raises UserError without one."""
-
     cloud = judged.cloud
     if cloud.rgb is None and cloud.amplitude is not None:  # an infrared picture shows printed codes too
         known = cloud.amplitude[np.isfinite(cloud.amplitude)]

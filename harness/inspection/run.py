@@ -50,8 +50,6 @@ THRESHOLDS = ("threshold", "quiet_capture", "false_calls")  # arguments of which
 
 def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: float) -> Judged:
     """Find damage beyond a threshold and missing returns, each damage and each object once, and measure them."""
-    from harness.report.findings import Judged
-
     missing = missing_returns(cloud, evidence)
     unseen = () if missing is None else missing.detections
     searched = detector.find(cloud, evidence, threshold)
@@ -67,7 +65,6 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
 
 def analysed(detector: Detector, cloud: Cloud) -> Evidence:
     """Return the detector's evidence, with a warning where it fitted a stated surface that does not fit."""
-
     evidence = detector.analyse(cloud)
     doubt = "" if "misfit_share" in evidence.notes else misfit(cloud, evidence.residual_m, "the stated surface")
     return replace(evidence, warnings=(*evidence.warnings, doubt)) if doubt else evidence
@@ -93,7 +90,6 @@ def threshold_of(
     """Return the threshold, its origin, and the evidence to search with it: given, calibrated on a quiet capture
     (``quiet`` does it), the detector's own, or by the peaks of the capture towards the camera, which may leave out a
     rim that cannot be judged; where these cannot be trusted, a fallback with warnings."""
-
     if arguments.threshold is not None:
         return arguments.threshold, "given", evidence
     if arguments.quiet_capture is not None:
@@ -191,8 +187,6 @@ class Inspection:
 
 def inspect(arguments: argparse.Namespace) -> int:
     """Open, average, register and merge views, judge, print, and write with --out. Returns 0. Raises UserError."""
-    from detectors.views import View
-
     config = asked.mapping_of(arguments) if arguments.register is not None else None
     paths = arguments.paths[: config.views] if config else arguments.paths
     asked.refuse_misfits(arguments, paths)
@@ -252,7 +246,6 @@ def _opened(arguments: argparse.Namespace, paths: Sequence[Path]) -> Recording:
 
 
 def _averaged(arguments: argparse.Namespace, recording: Recording, field: FlatField | None) -> Cloud:
-
     cloud = average(recording, RECORDED.model_copy(update={"method": arguments.average}))
     reach_px = noise_reach_px(list(islice(recording.frames(), REACH_FRAMES))) if cloud.organised else 0.0
     cloud = replace(cloud, projection=recording.projection, noise_reach_px=reach_px)
@@ -392,7 +385,6 @@ def _print(run: Inspection) -> None:
 
 def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
     """Return the facts that the JSON holds beside the findings, with the origin and digests of all files read."""
-
     evidence, arguments = run.result.evidence, run.arguments
     settings: dict[str, Any] = {"average": arguments.average, "unit": arguments.unit}
     facts: dict[str, Any] = {}

@@ -11,7 +11,8 @@ import numpy as np
 from harness.evaluation.intervals import SITES_PER_TARGET
 from harness.evaluation.pod import design as planned
 from harness.evaluation.pod.curve import PodCurve
-from harness.evaluation.pod.statement import LEAST_TARGETS
+from harness.evaluation.pod.hit_miss import METHOD
+from harness.evaluation.pod.statement import LEAST_TARGETS, POD
 from harness.report import blocks
 from harness.report.pod import axis_text, plain
 from harness.tables.schema import Column, Table
@@ -172,7 +173,7 @@ def notes(design: StudyDesign) -> list[str]:
         found.append(f"no plan listed has the {LEAST_TARGETS} targets that MIL-HDBK-1823A asks for (40 of signals)")
     return [
         *found,
-        f"medians and quantiles of {plan.studies} simulated studies, bound by {plan.method}; the share that "
+        f"medians and quantiles of {plan.studies} simulated studies, bound by {METHOD}; the share that "
         f"demonstrates any is known to {50 / np.sqrt(plan.studies):.1f} points or better (one standard error)",
         "repeats of the noise are no further targets: 50 inspections of each of 8 holes are worth 8 targets",
         "the plan is as good as the guess: a study whose sizes miss the rise of the true curve demonstrates less",
@@ -228,7 +229,7 @@ def _draw(canvas: Figure, design: StudyDesign) -> None:
     right.plot(sizes, design.guess.pod(sizes), color=blocks.INK, label=f"guessed POD, {design.guess.link}")
     style: dict[str, Any] = {"ms": 9, "mew": 1.0, "color": blocks.BLUE, "clip_on": False}
     right.plot(plan.sizes, np.full(plan.targets, -0.08), "|", label=f"{plan.targets} targets", **style)
-    for pod in (0.5, plan.pod):
+    for pod in (0.5, POD):
         at = design.guess.size_at(pod)
         right.plot([at, at], [0, pod], color=blocks.GREY, lw=0.9, ls=":")
     right.set(ylim=(-0.16, 1.04), xlim=(low, high), yticks=np.linspace(0, 1, 6))

@@ -39,10 +39,9 @@ BOARDS = Table(
 def answer(found: Mapod) -> str:
     """The limit to quote, and whether simulation and reality agree, in two sentences."""
     agrees = f"(p = {found.agrees:.2g})"
+    first = f"The real hits and misses do not contradict the simulation {agrees}."
     if found.contradicted:
         first = f"The real hits and misses contradict the simulation {agrees}: the larger of both limits counts."
-    else:
-        first = f"The real hits and misses do not contradict the simulation {agrees}."
     if not np.isfinite(found.a90_95):
         return f"{first} a90/95 is not demonstrated by the real ones, so no limit is stated."
     return f"{first} A flaw of {sized(found.a90_95, 'mm')} is found 90 % of the time, with 95 % confidence (a90/95)."
@@ -68,10 +67,12 @@ def notes(found: Mapod) -> list[str]:
         "Transfer function: real damage of size k a is found as easily as simulated damage of size a, and the rise "
         f"of the curve is w times as wide. Prior: ln k and ln w about 0 by Student's distribution with {FREEDOM:g} "
         f"degrees of freedom, with scales of a factor {PRIOR_SIZE:g} in k and {PRIOR_WIDTH:g} in w, and "
-        "the simulated curve's own uncertainty.",
-        "Combined: medians of the posterior, and for a90/95 its 95 % quantile, a credible limit. Over simulations that "
-        "are wrong as the prior says it covers the truth in 95 % of campaigns, with one that is far too optimistic in "
-        "fewer: where the simulation is contradicted, the larger of the combined and the measured limit counts.",
+        "the simulated curve's own uncertainty; w below 1 within that uncertainty alone.",
+        "Combined: medians of the posterior, and for a90/95 its 95 % quantile, the largest over the models that fit "
+        "the simulated hits about equally well. Where the simulation is contradicted, the larger of the combined and "
+        "the measured limit counts.",
+        "Study and real inspection have to use the same detector, threshold and hit radius: a difference counts as an "
+        "error of the simulation.",
         "Were the simulated curve right, hits and misses as far from it as these would come with probability "
         f"{found.agrees:.2g}; below 0.05 that is a contradiction.",
         f"Stop rule: enough where a90/95 is at most {ENOUGH:g} times a90. It was fixed before any board.",
@@ -107,7 +108,7 @@ def save_mapod_png(path: Path, found: Mapod) -> None:
 
 def _draw(figure: Figure, found: Mapod) -> None:
     curves = figure.subplots()
-    middle, low, high = found.transfer.band(found.sizes)
+    middle, low, high = found.band
     curves.fill_between(found.sizes, low, high, color=BLUE, alpha=0.16, lw=0)
     curves.plot(found.sizes, middle, color=BLUE, lw=2.2, label="combined")
     curves.plot(found.sizes, found.simulated.curve.pod(found.sizes), color=PURPLE, ls="--", label="simulated")

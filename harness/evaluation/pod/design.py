@@ -10,7 +10,7 @@ from scipy import stats
 
 from harness.evaluation.intervals import threshold_for_rate
 from harness.evaluation.pod.curve import PodCurve, link_ppf
-from harness.evaluation.pod.hit_miss import METHOD, bound, fit_hit_miss
+from harness.evaluation.pod.hit_miss import bound, fit_hit_miss
 from harness.evaluation.pod.statement import CONFIDENCE, LEAST_TARGETS, POD
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.seeds import random_stream
@@ -23,9 +23,6 @@ class StudyPlan:
     own; ``demonstrated``: share of studies with a finite bound; ``sizes`` (targets,) to make."""
 
     targets: int
-    pod: float
-    confidence: float
-    method: str
     studies: int
     true_size: float
     bound: float
@@ -70,7 +67,7 @@ def design(
             bounds[study] = bound(fit, POD, CONFIDENCE).value
         # Order statistics, as there is no mean between a number and infinity.
         low, median, high = np.quantile(bounds, [0.1, 0.5, 0.9], method="inverted_cdf").tolist()
-        told = (number, POD, CONFIDENCE, METHOD, studies, guess.size_at(POD))
+        told = (number, studies, guess.size_at(POD))
         plans.append(StudyPlan(*told, median, low, high, float(np.mean(np.isfinite(bounds))), sizes))
     return tuple(plans)
 
