@@ -91,7 +91,7 @@ def mapod_html(found: Mapod, command: str) -> str:
     """The page as text; it needs no network."""
     caption = (
         "The simulated curve, the one of the real hits (above) and misses (below) alone, and the combined one with its "
-        "90 % credible band."
+        "90 % credible band, the widest over all simulated models."
     )
     drawn = blocks.svg("mapod", SIZE_IN, answer(found), lambda figure: _draw(figure, found))
     body = [blocks.heading("Simulated, measured, combined"), sizes_grid(found).html()]
