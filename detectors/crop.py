@@ -200,23 +200,20 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
         near = other.depths_m[1] / max(it.depths_m[1], 1e-6)
         return _probability(ratio**0.5 * facing**2 * near), "two surfaces are about as large and as near"
 
-    def stands_before(front: int, back: int, border: _Border) -> bool:
-        """Return whether a thing is a target of its own, or too far before the other to lie on it."""
-        return table[front][back][0] >= 0.5 or border.behind_m > described[front].extent_m[0]
-
     table = [[judged(i, j) for j in numbers] for i in numbers]
     odds = [sum(math.log(probability) for probability, _ in row) for row in table]
     order = sorted(numbers, key=lambda number: (-odds[number], number))
     candidates = []
     for number in order:
-        # Holes whose rim the edge cuts are taken in. What stands before it as a target of its own is left out; a thing
-        # that lies on it stays.
+        # Holes whose rim the edge cuts are taken in. What stands before it as a target of its own, or too far to lie on
+        # it, is left out; a thing that lies on it stays.
         outline = described[number].outline
         for radius_px in NOTCHES_PX:
             outline = notches_filled(outline, radius_px)
         for other in numbers:
             border = borders[other].get(number)
-            if border and border.is_step and encloses(number, other) and stands_before(other, number, border):
+            stands = border and (table[other][number][0] >= 0.5 or border.behind_m > described[other].extent_m[0])
+            if border and stands and border.is_step and encloses(number, other):
                 outline = outline & ~grown(surfaces.filled[other], surfaces.reach_px)
         candidates.append(replace(described[number], outline=outline))
     against = [(place, *table[order[0]][other]) for place, other in enumerate(order[1:], start=2)]

@@ -20,7 +20,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--out", required=True, type=Path, metavar="DIR", help="folder for the page, the tables and my_camera.yaml")
     like = "refit this camera's model (a name or a .yaml file); without it, the file is an empirical camera"
     add("--like", metavar="CAMERA", help=like)
-    add("--unit", help="unit of the stored distances: mm, m, cm, um, tum (5000/m) or N/m")
+    add("--unit", help="unit of the stored distances: mm, m, cm, um, in, tum (5000/m) or N/m")
     add("--intrinsics", metavar="FILE|CAMERA", help="the lens: a file, or a camera's nominal lens by name")
     add("--poses", type=Path, metavar="FILE", help="where the camera stood for each PATH, as for harness.detect")
     add("--albedo", type=float, default=0.6, help="albedo that the surfaces are taken to have (default: 0.6)")

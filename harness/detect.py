@@ -18,7 +18,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     )
     add("paths", nargs="+", type=Path, metavar="PATH", help=formats)
     add("--out", type=Path, metavar="DIR", help="write tables, pictures and clouds here (docs/recordings.md)")
-    add("--unit", help="of the stored distances: mm, m, cm, um, tum (5000/m) or N/m; default: as the data say")
+    add("--unit", help="of the stored distances: mm, m, cm, um, in, tum (5000/m) or N/m; default: as the data say")
     add("--intrinsics", metavar="FILE|CAMERA", help="lens of the depth pixels: a file, or a camera's nominal one")
     crop = f"the target: {LEGAL_CROP}; auto: the nearest large smooth surface less 3 pixels of its rim (crop.inset_px)"
     add("--crop", default="auto", metavar="KIND", help=crop)

@@ -29,7 +29,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("paths", nargs="+", type=Path, metavar="PATH", help="captures, in any format that harness.detect reads")
     written = "the flat field; a .json of its figures and a .png of the map are written beside it"
     add("--out", type=Path, required=True, metavar="FILE.npz", help=written)
-    add("--unit", help="unit of the stored distances: mm, m, cm, um, tum (5000/m) or N/m")
+    add("--unit", help="unit of the stored distances: mm, m, cm, um, in, tum (5000/m) or N/m")
     add("--intrinsics", metavar="FILE|CAMERA", help="the lens: a file, or a camera's nominal lens by name")
     add("--crop", default="auto", metavar="KIND", help="the part that shows the wall, as for harness.detect")
     poses = "where the camera stood, as for harness.detect: the surface's own shape then counts as no noise"

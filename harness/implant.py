@@ -11,14 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harness.inspection.arguments import (
-    DEFAULT_DETECTOR,
-    DEFAULT_FALSE_CALLS,
-    LEGAL_CROP,
-    detector_of,
-    opened,
-    refuse_repeats,
-)
+from harness.inspection import arguments as asked
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM
 from harness.vocabulary.program import program
@@ -52,13 +45,13 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--hit-radius", type=float, default=15.0, metavar="MM", help="a finding this near is a hit (default: 15)")
     add("--apart", type=float, metavar="MM", help="least distance of damages (default: hit radius times 2, plus 10)")
     add("--seed", type=int, default=1, help="of places, sizes and noise (default: 1)")
-    calls = f"expected in a capture, which sets the threshold as harness.detect does (default: {DEFAULT_FALSE_CALLS:g})"
+    calls = f"expected in a capture; sets the threshold as harness.detect does (default: {asked.DEFAULT_FALSE_CALLS:g})"
     add("--false-calls", type=float, metavar="N", help=calls)
     add("--threshold", type=float, metavar="K", help="threshold in units of score instead")
-    add("--detector", default=DEFAULT_DETECTOR, help=f"detector's name (default: {DEFAULT_DETECTOR})")
+    add("--detector", default=asked.DEFAULT_DETECTOR, help=f"detector's name (default: {asked.DEFAULT_DETECTOR})")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="detector's setting: surface.degree=5")
-    add("--crop", default="auto", metavar="KIND", help=f"which part is the target: {LEGAL_CROP}")
-    add("--unit", help="unit of the stored distances: mm, m, cm, um, tum (5000/m) or N/m")
+    add("--crop", default="auto", metavar="KIND", help=f"which part is the target: {asked.LEGAL_CROP}")
+    add("--unit", help="unit of the stored distances: mm, m, cm, um, in, tum (5000/m) or N/m")
     add("--intrinsics", metavar="FILE|CAMERA", help="the lens: a file, or a camera's nominal lens by name")
     add("--out", type=Path, default=Path("results/implant"), metavar="DIR", help="default: results/implant")
 
@@ -101,7 +94,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     load_mitsuba()  # before anything loads Open3D, with which LLVM cannot be
     options.quiet_capture = options.target = None  # what harness.detect has, and this program has not
     refuse_thresholds(options)
-    detector, settings = detector_of(options, options.crop, options.set)
+    detector, settings = asked.detector_of(options, options.crop, options.set)
 
     def own_threshold(cloud: Any) -> tuple[float, tuple[str, ...]]:
         value, _, evidence = threshold_of(options, detector, cloud, analysed(detector, cloud), lambda: (0.0, ""))
@@ -109,8 +102,8 @@ def main(options: argparse.Namespace, command: str) -> int:
 
     how = (options.hit_radius * MM, options.threshold, own_threshold)
     judging = Judging(options.detector, canonical_json(settings), *how)
-    refuse_repeats(options.paths)
-    scans = [Scan(opened([path], options.intrinsics, unit=options.unit), judging) for path in options.paths]
+    asked.refuse_repeats(options.paths)
+    scans = [Scan(asked.opened([path], options.intrinsics, unit=options.unit), judging) for path in options.paths]
     family = _family(options, scans)
     cache = options.out / ".cache" / "renders"
     made = []
@@ -135,7 +128,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     }
     origin = record(command) | {"warnings": [COMPARED, *warnings], "seed": options.seed, "failures": []}
     title = f"Virtual damage in {said}"
-    calls = f"{options.false_calls or DEFAULT_FALSE_CALLS:g} false calls a capture: the median over groups of frames."
+    number = options.false_calls or asked.DEFAULT_FALSE_CALLS
+    calls = f"{number:g} false calls a capture: the median over groups of frames."
     own = f"Set by the undamaged frames as harness.detect sets it, by noise towards the camera, for {calls}"
     thresholds = f"Given as {options.threshold:g}." if options.threshold else own
     known = {key: origin[key] for key in ("commit", "dirty", "versions", "seed", "command")}

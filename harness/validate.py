@@ -19,7 +19,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     capture = parser.add_argument_group("a real capture")
     put = capture.add_argument
     put("--capture", type=Path, nargs="+", metavar="PATH", help="frames of a static scene, in any format of detect's")
-    put("--unit", help="unit of the stored distances: mm, m, cm, um, tum (5000/m) or N/m")
+    put("--unit", help="unit of the stored distances: mm, m, cm, um, in, tum (5000/m) or N/m")
     put("--intrinsics", metavar="FILE|CAMERA", help="the lens of the depth pixels: a file, or a camera's nominal lens")
     put("--frames", type=whole_number(4096), metavar="N", help="use the first N frames only")
     put("--mask", type=Path, metavar="PNG", help="use the pixels only that are not black here")

@@ -67,7 +67,7 @@ ANSWERED = (
     ("before_wall", 0), ("on_floor", 0), ("round_board", 0), ("tilted", 0), ("corner", 0), ("small_board", 0),
     ("object_on_plate", 0), ("no_return", 0), ("saddle", 0), ("slots", 0), ("bumps", 0), ("dents", 0),
     ("dropouts", 0), ("pipe_outside", 0), ("sphere", 0), ("dark_patch", 1),
-    ("quarter_mm", 0), ("undamaged", 0), ("passer_by", 0), ("resolutions", 0), ("corrugated", 20), ("foreground", 21),
+    ("quarter_mm", 0), ("undamaged", 0), ("passer_by", 0), ("resolutions", 0), ("corrugated", 20),
     ("heavy_tails", 21),
 )  # fmt: skip
 QUICK = ("before_wall", "no_return", "pipe_outside")

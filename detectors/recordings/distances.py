@@ -254,10 +254,8 @@ def refuse_implausible(frame: Frame, scale_m: float) -> None:
 
 def refuse_far_aside(frame: Frame) -> None:
     """Raise UserError where half of the points lie farther off the axis than in any camera's picture."""
-    if frame.xy_m is None:
-        return
-    aside = float(np.nanmedian(np.hypot(*np.moveaxis(frame.xy_m, -1, 0)) / frame.z_m))
-    if aside > FARTHEST_ASIDE:
+    across_m = np.zeros(1) if frame.xy_m is None else np.hypot(*np.moveaxis(frame.xy_m, -1, 0))
+    if (aside := float(np.nanmedian(across_m / frame.z_m))) > FARTHEST_ASIDE:
         what = f"{frame.name}: half of the points lie more than {math.degrees(math.atan(aside)):.0f} degrees"
         what += " off the camera's axis: the cloud stands in another frame, or z is in another unit than x and y"
         raise UserError(what, legal=CAMERA_FRAME, fix="move the cloud into the frame of the camera that took it")

@@ -41,7 +41,7 @@ def run_capture(options: argparse.Namespace, command: str) -> int:
     twin = characteristics(simulated(camera, found, options.albedo))
     rows = beside(found, twin, None)
     ratios = ", ".join(f"{row.ratio:.2f} ({row.where})" for row in rows if row.figure == "temporal noise")
-    answer = f"Temporal noise, simulated by measured: {ratios}. Albedo {options.albedo:g} is assumed."
+    answer = f"Simulated noise of a pixel, in parts of the measured: {ratios}. Albedo {options.albedo:g} is assumed."
     title = f"{capture.name} beside the simulated {camera.title}"
     facts = {"camera": name, "files": [str(path) for path in recording.files], "notes": recording.notes}
     sources = {MEASURED: found, SIMULATED: twin}

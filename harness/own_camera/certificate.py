@@ -90,7 +90,7 @@ def certified(found: Characteristics, poses: Sequence[np.ndarray] | None) -> Ite
     for name, where, unit, reading, meaning in shared_figures(found):
         if name.endswith("correlation") and not where.endswith(" lag 1"):
             continue  # the rest stands on the page
-        yield row(name, where, f"{reading.value:.3g} {unit}".removesuffix(" 1"), meaning)
+        yield row(name, where, f"{round(reading.value, 3) + 0.0:.3g} {unit}".removesuffix(" 1"), meaning)
     flat = all(capture.planes for capture in found.captures)
     errors = [] if poses is None or not flat else list(spacings_mm(found, poses))
     value = f"{max(map(abs, errors)):.3g} mm at most" if errors else "not measured"
@@ -113,14 +113,18 @@ def write_certificate(
     if study is not None:
         implanted = "Of the detection limits the frames are measured and the damage is simulated."
         share += f" {implanted if study.name == 'implant' else 'The detection limits are simulated.'}"
-    frames = f"{many(found.frames, 'frame')} in {many(len(found.captures), 'capture')}, {len(found.jumps_m)} displaced"
+    answer = f"{many(found.frames, 'frame')} in {many(len(found.captures), 'capture')}, {len(found.jumps_m)} displaced."
+    for one in found.surfaces[:1]:
+        lod_mm = level_of_detection_mm(found, (one.temporal.value * MM) ** 2, LOD_FRAMES[-1])
+        noise = f"A pixel's noise is {one.temporal.value:.3g} mm at {one.distance_m:.2f} m"
+        answer = f"{noise}; {LOD_FRAMES[-1]} frames detect a change of {lod_mm:.3g} mm (LoD95). {answer}"
     body = [PRINTED, heading("Unit"), bullets(f"{key}: {value}" for key, value in about.items())]
     body += [heading("Measured"), FLAT_SURFACES.grid(surfaces).html(), note(OF_SURFACES), CERTIFIED.grid(rows).html()]
     if study is not None:
         body += [heading("Probability of detection"), LIMITS.grid(limits, only=SHOWN_LIMITS).html()]
         body += [note(POD.format(study.hit_radius_mm))]
     body += [heading("Validity"), bullets((share, *CONDITIONS)), note(f"{date.today().isoformat()}: {command}")]
-    text = page(f"Certificate of measurement: {about['unit']}", frames, body, warnings=found.doubts)
+    text = page(f"Certificate of measurement: {about['unit']}", answer, body, warnings=found.doubts)
     told = {"results_version": RESULTS_VERSION, "about": about, "figures": rows}
     told |= {"surfaces": FLAT_SURFACES.data(surfaces), "conditions": [share, *CONDITIONS]}
     told |= {"limits": LIMITS.data(limits), "doubts": found.doubts, "command": command}

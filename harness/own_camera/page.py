@@ -124,8 +124,8 @@ def write_page(
     write_table(folder, OWN_CURVES, OWN_CURVES.frame(curves))
     drawn = svg("captures", (10.5, 6.4), title, lambda canvas: _draw(canvas, found, curves))
     said = (
-        "The simulation is of the camera's file, before the same surfaces as fitted planes, and is analysed like the "
-        "captures. A ratio of 1 says that the file repeats the camera."
+        "Simulated are frames of the camera's file before the same surfaces, taken as planes; they are analysed as the "
+        "captures are. A ratio of 1 says that the file repeats the camera."
     )
     body = [figure({"captures": drawn}, "captures", CAPTION), heading("Measured and simulated"), paragraph(said)]
     body += [OWN_FIGURES.grid(rows, heads=heads).html(), *command_of(command)]

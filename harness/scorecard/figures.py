@@ -293,6 +293,7 @@ SCORES = Table(
         ),
         Column("source", "", "figure.source", "source of the published value"),
         Column("", "source", lambda score: f"[{score.figure.tag}] {score.figure.source}"),
+        Column("", "name", "figure.name", brief=False),
         Column("note", "", "figure.note", "what was assumed"),
         Column("fails", "", "figure.fails", "why it is known to fail"),
         Column("", "note", _remarks, brief=False),
