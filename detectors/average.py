@@ -50,8 +50,8 @@ class AverageConfig(Config):
 
 MOST_LEFT_OUT = 0.25  # share of the frames from which on more than an accident disturbed a recording
 RECORDED = AverageConfig(disturbed_fraction=0.01)
-"""For recordings, in which a camera may be knocked: a shift by 2 % of the picture's width changes some 2 % of the
-pixels, and frames of static real cameras differ from the first by 0.3 % beyond what those show."""
+"""Settings for recordings, in which a camera may be knocked: a shift by 2 % of the picture's width changes some 2 % of
+the pixels, and frames of static real cameras differ from the first by 0.3 % beyond what those show."""
 
 
 def unsteadiness(cloud: Cloud) -> str:

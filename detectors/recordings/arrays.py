@@ -228,7 +228,8 @@ def _refuse_other_planes(name: str, key: str, frames: np.ndarray, left_over: int
     changed = [each for each in map(_apart, frames[:SEVERAL], frames[1:SEVERAL]) if math.isfinite(each)]
     worst = max(changed, default=0.0)
     if len(frames) > 1 and (left_over or not worst < SAME_SCENE):
-        what = f"{name}: {len(frames)} planes and {left_over} bytes more; the median pixel differs by"
+        more = f" and {left_over} bytes more" * bool(left_over)
+        what = f"{name}: {len(frames)} planes{more}; the median pixel differs by"
         what += f" {100 * worst:.3g} % from plane to plane: depth beside x and y, colour, brightness or confidence?"
         fix = f"choose the plane with the depth by its number from 0: --array {key}:N"
         raise UserError(what, legal="frames of one scene, or one plane", fix=fix)
