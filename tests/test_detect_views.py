@@ -52,12 +52,6 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     return [str(board.write_view(folder / f"view_{i}", pose, seed=i)) for i, pose in enumerate(POSES)]
 
 
-@pytest.fixture
-def unpictured(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the files of a run the picture takes longest: left empty by tests that look at the others."""
-    monkeypatch.setattr("harness.report.findings.save_picture", lambda path, *_: path.write_bytes(b""))
-
-
 def failed(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
     """The message of a run that must end with exit code 2."""
     assert detect.main([str(argument) for argument in arguments]) == 2
