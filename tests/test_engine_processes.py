@@ -122,10 +122,8 @@ def test_processes_run_the_drivers_code_whatever_lies_in_the_folder_they_start_i
     """A second `harness`, as another checkout has it, would be found first in the folder where a sweep is started."""
     other = tmp_path / "harness" / "engine"
     other.mkdir(parents=True)
-    for folder in (other, other.parent):
-        (folder / "__init__.py").touch()
-    (other / "preloaded.py").write_text("from harness.engine import trial\n")
-    (other / "trial.py").touch()
+    for path in (other.parent / "__init__.py", other / "__init__.py", other / "trial.py"):
+        path.touch()
     given = {"cwd": ROOT, "capture_output": True, "text": True, "timeout": 900}
     done = subprocess.run([sys.executable, "-c", OTHER_FOLDER, str(tmp_path)], **given)
     assert str(ROOT / "harness" / "engine" / "trial.py") in done.stdout, done.stdout + done.stderr

@@ -83,11 +83,10 @@ def test_a_trial_reaches_what_it_runs_and_not_what_evaluates_or_draws() -> None:
     assert not [name for name in names if name.startswith(("harness/report/", "harness/evaluation/pod/"))]
 
 
-def test_a_digest_is_of_what_is_loaded_not_of_what_was_edited_since(project: Path) -> None:
+def test_a_source_that_is_edited_stays_what_this_process_has_loaded(project: Path) -> None:
+    """So that a worker that reads the edited source, or has loaded it, is found out whatever is asked later."""
     forget()
-    provenance.remember_loaded()  # of this test's project what has the name of a loaded module: harness, scenes, ...
     before = source_digest(("harness.trial",), ("numpy",))
     (project / "harness" / "engine" / "judge.py").write_text("K = 5\n")
-    reached_sources.cache_clear()
     source_digest.cache_clear()
     assert source_digest(("harness.trial",), ("numpy",)) == before != fresh("harness.trial")

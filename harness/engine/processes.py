@@ -43,7 +43,7 @@ CAN_FORK = "forkserver" in multiprocessing.get_all_start_methods()
 PROCESSES: Any = multiprocessing.get_context("forkserver" if CAN_FORK else "spawn")
 """Processes fork from a small one of their own, which imports once what each would spend a second on."""
 if CAN_FORK:
-    PROCESSES.set_forkserver_preload(["harness.engine.preloaded"])
+    PROCESSES.set_forkserver_preload(["harness.engine.trial"])
 
 
 @dataclass(eq=False)
@@ -171,7 +171,7 @@ class _Worker(threading.Thread):
 
     def _carried_out(self, job: Job, limits: Limits, answers: Answers) -> Ended:
         """Run a job. A death of the process is how the job ended, and so is its time limit."""
-        if self._process is not None and not self._process.is_alive():
+        if self._process is not None and self._pipe.poll():  # idle, it says nothing: it has died
             self.end()
         while self._process is None:
             if answers.is_dropped or self._engine.is_over:

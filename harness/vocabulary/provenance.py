@@ -13,7 +13,6 @@ import os
 import platform
 import re
 import subprocess
-import sys
 from collections.abc import Iterable, Iterator
 from functools import cache, lru_cache
 from pathlib import Path
@@ -141,15 +140,9 @@ def reached_sources(modules: tuple[str, ...]) -> tuple[Path, ...]:
     return tuple(sorted(found.values()))
 
 
-def remember_loaded() -> None:
-    """Keep the sources of what this process has loaded of the project: digests in it, and in processes that fork from
-    it, are then of what they run, though the files are edited."""
-    for path in filter(None, map(_source_of, tuple(sys.modules))):
-        _content(path)
-
-
 @cache
 def _content(path: Path) -> bytes:
+    """A source as this process first read it: a later edit is not what it has loaded, nor what forks for it."""
     return path.read_bytes()
 
 

@@ -195,7 +195,8 @@ def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = Fa
             return Source(origin, text, data, {(): place(0, 0), **builder.values}, builder.keys)
         raise DeclarationError(origin, builder.problems)
     except _TooMuch as error:
-        problem = Problem(error.message, place(error.index, error.index + 1), legal=f"at most {error.limit}")
+        message, limit, index = error.args
+        problem = Problem(message, place(index, index + 1), legal=f"at most {limit}")
     except MarkedYAMLError as error:
         mark, context = error.problem_mark or error.context_mark, error.context_mark
         where = place(mark.index, mark.index + 1) if mark else None
@@ -220,11 +221,7 @@ def to_yaml(data: Any) -> str:
 
 
 class _TooMuch(Exception):
-    """More than a declaration may hold, at a character of its text."""
-
-    def __init__(self, message: str, limit: int, index: int) -> None:
-        super().__init__(message)
-        self.message, self.limit, self.index = message, limit, index
+    """What a declaration may not hold, how much it may, and the character of the text from which on it is too much."""
 
 
 class _BoundedParser(Parser):
