@@ -50,6 +50,12 @@ from harness.vocabulary.errors import UserError
 from scenes.render.cache import read_view
 
 
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nodes that start on a busy machine need more than a user's minute."""
+    monkeypatch.setattr("harness.engine.cluster.WAIT_FOR_NODES_S", HOLD)
+
+
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Processes]:
     """Two nodes of one process each, with nannies, which replace a node that dies."""
