@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy import optimize, stats
 from validation.pod_coverage import TRUTHS, coverage
 
-from harness.evaluation.pod.curve import LINKS, HitsAndMisses, link_cdf, link_ppf
+from harness.evaluation.pod.curve import LINKS, HitsAndMisses, link_cdf, link_ppf, profile
 from harness.evaluation.pod.hit_miss import (
     _search,
     band,
@@ -390,3 +390,19 @@ def test_bounds_that_do_not_exist_are_refused() -> None:
     ):
         with pytest.raises(UserError, match=message):
             bound(fit, **arguments)
+
+
+def test_a_bound_far_beyond_all_sizes_is_where_the_ratio_says():
+    """Three hits of 72, which hardly grow with size: far out, plain Newton steps end where all chances round to 0."""
+    size = np.repeat(np.linspace(11.0, 36.0, 24), 3)
+    hit = np.isin(np.arange(72), (53, 64, 71)).astype(float)
+    for log_size in (True, False):
+        fit = fit_hit_miss(size, hit, link="cloglog", log_size=log_size)
+        found, top = bound(fit), float(fit.data.value(fit.place))
+        level, slopes = float(link_ppf("cloglog", np.array(0.9))), np.geomspace(1e-4, 10.0, 4000)
+        for far in (4.0, 32.0, 64.0, 200.0):
+            largest = fit.data.value(np.stack([level - slopes * far, slopes], axis=-1)).max()
+            assert profile(fit.data, far, level, 1.0)[0] == pytest.approx(largest, abs=1e-3)
+        if found.demonstrated:
+            at = ((np.log(found.value) if log_size else found.value) - fit.centre) / fit.spread
+            assert 2.0 * (top - profile(fit.data, at, level, 0.1)[0]) == pytest.approx(criterion(0.95), abs=1e-6)

@@ -208,18 +208,21 @@ def ascend(
 def maxima(data: HitsAndMisses, start: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
     """(d, p) coefficients with the largest likelihood of several studies, from ``start`` (p,); without a penalty. Hits
     and misses of every study must overlap, else its coefficients end where the steps ran out. Plain Newton steps need
-    no values and nearly always arrive, and where they do, it is at the maximum; the others are searched again."""
+    no values and nearly always arrive at the maximum; the others are searched again, and so are those that end lower
+    than they began: far out, where probabilities are rounded to 0 or 1, steps can be small without a maximum."""
     place = np.tile(np.asarray(start, float), (len(data.hits), 1))
     moving = np.arange(len(place))
     for _ in range(PLAIN_STEPS):
         if not len(moving):
-            return place
+            break
         with np.errstate(all="ignore"):
             step = (data if len(moving) == len(place) else data.of(moving)).step(place[moving])
             place[moving] += step
         moving = moving[~(np.abs(step).max(axis=1) <= tolerance)]
-    begin = np.tile(np.asarray(start, float), (len(moving), 1))
-    place[moving], _ = ascend(data.of(moving).climb, begin, tolerance)
+    begin = np.tile(np.asarray(start, float), (len(place), 1))
+    with np.errstate(all="ignore"):
+        again = np.union1d(moving, np.flatnonzero(~(data.value(place) >= data.value(begin))))
+    place[again], _ = ascend(data.of(again).climb, begin[again], tolerance)
     return place
 
 
@@ -257,7 +260,11 @@ def profile(data: HitsAndMisses, z0: float, level: float, slope: float = 1.0) ->
 
         return max(_largest(rising, PENALISED_SLOPES), float(data.value(np.array([level, 0.0])))), slope
     line = replace(data, design=data.z[:, None] - z0, offset=level, hits=data.hits[None], misses=data.misses[None])
-    best = np.maximum(maxima(line, np.array([slope]), 1e-5), 0.0)
+    # far out only slopes near that of the line through the mean chance have a likelihood that is not tiny
+    rate = link_ppf(data.link, data.hits.sum() / (data.hits + data.misses).sum())
+    starts = np.array([[slope], [(level - float(rate)) / max(z0, 1.0)]])
+    best, _ = ascend(line.climb, starts[[np.argmax(np.concatenate([line.value(one[None]) for one in starts]))]], 1e-5)
+    best = np.maximum(best, 0.0)
     return float(line.value(best)[0]), float(best[0, 0])
 
 
