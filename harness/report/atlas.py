@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 from markupsafe import Markup
 
 from harness.report.blocks import COLOURS, GREY, INK, plain_decades, save_png, template
@@ -49,11 +50,14 @@ def atlas_html(rows: Sequence[Row], warnings: Sequence[str], about: Mapping[str,
 
 
 def save_atlas_png(path: Path, rows: Sequence[Row]) -> None:
-    """Draw a90 against distance for each camera, with the least and the most frames: one panel for each damage. Of
-    several albedos the brightest target is drawn."""
+    """Draw a90 against distance for each camera, with the least and the most frames: one panel for each damage that has
+    a limit in half of the places or more. Of several albedos the brightest target is drawn."""
     albedos = sorted({row.place["albedo"] for row in rows if "albedo" in row.place})
     rows = [row for row in rows if row.place.get("albedo") in (None, *albedos[-1:])]
-    damages = list(dict.fromkeys(row.damage for row in rows if np.isfinite(row.answer.a90_mm)))
+    known = pd.Series([np.isfinite(row.answer.a90_mm) for row in rows]).groupby(
+        [row.damage for row in rows], sort=False
+    )
+    damages = [damage for damage, share in known.mean().items() if share >= 0.5]
     titles = list(dict.fromkeys(row.title for row in rows))
     counts = sorted({int(row.place["frames"]) for row in rows})
     shown = {counts[0]: "--", counts[-1]: "-"}
@@ -88,6 +92,6 @@ def save_atlas_png(path: Path, rows: Sequence[Row]) -> None:
         axes[0, 0].plot([], [], "--", color=GREY, label=dashed)
         figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
 
-    columns = max(1, min(len(damages), 2))
+    columns = max(1, len(damages) if len(damages) <= 3 else 2)
     lines = max(1, -(-len(damages) // columns))
-    save_png(path, (3.6 * max(columns, 2), 1.4 + 2.8 * lines), draw)
+    save_png(path, (3.6 * max(columns, 2), 1.7 + 3.2 * lines), draw)
