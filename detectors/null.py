@@ -101,7 +101,7 @@ def own_threshold(detector: Detector, cloud: Cloud, evidence: Evidence, false_ca
     threshold = max(tail.threshold(number), LEAST)
     rim = _mixed_rim(detector, cloud, evidence, threshold) if cloud.organised else np.zeros(known.shape, bool)
     if threshold > MOST:
-        why = f"bumps or structure of the surface raise it, where noise needs some {LEAST + 2:g} units of score"
+        why = f"bumps or structure of the surface, or noise with heavy tails, raise it above {MOST:g} units of score"
         doubts.append(f"{why}, and fainter damage is not found (--threshold states another)")
     low, high = (2.0 * bound for bound in tail.interval(threshold))
     hidden = int((covered & known).sum())

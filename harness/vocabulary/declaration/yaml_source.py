@@ -221,7 +221,7 @@ def to_yaml(data: Any) -> str:
 
 
 class _TooMuch(Exception):
-    """What a declaration may not hold, how much it may, and the character of the text from which on it is too much."""
+    """A declaration exceeds a ``limit`` from the character ``index`` of its text on; ``message``: by what."""
 
 
 class _BoundedParser(Parser):
