@@ -271,8 +271,8 @@ def ray_lengths_doubt(z_m: np.ndarray, slopes: np.ndarray) -> str:
         bends = [_bend(inverse), _bend(inverse * np.sqrt(1.0 + (slopes**2).sum(axis=-1)))]
     if not bends[0] > RAYS_TELL * bends[1]:
         return ""
-    what = f"the numbers look like lengths along the rays, not like z: surfaces are {bends[0] / bends[1]:.0f} times as"
-    return f"{what} flat so; places and sizes are wrong then: store z, which is the length times the ray's cosine"
+    what = f"the numbers look like lengths along the rays, not like z: read so, surfaces are {bends[0] / bends[1]:.0f}"
+    return f"{what} times as flat. Places and sizes are then wrong: store z, the length times the ray's cosine"
 
 
 def _bend(image: np.ndarray) -> float:
