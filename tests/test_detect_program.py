@@ -149,6 +149,7 @@ def test_long_damage_is_told_with_length_width_and_angle(capsys: pytest.CaptureF
     assert "long" not in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("unpictured")
 def test_the_json_says_where_every_number_comes_from(capture: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     local = ("--detector", "local")  # matched filters find the hole too wide for their model and measure its contour
@@ -171,6 +172,7 @@ def test_the_json_says_where_every_number_comes_from(capture: Path, tmp_path: Pa
     assert digests["intrinsic.json"] == hashlib.sha256((capture / "intrinsic.json").read_bytes()).hexdigest()
 
 
+@pytest.mark.usefixtures("unpictured")
 def test_the_cloud_has_the_damage_in_magenta(capture: Path, tmp_path: Path) -> None:
     import trimesh
 
@@ -196,6 +198,7 @@ def test_the_picture_is_a_picture(capture: Path, tmp_path: Path) -> None:
     assert magenta.sum() > 200  # two circles
 
 
+@pytest.mark.usefixtures("unpictured")
 def test_a_cloud_without_a_grid_works_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cloud = plane.write_ply(tmp_path / "c.ply", plane.points_m(plane.depth_mm()), grid=False)
     assert detect.main([str(cloud), "--crop", "none", "--out", str(tmp_path / "out")]) == 0
@@ -214,6 +217,7 @@ def test_a_cloud_without_a_grid_works_too(tmp_path: Path, capsys: pytest.Capture
     assert "1.0 false calls expected, 95 % interval 0.03 to 4.0" in said and "single points" in said
 
 
+@pytest.mark.usefixtures("unpictured")
 def test_auto_crop_without_a_grid_keeps_the_hole_and_leaves_the_rim(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -227,6 +231,7 @@ def test_auto_crop_without_a_grid_keeps_the_hole_and_leaves_the_rim(
     assert told["settings"]["detector"]["settings"]["crop"]["inset_px"] == 3
 
 
+@pytest.mark.usefixtures("unpictured")
 def test_a_quiet_capture_sets_the_threshold(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     quiet = plane.write_open3d_folder(tmp_path / "quiet", 4, noise_mm=0.6, hole=False)
     assert detect.main([str(capture), "--quiet-capture", str(quiet), "--out", str(tmp_path / "a")]) == 0
@@ -242,6 +247,7 @@ def test_a_quiet_capture_sets_the_threshold(capture: Path, tmp_path: Path, capsy
     assert "no findings" not in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("unpictured")
 @pytest.mark.parametrize(
     ("crop", "found"),
     (
@@ -402,6 +408,7 @@ def missed_and_false(findings: list[dict[str, str]], mouths: np.ndarray) -> tupl
     return int(missed.sum()), int((strays | (bare[:, 0] > 0)).sum())
 
 
+@pytest.mark.usefixtures("unpictured")
 def test_a_part_of_the_drilled_plate(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The default command on the rows of mouths at the lower left."""
     part = "polygon:120,350,520,350,520,680,120,680"

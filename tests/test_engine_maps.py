@@ -119,7 +119,7 @@ source:
   kind: simulated
   target: {name: thesis}
   camera: {name: azure_kinect_nfov}
-  render: {bounces: 1, face_samples: 64, hole_samples: 16, rest_samples: 8}
+  render: {bounces: 0}
   views: {kind: arc, count: 3, spread_deg: 40.0}
 capture: {frames: 2}
 mapping: {marks: {kind: red}}

@@ -139,11 +139,8 @@ def test_written_read_back_and_detected_is_equal_bit_for_bit(
         assert measured[0].model_diameter_m == pytest.approx(0.012, rel=0.1)
 
 
-def test_the_program_finds_the_same_in_either_storage(
-    exports: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # the picture takes longer than all else, and other tests look at it
-    monkeypatch.setattr("harness.report.findings.save_picture", lambda path, *_: path.write_bytes(b""))
+@pytest.mark.usefixtures("unpictured")
+def test_the_program_finds_the_same_in_either_storage(exports: dict[str, Path], tmp_path: Path) -> None:
     for form in ("ros2", "mcap"):
         bag = exports[form] / "view_00"
         more = ["--topic", "points2", "--crop", "box:-60,60,-80,-20,0,1000", "--out", str(tmp_path / f"found_{form}")]
