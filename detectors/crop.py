@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from pydantic import Field, model_validator
 
-from detectors.masks import grown, holes_filled, inset, nearest_pixel, notches_filled
+from detectors.masks import grown, holes_filled, inset, nearest_pixel, notches_filled, parts_with
 from detectors.smooth_surfaces import Surfaces, raster, smooth_surfaces
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
@@ -206,7 +206,7 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
     candidates = []
     for number in order:
         # Holes whose rim the edge cuts are taken in. What stands before it as a target of its own, or too far to lie on
-        # it, is left out; a thing that lies on it stays.
+        # it, is left out with all that joins it and is nearer to it (fingers of a hand); a thing that lies on it stays.
         outline = described[number].outline
         for radius_px in NOTCHES_PX:
             outline = notches_filled(outline, radius_px)
@@ -214,7 +214,9 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
             border = borders[other].get(number)
             stands = border and (table[other][number][0] >= 0.5 or border.behind_m > described[other].extent_m[0])
             if border and stands and border.is_step and encloses(number, other):
-                outline = outline & ~grown(surfaces.filled[other], surfaces.reach_px)
+                nearer = grid.points_m[..., 2] < described[other].depths_m[2] + border.behind_m / 2
+                joined = surfaces.filled[other] | (nearer & ~surfaces.own[number])
+                outline = outline & ~grown(parts_with(joined, surfaces.own[other]), surfaces.reach_px)
         candidates.append(replace(described[number], outline=outline))
     against = [(place, *table[order[0]][other]) for place, other in enumerate(order[1:], start=2)]
     close = [(place, why) for place, probability, why in against if probability < DOUBTFUL_BELOW]

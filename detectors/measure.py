@@ -21,7 +21,11 @@ from harness.vocabulary.geometry import MM, Cloud, Region, rotate_vectors
 
 OTHER_DAMAGE_SIGMAS = 5.0
 """Pixels of the patch that stand out by so much and do not touch the detection belong to something else."""
+OPEN_M = 20.0 * MM
+"""The contour counts what is deeper as so deep: of an oblique hole it outlines the mouth, not what shows through."""
 CONTOUR_ZOOM = 4  # sub-pixels of the half-depth contour along each axis
+SHARPER_PX, SHARPER_GAIN = (1.0, 2.0, 3.0, 5.0), 9.0
+"""Blurs that a recording may have below that of its noise, and the gain in chi square beyond which one is believed."""
 
 
 class HoleModelConfig(Config):
@@ -153,7 +157,8 @@ def _sides(around: _Surroundings, near: np.ndarray) -> tuple[float, float, np.nd
 @dataclass(frozen=True)
 class _Surroundings:
     """A detection and its neighbourhood. ``offset_m`` of the residual round about; ``sign`` and ``peak_m`` of the
-    detection's own less that; ``reach_px``: half of the blur. ``origin_m``: the surface's point at (``u0``, ``v0``)."""
+    detection's own less that; ``reach_px``: half of the blur. ``origin_m``: the surface's point at (``u0``, ``v0``).
+    ``sharper_px``: less blur that the image may have, as its noise may be blurred by more than the scene."""
 
     patch: HolePatch
     own: np.ndarray
@@ -166,6 +171,7 @@ class _Surroundings:
     v0: float
     origin_m: np.ndarray
     per_px_m: np.ndarray
+    sharper_px: tuple[float, ...]
 
     @property
     def area_m2(self) -> float:
@@ -223,7 +229,8 @@ def _surroundings(
     patch = HolePatch(residual, used, per_px @ per_px.T, sides, noise, np.array(sights))
     v0, u0 = (float(axis.mean()) for axis in np.nonzero(own))
     invalid = ~np.isfinite(points[..., 2])
-    return _Surroundings(patch, own, invalid, offset, sign, peak, int(blur / 2), u0, v0, centre, per_px)
+    sharper = tuple(side for side in SHARPER_PX if side < cloud.noise_reach_px)
+    return _Surroundings(patch, own, invalid, offset, sign, peak, int(blur / 2), u0, v0, centre, per_px, sharper)
 
 
 def local_plane(
@@ -270,7 +277,13 @@ def _modelled(around: _Surroundings, config: HoleModelConfig) -> tuple[HoleFit |
     u0, v0 = float(weight @ u) / total, float(weight @ v) / total
     if patch.used.sum() < 6:
         return None, "the model of a blurred hole does not fit"
-    fit = fit_hole(patch, u0, v0, radius, around.sign * around.peak_m, around.offset_m)
+    start = (u0, v0, radius, around.sign * around.peak_m, around.offset_m)
+    fit, pixels = fit_hole(patch, *start), int(patch.used.sum())
+    for side in around.sharper_px if fit.misfit else ():
+        other = fit_hole(replace(patch, blur_px=(side, side)), *start)
+        gain = pixels * (fit.misfit**2 - other.misfit**2)
+        if other.converged and gain > (SHARPER_GAIN * other.misfit**2 if fit.converged else 0.0):
+            fit = other
     h, w = own.shape
     row, column = round(fit.v_px), round(fit.u_px)
     is_near = 0 <= row < h and 0 <= column < w and grown(own, around.reach_px + 1)[row, column]
@@ -291,20 +304,25 @@ def _modelled(around: _Surroundings, config: HoleModelConfig) -> tuple[HoleFit |
 
 
 def _by_contour(measured: Measurement, around: _Surroundings, doubt: str) -> Measurement:
-    """Measure the contour at half of the depth; pixels without a range that touch the detection count as inside."""
+    """Measure the contour at half of the depth, of `OPEN_M` where it is deeper; pixels without a range that touch the
+    detection count as inside."""
     residual = np.nan_to_num(around.sign * (around.patch.residual_m - around.offset_m))
     hollow = around.invalid & parts_with(around.own | around.invalid, around.own)
-    residual[hollow] = around.peak_m
+    top_m = min(around.peak_m, OPEN_M)
+    residual = np.minimum(residual, top_m)
+    residual[hollow] = top_m
     residual[~around.patch.used & ~hollow] = 0.0
     size = tuple(CONTOUR_ZOOM * side for side in residual.shape[::-1])
     fine = cv2.resize(residual, size, interpolation=cv2.INTER_LINEAR)
     seeds = cv2.resize(around.own.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-    inside = parts_with(fine > 0.5 * around.peak_m, seeds > 0)
+    inside = parts_with(fine > 0.5 * top_m, seeds > 0)
     if not inside.any():
         return replace(measured, model_note=doubt + "; no half-depth contour")
     v, u = (float((axis.mean() + 0.5) / CONTOUR_ZOOM - 0.5) for axis in np.nonzero(inside))
     area = inside.sum() / CONTOUR_ZOOM**2 * around.area_m2
     diameter_m = 2.0 * float(np.sqrt(area / np.pi))
+    if not hollow.any():  # a pixel that the edge cuts counts as inside by its cut's depth
+        diameter_m -= (1.0 - top_m / around.peak_m) * math.sqrt(around.area_m2)
     depth_m = np.nan if hollow.sum() > around.own.sum() else around.sign * around.peak_m
     note = doubt + "; from the contour at half depth, without standard errors"
     placed = around.placed(measured, u, v)

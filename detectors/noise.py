@@ -13,6 +13,9 @@ from harness.vocabulary.geometry import Cloud, Frame
 REACH_FRAMES, REACH_WINDOW_PX, REACH_PIXELS, FARTHEST_LAG_PX = 6, 384, 5000, 30
 """Frames that are looked at, the side of the window about the middle of the valid pixels, and pixels that must be valid
 in two frames: the correlation of so many, of which 25 are alike, is known to 0.07."""
+LONE_LEVEL_PX, LONE_SIGMAS, LONE_MOST_PX = 21, 5.0, 7
+"""Side of the square whose mean is the level in a lone frame; deviations from it beyond which lies an edge; longest lag
+that is the noise's and not a pattern's or the surface's."""
 LEAST_FRAMES, SCATTER_PX = 4, 7
 """Frames from which on their scatter tells noise, averaged over a square: known to 12 % from 49 x 3 differences."""
 SHARED = 0.1  # correlation below which pixels share nothing: a box of b pixels falls below it at lag b, up to 9 pixels
@@ -82,26 +85,39 @@ def rounding_floor(cloud: Cloud, mask: np.ndarray) -> float:
     return float(np.sqrt(sum(rounding_variances(cloud, mask))))
 
 
-def noise_reach_px(frames: Sequence[Frame]) -> float:
+def noise_reach_px(frames: Sequence[Frame], z_step_m: float) -> float:
     """Return the lag, in pixels, at which the noise of neighbours along rows and columns stops being alike: the median
-    over pairs of successive frames; 0 for unknown (one frame, no noise beyond the rounding, or movement)."""
+    over pairs of successive frames; of a lone frame beside its own level, which holds for white noise beyond the
+    rounding to ``z_step_m``. 0 for unknown (no noise beyond the rounding, movement, or a bent surface in one frame)."""
     lags: list[int] = []
-    for first, second in pairwise(frames):
-        difference = second.z_m.astype(np.float64) - first.z_m
+    lone = len(frames) == 1
+    pictures = [frame.z_m.astype(np.float64) for frame in frames]
+    for difference in pictures if lone else [second - first for first, second in pairwise(pictures)]:
         rows, columns = np.isfinite(difference).nonzero()
         if rows.size < REACH_PIXELS:
             continue
         top, left = (max(0, int(np.median(places)) - REACH_WINDOW_PX // 2) for places in (rows, columns))
         difference = difference[top : top + REACH_WINDOW_PX, left : left + REACH_WINDOW_PX]
         known = np.isfinite(difference)
-        known &= np.abs(np.nan_to_num(difference)) < 8 * float(np.abs(difference[known]).mean())
-        side = (2 * FARTHEST_LAG_PX + 1,) * 2
-        weight = cv2.boxFilter(known.astype(np.float64), -1, side)
-        level = cv2.boxFilter(np.where(known, difference, 0.0), -1, side) / np.maximum(weight, 1e-9)
-        noise = np.where(known, difference - level, 0.0)
+        if lone:
+            noise = _levelled(difference, known, LONE_LEVEL_PX)
+            if (sigma := sigma_of(noise[known])) < z_step_m:
+                continue
+            known &= np.abs(noise) < LONE_SIGMAS * sigma
+            noise = _levelled(difference, known, LONE_LEVEL_PX)
+        else:
+            known &= np.abs(np.nan_to_num(difference)) < 8 * float(np.abs(difference[known]).mean())
+            noise = _levelled(difference, known, 2 * FARTHEST_LAG_PX + 1)
         lags += [_first_unlike_lag(noise, known), _first_unlike_lag(noise.T, known.T)]
-    ends = [lag for lag in lags if lag]
+    ends = [lag for lag in lags if 0 < lag <= (LONE_MOST_PX if lone else FARTHEST_LAG_PX)]
     return float(np.median(ends)) if len(ends) > len(lags) / 2 else 0.0
+
+
+def _levelled(values: np.ndarray, known: np.ndarray, side: int) -> np.ndarray:
+    """Return the values (h, w) less their mean over a square of known ones; 0 where unknown."""
+    weight = cv2.boxFilter(known.astype(np.float64), -1, (side, side))
+    level = cv2.boxFilter(np.where(known, values, 0.0), -1, (side, side)) / np.maximum(weight, 1e-9)
+    return np.where(known, values - level, 0.0)
 
 
 def _first_unlike_lag(noise: np.ndarray, known: np.ndarray) -> int:

@@ -155,6 +155,19 @@ def test_a_hand_before_the_board_is_right_or_a_doubt() -> None:
         assert right or warned
 
 
+def test_the_fingers_of_a_hand_before_the_board_leave_with_it() -> None:
+    cloud, _ = board_before_wall()
+    z = cloud.points_m[..., 2].copy()
+    z[80:120, 110:150] = 0.4
+    fingers = np.zeros(z.shape, dtype=bool)
+    fingers[84:90, 90:110] = fingers[96:102, 90:110] = fingers[108:114, 90:110] = True
+    z[fingers] = 0.43  # 30 mm behind the palm: no part of one smooth surface with it
+    bump = (np.arange(200) - 65) ** 2 + (np.arange(150)[:, None] - 75) ** 2 < 64
+    z[bump] -= 0.02
+    mask = crop(cloud_of(z), AutoCrop())
+    assert mask[fingers].mean() < 0.02 and mask[bump].all()
+
+
 def test_what_lies_on_a_plate_stays_in_its_outline() -> None:
     right, _, scene = judged("object_on_plate", 1, "phone")
     assert right and (scene.name == 1).all()

@@ -218,7 +218,7 @@ def test_a_real_drilled_plate(detector: LocalDetector, shared_data: Path) -> Non
     if not folder.is_dir():
         pytest.skip("the capture of the drilled plate is not here")
     recording = open_capture([folder])
-    reach_px = noise_reach_px(list(islice(recording.frames(), REACH_FRAMES)))
+    reach_px = noise_reach_px(list(islice(recording.frames(), REACH_FRAMES)), recording.z_step_m)
     cloud = replace(average(recording, AverageConfig()), noise_reach_px=reach_px)
     detector = type(detector)(LocalConfig.from_data({}))
     evidence = detector.analyse(cloud)

@@ -251,6 +251,15 @@ def test_a_deep_hole_falls_back_to_its_contour() -> None:
     assert m.model_depth_m == pytest.approx(0.2, abs=1e-3)
 
 
+def test_the_mouth_of_an_oblique_deep_hole_is_measured_and_not_what_it_shows_through() -> None:
+    # 26 degrees off the axis and 20 off the normal, the tube of 20 mm hides most of what lies 0.5 m behind
+    board = Board(19.0, 500.0, wall=0.04, blur=1, emitter_mm=(0.0, 0.0, 0.0), at=(0.32, 0.0), middle=(50.0, 120.0))
+    through_m = np.sqrt((board.image > 0.25).sum() / (board.image > 0).sum()) * 19.0e-3
+    m = measured(board, 0.2, 3)
+    assert through_m < 11.0e-3 and "deeper than 75 mm" in m.model_note
+    assert 14.0e-3 < m.model_diameter_m < 20.0e-3
+
+
 def test_a_hole_without_range_inside_is_measured_by_its_contour() -> None:
     board = Board(19.0, 30.0, wall=0.0, blur=1, emitter_mm=(0.0, 0.0, 0.0))
     cloud, evidence = board.seen(0.2, 3)

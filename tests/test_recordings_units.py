@@ -220,16 +220,27 @@ def test_the_reach_of_noise_is_the_filter_times_the_upsampling(side: int, finer:
         noise = cv2.blur(rng.normal(0, 1e-3 * side, (240, 240)), (side, side))
         z_m = cv2.resize(0.7 + noise, None, fx=finer, fy=finer, interpolation=cv2.INTER_LINEAR).astype(np.float32)
         frames.append(Frame(str(number), z_m, np.zeros(z_m.shape, np.uint8)))
-    assert least <= noise_reach_px(frames) <= most
-    assert noise_reach_px(frames[:1]) == 0.0 and noise_reach_px([frames[0], frames[0]]) == 0.0
+    assert least <= noise_reach_px(frames, 0.0) <= most
+    assert noise_reach_px([frames[0], frames[0]], 0.0) == 0.0
+
+
+@pytest.mark.parametrize(("side", "reach_px"), ((1, 1), (3, 3), (5, 5), (12, 0)))
+def test_a_lone_frame_shows_the_reach_of_its_noise_beside_edges_and_not_below_the_rounding(side, reach_px) -> None:
+    v, u = np.mgrid[:240, :320]
+    z_m = 0.7 + 2e-4 * u + cv2.blur(np.random.default_rng(3).normal(0, 1e-3 * side, u.shape), (side, side))
+    z_m[:, :70] += 0.5  # a wall behind the board
+    z_m[(v - 120) ** 2 + (u - 200) ** 2 < 15**2] += 0.02
+    frame = Frame("0", z_m.astype(np.float32), np.zeros(u.shape, np.uint8))
+    assert noise_reach_px([frame], 0.0) == reach_px
+    assert noise_reach_px([frame], 2e-3) == 0.0
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="needs the real captures")
 def test_real_depth_that_was_aligned_to_colour_is_told_from_the_cameras_own() -> None:
     aligned = list(islice(open_capture([DATA / "azure_drilled_board"]).frames(), 6))
     own = list(islice(open_capture(walls(), lens=lens_named("azure_kinect_nfov")).frames(), 6))
-    assert noise_reach_px(own) == 5.0  # the depth engine's filter
-    assert noise_reach_px(aligned) > 7.0  # 5 pixels of 252 px focal length in an image of 601 px
+    assert noise_reach_px(own, 1e-3) == 5.0  # the depth engine's filter
+    assert noise_reach_px(aligned, 1e-3) > 7.0  # 5 pixels of 252 px focal length in an image of 601 px
 
 
 def walls() -> list[Path]:

@@ -62,7 +62,7 @@ class Scan:
             raise UserError(f"{recording.name}: the lens is not known, and damage cannot be placed", fix=fix)
         self.recording, self.lens, self.slopes = recording, recording.lens, recording.slopes
         self.frames = list(recording.frames())
-        self.reach_px = noise_reach_px(self.frames[:REACH_FRAMES])
+        self.reach_px = noise_reach_px(self.frames[:REACH_FRAMES], recording.z_step_m)
         self.whole = self.averaged(self.frames)
         evidence = detector_of(judging.detector, judging.settings_json).analyse(self.whole)
         self.judged = np.isfinite(evidence.score) & np.isfinite(evidence.surface_z_m)

@@ -247,7 +247,9 @@ def _opened(arguments: argparse.Namespace, paths: Sequence[Path]) -> Recording:
 
 def _averaged(arguments: argparse.Namespace, recording: Recording, field: FlatField | None) -> Cloud:
     cloud = average(recording, RECORDED.model_copy(update={"method": arguments.average}))
-    reach_px = noise_reach_px(list(islice(recording.frames(), REACH_FRAMES))) if cloud.organised else 0.0
+    reach_px = (
+        noise_reach_px(list(islice(recording.frames(), REACH_FRAMES)), recording.z_step_m) if cloud.organised else 0.0
+    )
     cloud = replace(cloud, projection=recording.projection, noise_reach_px=reach_px)
     return cloud if field is None else corrected(cloud, field)
 
