@@ -7,7 +7,7 @@ import json
 import re
 import shlex
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -131,13 +131,17 @@ def _answer(options: argparse.Namespace, surfaces: Sequence[LimitSurface], title
         elif not computed:
             raise UserError(f"{option}: the atlas has none for {damage_words(kind)}s", fix=f"leave {option} out")
     places = [dict(zip(filter(given.get, given), each, strict=True)) for each in product(*filter(None, given.values()))]
-    rows, refused = [], []
+    rows, whose = [], dict[str, set[str]]()
     for place in places:
         found, why = rows_at(asked, titles, place, size_mm)
         rows += found
-        refused += [reason for reason in why if reason not in refused]
+        for reason, title in why:
+            whose.setdefault(reason, set()).add(title)
+    all_asked = {titles[surface.camera] for surface in asked}
+    refused = [reason if of == all_asked else f"{', '.join(sorted(of))}: {reason}" for reason, of in whose.items()]
     if not rows:
-        raise UserError("the atlas does not reach so far: " + "; ".join(refused), fix="run a study: tofpod sweep atlas")
+        fix = f"compute it: {_exactly(asked[0], places[0], about)}"
+        raise UserError("the atlas does not reach so far: " + "; ".join(refused), fix=fix)
     for text in _warnings(row.surface.camera for row in rows):
         print(f"warning: {text}")
     verdicts = [row.answer.verdict(size_mm) for row in rows]
@@ -151,9 +155,8 @@ def _answer(options: argparse.Namespace, surfaces: Sequence[LimitSurface], title
     study, heads = about.get("experiment", "the study"), {} if len(given["albedo"]) > 1 else {"albedo": ""}
     notes = [f"Simulated: one unit of each camera, under the conditions of {study}.yaml{missed}."]
     notes += [f"not answered: {reason}" for reason in refused]
-    show(
-        [answer, ATLAS.grid(rows, heads=heads, terminal=True), *notes, f"computed exactly: {_exactly(rows[0], about)}"]
-    )
+    notes.append(f"to compute the first row exactly: {_exactly(rows[0].surface, rows[0].place, about)}")
+    show([answer, ATLAS.grid(rows, heads=heads, terminal=True), *notes])
 
 
 def _chosen(options: argparse.Namespace, surfaces: Sequence[LimitSurface], kind: str) -> list[LimitSurface]:
@@ -170,7 +173,7 @@ def _chosen(options: argparse.Namespace, surfaces: Sequence[LimitSurface], kind:
             legal = [*(word for word, kind in KINDS.items() if name == "kind" and kind in there), *there]
             near = nearest(unknown[0], (*legal, *(KINDS if name == "kind" else ())))
             meant = f"; did you mean {near!r}?" if near and near != unknown[0] else ""
-            said = f"{option} {', '.join(unknown)}: not in the atlas{meant}"
+            said = f"{option} {options.damage if name == 'kind' else ', '.join(unknown)}: not in the atlas{meant}"
             fix = "run a study of damage that is not in the atlas, such as tofpod sweep crack"
             raise UserError(said, legal=", ".join(legal), fix=fix if name == "kind" else None)
     cameras = options.camera or [surface.camera for surface in surfaces]
@@ -185,18 +188,18 @@ def length_m(option: str, text: str) -> float:
     return float(match[1]) * UNITS_M[match[2]]
 
 
-def _exactly(row: Any, about: dict[str, Any]) -> str:
-    """Return the command that computes one set-up of the answer by a study of its own."""
+def _exactly(surface: LimitSurface, place: Mapping[str, float], about: dict[str, Any]) -> str:
+    """Return the command that computes a set-up by a study of its own."""
     from harness.evaluation import atlas
 
-    axes: dict[str, Any] = {atlas.CAMERA: row.surface.camera, "capture.frames": int(row.place["frames"])}
-    axes[atlas.AXES["distance_m"]] = row.place["distance_m"]
+    axes: dict[str, Any] = {atlas.CAMERA: surface.camera, "capture.frames": int(place["frames"])}
+    axes[atlas.AXES["distance_m"]] = place["distance_m"]
     parts = [f"tofpod sweep {about.get('experiment', 'atlas')}"]
-    depth = row.place.get("depth_mm")
-    if depth is not None or row.surface.kind != "through":
-        axes[atlas.DAMAGE] = json.loads(row.surface.damage) | ({} if depth is None else {"depth_mm": [depth, depth]})
-    if "albedo" in row.place:
-        axes[atlas.AXES["albedo"]] = row.place["albedo"]
+    depth = place.get("depth_mm")
+    if depth is not None or surface.kind != "through":
+        axes[atlas.DAMAGE] = json.loads(surface.damage) | ({} if depth is None else {"depth_mm": [depth, depth]})
+    if "albedo" in place:
+        axes[atlas.AXES["albedo"]] = place["albedo"]
     swept = {path: [value] for path, value in axes.items()}
     return " ".join([*parts, "--set study.boards=36 --set", shlex.quote(f"sweep={json.dumps(swept)}")])
 

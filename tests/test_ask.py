@@ -156,7 +156,7 @@ def test_the_exact_command_is_a_valid_experiment(stored: Path, capsys: pytest.Ca
 
     asked = ["--damage", "blind", "--depth", "4mm", "--size", "9mm", "--distance", "0.8m", "--frames", "5"]
     assert main([*asked, "--atlas", str(stored)]) == 0
-    command = capsys.readouterr().out.split("computed exactly: ")[1].strip()
+    command = capsys.readouterr().out.split("exactly: ")[1].strip()
     assert tofpod([*shlex.split(command)[1:], "--dry-run", "--out", str(stored / "dry")]) == 0
     assert "1 point" in capsys.readouterr().out
 
@@ -166,9 +166,9 @@ def test_the_exact_command_is_a_valid_experiment(stored: Path, capsys: pytest.Ca
     [
         (["--size", "5mm"], "a question needs --size and --distance"),
         (["--size", "5", "--distance", "1m"], "--size 5: no length with its unit"),
-        (["--size", "5mm", "--distance", "9m"], "the atlas does not reach so far"),
+        (["--size", "5mm", "--distance", "9m"], "not reach so far: distance 9 m: the atlas has 0.5 to 1.5 m\n"),
         (["--size", "5mm", "--distance", "1m", "--camera", "kinect"], "--camera kinect: not in the atlas"),
-        (["--size", "5mm", "--distance", "1m", "--damage", "crack"], "legal: hole, through-hole, "),
+        (["--size", "5mm", "--distance", "1m", "--damage", "crack"], "--damage crack: not in the atlas\n  legal: hole"),
         (["--size", "5mm", "--distance", "1m", "--damage", "crak"], "did you mean 'crack'?"),
         (["--size", "5mm", "--distance", "1m", "--damage", "blind"], "--depth is missing"),
         (["--size", "5mm", "--distance", "1m", "--depth", "2mm"], "--depth: the atlas has none for through-holes"),

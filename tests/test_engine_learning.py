@@ -199,5 +199,5 @@ def test_one_blob_of_one_unit_decides_its_calibration_and_units_spread_it(study_
     of_one, of_units = ([limit_of(one, draws=10) for one in record.set_ups] for record in records)
     assert set_by(of_one)[0].same_pixels == 4, "of 5 boards"
     assert set_by(of_units)[0].same_pixels == 1
-    assert "loudest on the same pixels" in threshold_warnings(of_one)[0]
+    assert "highest score on the same pixels" in threshold_warnings(of_one)[0]
     assert not any("same pixels" in said for said in threshold_warnings(of_units))

@@ -120,8 +120,8 @@ def test_the_same_input_gives_the_same_bytes(page: str, results: Tables) -> None
 
 
 def test_answer_counts_and_verdicts_are_told(page: str) -> None:
-    assert "With 50 averaged frames the camera finds 8 of 11 holes (4–11; the smallest is 6.35 mm, 1/4 in)" in page
-    assert "with one frame 7 of 11 holes (5–11; the smallest is 7.94 mm, 5/16 in)" in page
+    assert "With 50 averaged frames the camera finds 8 of 11 holes (no. 4–11; the smallest is 6.35 mm, 1/4 in)" in page
+    assert "with one frame 7 of 11 holes (no. 5–11; the smallest is 7.94 mm, 5/16 in)" in page
     assert page.count("✓ borne out") == 8
     assert page.count(">50/50 <small>") == 7 + 8 + 8
     assert "0.93–1.00" in page
@@ -193,7 +193,7 @@ def test_answer_tells_what_is_undecided() -> None:
     results = tables(World(rate=lambda hole, frames: 0.5 if hole == 5 else float(hole > 5)), frames=(1, 50))
     main = summarise_holes(results.holes)
     sentence = answer_sentence(main, score_claims(results, summary=main))
-    assert "6 of 11 holes (6–11; the smallest is 9.52 mm, 3/8 in), with 5 undecided" in sentence
+    assert "6 of 11 holes (no. 6–11; the smallest is 9.52 mm, 3/8 in), with 5 undecided" in sentence
     assert sentence.endswith("1 is not borne out (C1), 2 are undecided (C2, C6).")
 
 

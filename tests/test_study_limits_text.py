@@ -205,10 +205,16 @@ def test_few_targets_are_told() -> None:
 @given(st.floats(-1e3, 1e3), st.floats(0, 1e3), st.floats(0, 1e3))
 @settings(max_examples=30, deadline=None)
 def test_intervals_as_text_hold_their_numbers(value: float, down: float, up: float) -> None:
-    """To two decimals, or to two significant digits of the estimate, where the interval is wider than a tenth of it."""
+    """To two decimals, or to two significant digits of the estimate (of the upper end where that is 0), where the
+    interval is wider than a tenth of it."""
     text = with_interval(value, value - down, value + up)
     numbers = [float(one) for one in re.findall(r"-?\d+(?:\.\d+)?", text)]
-    assert np.allclose(numbers, [value, value - down, value + up], atol=max(0.0051, 0.051 * abs(value)))
+    assert np.allclose(numbers, [value, value - down, value + up], atol=max(0.0051, 0.051 * abs(value or up)))
+
+
+def test_an_interval_from_0_has_two_digits() -> None:
+    assert with_interval(0.0, 0.0, 2.857) == "0.0 (0.0 to 2.9)"
+    assert with_interval(0.0, 0.0, 0.0) == "0.00 (0.00 to 0.00)"
 
 
 def test_numbers_are_held_to_their_units() -> None:

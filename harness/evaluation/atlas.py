@@ -79,7 +79,8 @@ class LimitSurface:
         for axis, values in ends.items():
             if not values[0] - TOLERANCE <= place[axis] <= values[-1] + TOLERANCE:
                 only = f"{values[0]:g} to {values[-1]:g}" if len(values) > 1 else f"{values[0]:g} only"
-                raise Outside(f"{axis} {place[axis]:g}: the atlas has {only}")
+                name, _, unit = axis.partition("_")
+                raise Outside(f"{name} {place[axis]:g} {unit}".rstrip() + f": the atlas has {only} {unit}".rstrip())
         wanted = np.array([place.get(axis, values[0]) for axis, values in self.grid.items()])
         around = np.all([self._near(k, value) for k, value in enumerate(wanted)], axis=0)
         largest_mm = float(self.largest_mm[around].min()) if around.any() else float("nan")

@@ -86,10 +86,10 @@ def save_atlas_png(path: Path, rows: Sequence[Row]) -> None:
             panel.set_xlabel("distance (m)")
         for panel in axes[:, 0]:
             panel.set_ylabel("size found 90 % of the time (mm)")
-        if len(albedos) > 1:
-            figure.suptitle(f"target of albedo {albedos[-1]:g}", fontsize="medium")
-        dashed = f"{many(counts[0], 'frame')} (lines: {counts[-1]})"
-        axes[0, 0].plot([], [], "--", color=GREY, label=dashed)
+        target = f"target of albedo {albedos[-1]:g}; " if albedos else ""
+        figure.suptitle(f"{target}bands: 95 % intervals, {many(counts[-1], 'frame')}", fontsize="medium")
+        for frames, style in shown.items():
+            axes[0, 0].plot([], [], style, color=GREY, label=many(frames, "frame"))
         figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
 
     columns = max(1, len(damages) if len(damages) <= 3 else 2)

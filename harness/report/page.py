@@ -332,7 +332,7 @@ def answer_sentence(main: pd.DataFrame, verdicts: Sequence[Verdict] = ()) -> str
         if found:
             least = float(main["true_diameter_mm"][main["hole"].isin(found)].min())
             drill = f", {inches(least)}" if inches(least) else ""
-            text += f" ({hole_list(found)}; the smallest is {least:.2f} mm{drill})"
+            text += f" (no. {hole_list(found)}; the smallest is {least:.2f} mm{drill})"
         text += f", with {hole_list(open_)} undecided" if open_ else ""
         parts.append(f"with {_averaged(n)} {text}" if parts else f"With {_averaged(n)} the camera finds {text}")
     return f"{'; '.join(parts)}.{sections.counted_verdicts(verdicts)}"

@@ -27,6 +27,7 @@ from harness.vocabulary.config import Config
 from harness.vocabulary.declaration.diagnose import validated, wrong_choice
 from harness.vocabulary.declaration.shape import child
 from harness.vocabulary.declaration.yaml_source import DeclarationError, KeyPath, Problem, read_yaml
+from harness.vocabulary.path_names import camera_title
 from harness.vocabulary.provenance import RESULTS_VERSION
 from harness.vocabulary.seeds import canonical_json
 from scenes.sensor.camera import camera_names
@@ -259,6 +260,10 @@ def _ratio(row: Beside) -> str:
     return f"{row.simulated.value / row.measured.value:.2f}" if told else "–"
 
 
+def _named(score: Score) -> str:
+    return f"{score.figure.what()}\n{score.figure.name}"
+
+
 def _remarks(score: Score) -> str:
     why = f"Why it fails: {score.figure.fails}. " if score.figure.fails else ""
     return why + score.figure.note
@@ -270,13 +275,15 @@ SCORES = Table(
     "one row per published figure",
     (
         Column("name", "", "figure.name", "name in the file of figures"),
-        Column("camera", "camera", "figure.camera", "simulated camera"),
-        Column("figure", "figure", lambda score: score.figure.what(), "quantity and conditions in words"),
+        Column("camera", "", "figure.camera", "simulated camera"),
+        Column("", "camera", lambda score: camera_title(score.figure.camera)),
+        Column("figure", "", lambda score: score.figure.what(), "quantity and conditions in words"),
+        Column("", "figure", _named, brief=lambda text: text.partition("\n")[0]),
         Column("quantity", "", "figure.quantity", "quantity that is measured"),
         Column("unit", "", "figure.measures.unit", "unit of all values"),
         *_reading("simulated", "low", "high", "simulated value"),
-        Column("published", "published", lambda score: score.figure.published.in_words(), "published value"),
-        Column("", "unit", lambda score: score.figure.measures.unit or "–"),
+        Column("published", "", lambda score: score.figure.published.in_words(), "published value"),
+        Column("", "published", lambda score: f"{score.figure.published.in_words()} {score.figure.measures.unit}"),
         Column("ratio", "ratio", "ratio", "simulated by published, or by the nearer bound", number),
         Column("passes_from", "", lambda score: score.figure.limits[0], "lowest value that passes"),
         Column("passes_to", "", lambda score: score.figure.limits[1], "highest value that passes"),
@@ -287,13 +294,12 @@ SCORES = Table(
         Column("tag", "", "figure.tag", "R read, D derived, S secondary, W measured on captures, M a guess"),
         Column(
             "first_hand",
-            "first hand",
+            "",
             lambda score: "yes" if score.figure.tag in "RW" else "no",
             "whether the source itself was read, or the capture measured",
         ),
         Column("source", "", "figure.source", "source of the published value"),
         Column("", "source", lambda score: f"[{score.figure.tag}] {score.figure.source}"),
-        Column("", "name", "figure.name", brief=False),
         Column("note", "", "figure.note", "what was assumed"),
         Column("fails", "", "figure.fails", "why it is known to fail"),
         Column("", "note", _remarks, brief=False),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harness.report.blocks import BLUE, RED, command_of, figure, heading, note, page, plain, subheading, svg, tag
+from harness.report.blocks import BLUE, RED, command_of, figure, heading, note, page, plain, svg, tag
 from harness.scorecard import figures as scoring
 from harness.scorecard.bench import FULL
 from harness.scorecard.quantities import QUANTITIES
@@ -28,9 +28,9 @@ HOW = (
     "Each quantity is measured on simulated frames like that of a real camera, under the conditions that the source "
     "states. A figure of a real camera passes where the simulated value lies within 25 % of the published one; where "
     "the stated tolerance is wider, that counts, and the verdict says so. A bound must hold. Blind: nothing was fitted "
-    "to it. Calibration: the camera's file was, or may be, fitted to it, so it is no test. First hand: the source was "
-    "read, or the capture measured, for this project. Tags: R read in the named public source, D derived from such, S "
-    "one secondary source, W measured on public captures, M from memory or a guess."
+    "to it. Calibration: the camera's file was, or may be, fitted to it, so it is no test. Tags of sources: R "
+    "read for this project in the named public source, D derived from such, S one secondary source, W measured on "
+    "public captures, M from memory or a guess."
 )
 CHECKS = (
     "These compare the program with arithmetic that follows from a stated filter, gate or limit of the camera's file. "
@@ -86,7 +86,7 @@ def _page(
     provenance: Mapping[str, object],
     command: str,
 ) -> str:
-    """The page: the ratios' picture, a table for each camera, checks of the code, what the quantities mean."""
+    """The page: the ratios' picture, figures of cameras, checks of the code, what the quantities mean."""
     body = [heading("Simulated beside published")]
     real = [score for score in scores if score.figure.kind == "reality"]
     ratios = [score for score in real if score.figure.published.value is not None and score.ratio > 0]
@@ -94,10 +94,9 @@ def _page(
         size, name = (9.5, 1.2 + 0.17 * len(ratios)), "ratios"
         drawn = {name: svg(name, size, "Simulated by published value", lambda canvas: _draw(canvas, ratios))}
         body.append(figure(drawn, name, CAPTION))
-    for camera, title in titles.items():
-        own = [score for score in real if score.figure.camera == camera]
-        none = note("No published figure is on file for this camera.")
-        body += [subheading(title), scoring.SCORES.grid(own, heads={"camera": ""}).html() if own else none]
+    without = [title for camera, title in titles.items() if all(score.figure.camera != camera for score in real)]
+    body += [scoring.SCORES.grid(real).html()] if real else []
+    body += [note(f"No published figure is on file for {'; '.join(without)}.")] if without else []
     code = [score for score in scores if score.figure.kind == "code"]
     if code:
         body += [heading("Checks of the code"), note(CHECKS), scoring.SCORES.grid(code).html()]

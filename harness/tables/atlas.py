@@ -81,15 +81,15 @@ ATLAS = Table(
 
 def rows_at(
     surfaces: Iterable[LimitSurface], titles: Mapping[str, str], place: Mapping[str, float], size_mm: float = np.nan
-) -> tuple[list[Row], list[str]]:
-    """Return the rows at a place, best first, and why other surfaces say nothing there."""
+) -> tuple[list[Row], list[tuple[str, str]]]:
+    """Return the rows at a place, best first, and why surfaces say nothing there, each with its camera's title."""
     rows, refused = [], []
     for surface in surfaces:
         own = {axis: place[axis] for axis in surface.grid if axis in place}
         try:
             rows.append(Row(surface, titles[surface.camera], own, surface.at(**own), size_mm))
         except Outside as reason:
-            refused.append(f"{titles[surface.camera]}: {reason}")
+            refused.append((str(reason), titles[surface.camera]))
     rows.sort(key=lambda row: (np.isnan(row.answer.a90_mm), row.answer.a90_mm, row.title))
     return rows, refused
 

@@ -106,8 +106,8 @@ def threshold_warnings(limits: Sequence[SetUpLimit]) -> list[str]:
         where = crowded[0].limit.record.label if len(crowded) == 1 else f"{len(crowded)} of {len(limits)} set-ups"
         said.append(
             f"{where}: {' to '.join(map(str, counts[:1] + counts[1:][-1:]))} of {crowded[0].runs} calibration boards "
-            "are loudest on the same pixels of the sensor: the threshold is that of one place of this unit's pattern, "
-            "not of many (study.units draws units)"
+            "have their highest score on the same pixels of the sensor: one place of this unit's fixed pattern sets "
+            "the threshold (study.units draws several units)"
         )
     for one in rows:
         threshold = one.limit.record.threshold

@@ -68,11 +68,13 @@ def interval(low: float, high: float, digits: int = 2, most: float = np.inf) -> 
 
 def with_interval(value: float, low: float, high: float, digits: int = 2, most: float = np.inf) -> str:
     """Return ``5.1 (4.8 to 5.6)``; the estimate alone where its interval is unknown or beyond ``most``. Numbers have
-    ``digits`` decimals at most, and two significant digits where the interval is wider than `ROUGH` of the value."""
+    ``digits`` decimals at most, and two significant digits where the interval is wider than `ROUGH` of the value (of
+    its upper end where the value is 0)."""
     if np.isnan(low) or np.isnan(high) or np.isnan(value) or min(value, low) > most:
         return _number(value, digits, most)
-    if np.isfinite([value, low, high]).all() and value and high - low > ROUGH * abs(value):
-        digits = min(digits, max(0, 1 - int(np.floor(np.log10(abs(value))))))
+    scale = abs(value or high)
+    if np.isfinite([scale, low, high]).all() and scale and high - low > ROUGH * scale:
+        digits = min(digits, max(0, 1 - int(np.floor(np.log10(scale)))))
     return f"{_number(value, digits, most)} ({interval(low, high, digits, most)})"
 
 

@@ -56,19 +56,19 @@ def part_of(shape: custom.MeshConfig) -> tuple[np.ndarray, np.ndarray]:
 
     def refuse(wrong: np.ndarray, said: str, fix: str) -> None:
         if len(wrong):
-            place = ", ".join(f"{each:.4g}" for each in mesh.vertices[wrong].reshape(-1, 3).mean(axis=0))
-            where = f"{len(wrong)} {said.format(shape.file)}, about ({place}) {shape.unit} of the file"
+            place = ", ".join(f"{each:.4g}" for each in mesh.vertices[wrong[0]].mean(axis=0))
+            where = f"{shape.file}: {said}: {len(wrong)}, the first at ({place}) {shape.unit} of the file"
             raise UserError(where, legal="a closed surface", fix=f"{fix} in a mesh editor, such as MeshLab")
 
     edges, counts = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
-    refuse(edges[counts > 2], "edges of {} are shared by three faces or more", "split them")
-    refuse(edges[counts == 1], "edges of {} are open", "close them")
+    refuse(edges[counts > 2], "edges that three faces or more share", "split them")
+    refuse(edges[counts == 1], "open edges", "close them")
     if not len(mesh.faces):
         raise UserError(f"{shape.file}: is no mesh: it holds no triangles", legal="a closed surface")
     if not mesh.is_winding_consistent:
         said = f"{shape.file}: neighbouring triangles face in and out"
         raise UserError(said, fix="orient its faces in a mesh editor, such as MeshLab (Re-Orient All Faces Coherently)")
-    refuse(mesh.faces[crossing(mesh.triangles)], "triangles of {} cross others", "unite its overlapping shells")
+    refuse(mesh.faces[crossing(mesh.triangles)], "triangles that cross others", "unite its overlapping shells")
     if mesh.volume < 0:
         mesh.invert()
     points = front_first(mesh, shape.unit, shape.front)
