@@ -96,11 +96,11 @@ def main(options: argparse.Namespace, command: str) -> int:
         surveys = survey(experiment, [*given, *further], cache, folder, engine)
     one, goals = surveys[0], []
     if options.goal:
-        ways = (way for one in surveys for way in _ways(one, one.found.wanted_mm(size_mm), options.share))
+        ways = (way for one in surveys for way in _ways(one, size_mm or one.found.sizes_mm[1], options.share))
         order = {True: "capture_s", False: "missing_share"}
         goals = sorted(ways, key=lambda way: (not way["reached"], way[order[way["reached"]]]))
         one = goals[0]["survey"]
-    wanted = one.found.wanted_mm(size_mm)
+    wanted = size_mm or one.found.sizes_mm[1]
     poses = goals[0]["rows"] if goals else _rows(one, list(one.seen), wanted, len(given), options.suggest)
     if not poses:
         raise UserError(f"{name}: damage of {wanted:.3g} mm is found nowhere, in no pose", fix="ask for a larger size")

@@ -93,15 +93,6 @@ class Findable:
             "as much). Limits are rough and may be far too large: run a study in these poses before you rely on them"
         )
 
-    def wanted_mm(self, size_mm: float | None) -> float:
-        """Return a size, without one the largest inspected. Raises UserError for one that was not inspected."""
-        low, high = self.sizes_mm
-        if size_mm is not None and not low <= size_mm <= high:
-            fix = "change the damage's range in the experiment: nothing is said of sizes that were not inspected"
-            legal = f"{low:.3g} to {high:.3g} mm ({self.size_of})"
-            raise UserError(f"{size_mm:.3g} mm: no damage of that size was inspected", legal=legal, fix=fix)
-        return size_mm or high
-
     def limits_mm(self, seen: Seen) -> np.ndarray:
         """Return a90 (n,) of places: the size from which on all up to the largest inspected are found, infinite where
         there is none; NaN where nothing is judged, and where the angle is steeper than all inspected."""

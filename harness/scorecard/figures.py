@@ -292,12 +292,6 @@ SCORES = Table(
         ),
         Column("use", "use", "figure.use", "blind, calibration (the camera's file may be fitted to it) or code"),
         Column("tag", "", "figure.tag", "R read, D derived, S secondary, W measured on captures, M a guess"),
-        Column(
-            "first_hand",
-            "",
-            lambda score: "yes" if score.figure.tag in "RW" else "no",
-            "whether the source itself was read, or the capture measured",
-        ),
         Column("source", "", "figure.source", "source of the published value"),
         Column("", "source", lambda score: f"[{score.figure.tag}] {score.figure.source}"),
         Column("note", "", "figure.note", "what was assumed"),
