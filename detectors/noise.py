@@ -101,7 +101,7 @@ def noise_reach_px(frames: Sequence[Frame], z_step_m: float) -> float:
         known = np.isfinite(difference)
         if lone:
             noise = _levelled(difference, known, LONE_LEVEL_PX)
-            if (sigma := sigma_of(noise[known])) < z_step_m:
+            if (sigma := sigma_of(noise[known])) < 0.5 * z_step_m:  # noise of .4 steps hides them, but for a hundredth
                 continue
             known &= np.abs(noise) < LONE_SIGMAS * sigma
             noise = _levelled(difference, known, LONE_LEVEL_PX)
