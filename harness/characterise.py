@@ -88,14 +88,15 @@ def main(options: argparse.Namespace, command: str) -> int:
     rows, label = beside(found, twin, sources.get(KNOWN)), load_camera(known).title if known else ""
     noise = ", ".join(f"{one.temporal.value:.3g} mm at {one.distance_m:.2f} m" for one in found.surfaces[:3])
     answer = f"Temporal noise of single pixels: {noise}." if noise else "No flat surface was found."
-    off = [abs(row.ratio - 1) for row in rows if row.figure == "temporal noise"]
-    worst = max(np.nan_to_num(off, nan=1.0), default=0.0)
     warnings = [*(warning for recording in recordings for warning in recording.warnings), *found.doubts]
-    if worst > REPEATED:
-        wrong = f"{CAMERA_FILE} has the captures' noise wrong by up to {100 * worst:.0f} %"
-        warnings.insert(0, f"{wrong}: limits that are simulated with it are wrong, too")
-    elif noise:
-        answer += f" {CAMERA_FILE} repeats it within {100 * worst:.0f} %."
+    for figure in ("fill rate", "temporal noise"):
+        off = [abs(row.ratio - 1) for row in rows if row.figure == figure]
+        worst = max(np.nan_to_num(off, nan=1.0), default=0.0)
+        if worst > REPEATED:
+            wrong = f"{CAMERA_FILE} has the captures' {figure} wrong by up to {100 * worst:.0f} %"
+            warnings.insert(0, f"{wrong}: limits that are simulated with it are wrong, too")
+        elif noise:
+            answer += f" {CAMERA_FILE} repeats the {figure} within {100 * worst:.0f} %."
     print_warnings(warnings)
     for recording, capture in zip(recordings, captures, strict=True):
         print(f"{recording.name}: {len(capture.z_m)} frames, {recording.unit_text}")

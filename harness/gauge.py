@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 DICTIONARY, CODES = "DICT_6X6_50", 50
 MARK_MM, DRILLS_MM, SEED = 32.0, 0.5, 1  # Side of a mark, step of the drills, seed of which size goes where
 CLEAR_MM, EDGE_MM = 6.0, 18.0  # White around a mark, for its code; from a hole's rim to the board's edge at least
+LARGEST_MM = 5e3  # as the truth file takes it
 HIT_SHARE = 0.4  # Hit radius as a share of the distance between holes, so that no finding can count for two
 
 
@@ -56,8 +57,10 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.vocabulary.files import write_bytes, write_text
 
     low, high = options.diameters
-    if not DRILLS_MM <= low < high:
+    if not DRILLS_MM <= low < high < LARGEST_MM:
         raise UserError(f"--diameters {low:g}:{high:g}", legal=f"FROM < TO, and FROM at least {DRILLS_MM:g}")
+    if options.depths and not 0 < options.depths[0] <= options.depths[1] < LARGEST_MM:
+        raise UserError("--depths {:g}:{:g}".format(*options.depths), legal="FROM <= TO, both above 0, in mm")
     if not 10 <= options.targets <= 600:
         raise UserError(f"--targets {options.targets}", legal="10 to 600 holes")
     curve = _curve(options)
@@ -106,6 +109,8 @@ def _laid_out(options: argparse.Namespace, sizes: np.ndarray) -> Gauge:
 
     try:
         width, height = map(float, options.board.lower().split("x"))
+        if not all(0 < each < LARGEST_MM for each in (width, height)):
+            raise ValueError("no size of a board")
     except ValueError as error:
         raise UserError(f"--board {options.board}: is no size", legal="WIDTHxHEIGHT in mm: 270x175") from error
     side, apart = MARK_MM, options.apart

@@ -81,6 +81,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.evaluation.study.record import StudyRecord, record_text
     from harness.evaluation.study.result import evaluate_study
     from harness.inspection.run import analysed, refuse_thresholds, threshold_of
+    from harness.own_camera.camera_file import opened_as
     from harness.report.study_page import study_html, study_parts
     from harness.tables.outputs import PROVENANCE, REPORT, STUDY
     from harness.tables.study import study_tables
@@ -94,6 +95,10 @@ def main(options: argparse.Namespace, command: str) -> int:
     load_mitsuba()  # before anything loads Open3D, with which LLVM cannot be
     options.quiet_capture = options.target = None  # what harness.detect has, and this program has not
     refuse_thresholds(options)
+    numbers = [("targets", options.targets), ("hit-radius", options.hit_radius)]
+    for name, number in [*numbers, *(("frames", each) for each in options.frames or ())]:
+        if not 0 < number < math.inf:
+            raise UserError(f"--{name} {number:g}", legal="above 0")
     detector, settings = asked.detector_of(options, options.crop, options.set)
 
     def own_threshold(cloud: Any) -> tuple[float, tuple[str, ...]]:
@@ -103,7 +108,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     how = (options.hit_radius * MM, options.threshold, own_threshold)
     judging = Judging(options.detector, canonical_json(settings), *how)
     asked.refuse_repeats(options.paths)
-    scans = [Scan(asked.opened([path], options.intrinsics, unit=options.unit), judging) for path in options.paths]
+    opened = [opened_as(options.camera, [path], options.intrinsics, unit=options.unit) for path in options.paths]
+    scans = [Scan(recording, judging) for recording in opened]
     family = _family(options, scans)
     cache = options.out / ".cache" / "renders"
     made = []
@@ -118,7 +124,10 @@ def main(options: argparse.Namespace, command: str) -> int:
     area_m2 = sum(scan.area_m2 for scan in scans)
     said = f"{len(scans)} recording{'s' * (len(scans) > 1)} of {longest} frames, {area_m2:.3g} m² judged"
     facts = {
-        "implanted": _shares(options, said, [one.depth_mm for each in made for one in each.implants]),
+        "implanted": [
+            *_shares(options, said, [one.depth_mm for each in made for one in each.implants]),
+            *(f"Note: {note}." for note in dict.fromkeys(note for one in opened for note in one.notes)),
+        ],
         "recordings": [str(path) for path in options.paths],
         "camera": options.camera,
         "targets": options.targets,
@@ -128,8 +137,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     }
     origin = record(command) | {"warnings": [COMPARED, *warnings], "seed": options.seed, "failures": []}
     title = f"Virtual damage in {said}"
-    number = options.false_calls or asked.DEFAULT_FALSE_CALLS
-    calls = f"{number:g} false calls a capture: the median over groups of frames."
+    expected = options.false_calls or asked.DEFAULT_FALSE_CALLS
+    calls = f"{expected:g} false calls a capture: the median over groups of frames."
     own = f"Set by the undamaged frames as harness.detect sets it, by noise towards the camera, for {calls}"
     thresholds = f"Given as {options.threshold:g}." if options.threshold else own
     known = {key: origin[key] for key in ("commit", "dirty", "versions", "seed", "command")}
@@ -183,7 +192,7 @@ def _family(options: argparse.Namespace, scans: list[Scan]) -> DrawnTargetConfig
         "room": None,
         "other_wavelengths": [albedos],
     }
-    return settings_of(DrawnTargetConfig, data, "the virtual damage")
+    return settings_of(DrawnTargetConfig, data, "the virtual damage (--damage, --diameters, --depths, --lengths)")
 
 
 def _shares(options: argparse.Namespace, said: str, peaks_mm: list[float]) -> list[str]:

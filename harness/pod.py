@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,12 +12,12 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
+    from harness.evaluation.pod.inspections import Inspections
     from harness.evaluation.pod.statement import PodStatement
     from harness.evaluation.pod.transfer import Mapod
+    from harness.evaluation.study.record import SetUpRecord
 
 LINKS = ("logit", "probit", "cloglog", "loglog")
-FILES = ("pod.json", "pod.png", "pod.html")
-MAPOD_FILES = ("mapod.json", "mapod.png", "mapod.html")
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -66,7 +67,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     alone, combined = (pod_parts, save_pod_png, pod_html), (mapod_parts, save_mapod_png, mapod_html)
     parts, save_png, html = alone if options.prior is None else combined
     show(parts(found))
-    data, picture, page = (options.out / name for name in (FILES if options.prior is None else MAPOD_FILES))
+    stem = "pod" if options.prior is None else "mapod"
+    data, picture, page = (options.out / f"{stem}.{ending}" for ending in ("json", "png", "html"))
     told = {"results_version": RESULTS_VERSION, **found.to_data(), "command": command}
     write_text(data, json.dumps(told, indent=2, allow_nan=False) + "\n")
     save_png(picture, found)
@@ -89,13 +91,28 @@ def _corrected(options: argparse.Namespace) -> Mapod:
     if not options.hit or len(options.hit) != 1 or options.unit not in ("", "mm"):
         legal = "--hit COL once, with sizes in mm, as a study's are"
         raise UserError("--prior corrects a curve by hits and misses", legal=legal)
-    limit = limit_of(set_up_named(read_record(options.prior), options.set_up))
+    study = read_record(options.prior)
+    limit = limit_of(set_up_named(study, options.set_up))
     read = table.read_inspections(options.file, options.size, options.hit, options.target)
     table.require_positive(read, response=False, why="--prior")
     if read.targets < len(read.size):
         raise UserError(f"{options.file}: targets stand in it more than once", fix="keep one inspection of each target")
     boards = table.texts_of(read, options.board) if options.board else None
-    return Mapod.of(limit.record.label, limit.statement, limit.why, read, boards)
+    doubt = _unlike(read, limit.record, study.hit_radius_mm)
+    return Mapod.of(limit.record.label, limit.statement, limit.why, read, boards, doubt)
+
+
+def _unlike(read: Inspections, study: SetUpRecord, radius_mm: float) -> str:
+    """Say that the real hits were not counted as the study's were, or that the table does not tell; "" otherwise."""
+    from harness.evaluation.pod.inspections import texts_of
+
+    counted = "by {} at a threshold of {:.3g}, within {:.3g} mm"
+    own = counted.format(f"{study.detector} {study.detector_version}", study.threshold, radius_mm)
+    real = {f"in a way that {read.path.name} does not tell"}
+    with suppress(UserError, ValueError):
+        columns = [texts_of(read, name) for name in ("detector", "threshold", "hit_radius_mm")]
+        real = {counted.format(by, float(k), float(mm)) for by, k, mm in zip(*columns, strict=True)}
+    return "" if real == {own} else f"real hits were counted {'; '.join(sorted(real))}; those of the study {own}"
 
 
 def _stated(options: argparse.Namespace) -> PodStatement:

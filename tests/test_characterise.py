@@ -145,6 +145,7 @@ def test_an_empirical_camera_s_truth_is_found_again(truth, tmp_path, capsys):
     for words in ("firmware: 1.6", "warm-up: not stated", "LoD95", "ISO 10360-13", "No accreditation"):
         assert words in certificate
     told = json.loads((out / "certificate.json").read_text())
+    assert "the mean of 25 recorded frames" in told["answer"] and told["answer"] in certificate.replace("&#39;", "'")
     assert told["surfaces"][0]["temporal_mm"] == pytest.approx(table["measured"].iloc[0], rel=1e-5)
     assert [row["surface"].split(",")[0] for row in told["surfaces"]] == [path.name for path in paths]
     assert "Measured and simulated" in page and "/tmp" not in re.sub(r"<pre>.*?</pre>", "", page, flags=re.DOTALL)
@@ -156,7 +157,9 @@ def test_edges_and_a_single_distance_without_amplitude(truth, tmp_path, capsys):
     z_m = np.where(slopes @ [1.0, 0.35] < 0.05, 1.0, 1.25)
     path = recorded(tmp_path / "step.npz", truth, z_m, 0.6 / z_m**2, 12, keep=False, frame_jumps=False)
     given = [str(path), "--intrinsics", str(tmp_path / "lens.json"), "--out", str(tmp_path / "out"), "--rate", "15"]
+    given.append("--certificate")
     assert characterise.main(given) == 0
+    assert "the mean of 12 recorded frames tells" in (tmp_path / "out" / "certificate.html").read_text()
     printed = capsys.readouterr().out
     assert printed.index("no amplitude is recorded") < printed.index("temporal noise")
     own = read_camera(tmp_path / "out" / "my_camera.yaml")

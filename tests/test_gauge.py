@@ -150,6 +150,7 @@ def test_a_capture_of_the_board_gives_hits_and_misses(made: Path, tmp_path: Path
         assert row["found"] == ("hit" if hole.diameter_mm > NEVER_FOUND_MM else "miss"), row
         if row["found"] == "hit":
             assert float(row["offset_mm"]) < 1.0
+        assert row["detector"].startswith("matched ") and float(row["threshold"]) > 3 and row["hit_radius_mm"] == "12"
     table = str(tmp_path / "found" / "gauge.csv")
     asked = ["--size", "diameter_mm", "--hit", "found", "--target", "target", "--unit", "mm"]
     assert pod.main([table, *asked, "--out", str(tmp_path / "pod")]) == 0
@@ -232,6 +233,7 @@ def test_the_combined_limit_covers_the_truth_of_a_camera_that_the_study_has_wron
         said = json.loads((out / "pod" / "mapod.json").read_text())
         last = said["after_each_board"][-1]
         print(f"simulated {simulated.statement.a90:.2f}, truth {truth_mm:.2f}, {last}, quoted {said['a90_95']}")
+        assert said["counted_otherwise"] == ""
         assert truth_mm <= last["a90_95"] < 2 * truth_mm
         assert truth_mm <= said["a90_95"] < 2 * truth_mm
         assert simulated.statement.a90 < last["a90"] and simulated.statement.bound.value < said["a90_95"]
@@ -245,6 +247,8 @@ def test_the_combined_limit_covers_the_truth_of_a_camera_that_the_study_has_wron
         (["--a50", "5", "--a90", "7", "--board", "60x60"], "a larger --board"),
         (["--a50", "5", "--a90", "7", "--board", "big"], "280x190|270x175"),
         (["--a50", "5", "--a90", "7", "--apart", "10"], "--apart"),
+        (["--a50", "5", "--a90", "7", "--board", "175xnan"], "280x190|270x175"),
+        (["--a50", "5", "--a90", "7", "--depths", "5:2"], "--depths 5:2"),
     ],
 )
 def test_mistakes_are_explained(wrong: list[str], word: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -161,6 +161,9 @@ def test_the_program_states_a_limit_of_a_recording(tmp_path: Path, capsys: pytes
 
     assert implant.main([*given, "--depths", "2:4", "--out", str(tmp_path / "no")]) == 2
     assert "depth_mm" in capsys.readouterr().err
+    for name in ("--targets", "--hit-radius", "--frames"):
+        assert implant.main([*given, name, "0", "--out", str(tmp_path / "no")]) == 2
+        assert f"{name} 0" in capsys.readouterr().err
     given[given.index("2:14")] = "60:80"
     assert implant.main([*given, "--out", str(tmp_path / "no")]) == 2
     assert not (tmp_path / "no").exists()

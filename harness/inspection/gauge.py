@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -83,10 +83,12 @@ def read_gauge(path: Path) -> Gauge:
 
 @dataclass(frozen=True)
 class GaugeRow:
-    """A hole in a capture. ``found`` "NA": not all around it was judged; ``offset_mm`` and ``score`` of the hit."""
+    """A hole in a capture. ``found`` "NA": not all around it was judged; ``offset_mm`` and ``score`` of the hit.
+    ``counted``: detector with its version, its threshold in units of score, and the hit radius, mm."""
 
     board: str
     hole: GaugeHole
+    counted: tuple[str, float, float]
     found: Literal["hit", "miss", "NA"]
     offset_mm: float | None
     score: float | None
@@ -107,6 +109,9 @@ HITS_AND_MISSES = Table(
         Column("found", "found", "found", "hit, miss, or NA where not all around it was judged", text=str),
         Column("offset_mm", "offset (mm)", "offset_mm", "of the finding's centre from the hole's", text=_number),
         Column("score", "score", "score", "of that finding", text=_number),
+        Column("detector", "", lambda row: row.counted[0], "that looked for it, with its version"),
+        Column("threshold", "", lambda row: row.counted[1], "beyond which it finds, units of score"),
+        Column("hit_radius_mm", "", lambda row: row.counted[2], "within which a finding is a hit"),
     ),
     formats=("csv",),
 )
@@ -129,8 +134,9 @@ class GaugeSeen:
         return f"gauge: {hits}, {self.false_calls} false calls"
 
 
-def seen_on(gauge: Gauge, judged: Judged) -> GaugeSeen:
+def seen_on(gauge: Gauge, judged: Judged, detector: str, threshold: float) -> GaugeSeen:
     """Find the boards in a judged capture by their marks, match findings to holes. Raises UserError without one."""
+    counted = (detector, threshold, gauge.hit_radius_mm)
     cloud = judged.cloud
     if cloud.rgb is None and cloud.amplitude is not None:  # an infrared picture shows printed codes too
         known = cloud.amplitude[np.isfinite(cloud.amplitude)]
@@ -153,7 +159,7 @@ def seen_on(gauge: Gauge, judged: Judged) -> GaugeSeen:
         if fit_mm > WORST_FIT_MM:
             doubt = f"its marks are {fit_mm:.1f} mm off: was it printed at 100 %, and is it flat?"
             warnings.append(f"{board.name}: {doubt}")
-        own, beside = _matched(board, gauge.hit_radius_mm * MM, judged, invert(T_camera_board))
+        own, beside = _matched(board, counted, judged, invert(T_camera_board))
         if unjudged := [str(row.hole.id) for row in own if row.found == "NA"]:
             told = "is not judged all around, as near the edge of what is judged: it counts neither as hit nor as miss"
             warnings.append(f"{board.name}: hole {', '.join(unjudged)} {told}")
@@ -167,9 +173,10 @@ def seen_on(gauge: Gauge, judged: Judged) -> GaugeSeen:
 
 
 def _matched(
-    board: GaugeBoard, radius_m: float, judged: Judged, T_board_camera: np.ndarray
+    board: GaugeBoard, counted: tuple[str, float, float], judged: Judged, T_board_camera: np.ndarray
 ) -> tuple[list[GaugeRow], int]:
     """Return the rows of a board's holes, and how many findings on the board are false calls."""
+    radius_m = counted[2] * MM
 
     def on_face(points_m: np.ndarray) -> np.ndarray:
         """Return (n, 2): the board's face where lines of sight through points (n, 3) in the camera's frame meet it."""
@@ -186,14 +193,13 @@ def _matched(
         away = seen - centre
         away = away[np.linalg.norm(away, axis=-1) < radius_m + hole.diameter_mm / 2 * MM]
         sides = np.floor(np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi / SIDES)).astype(int) % SIDES
+        told: tuple[Any, ...] = ("miss", None, None)
         if len(np.unique(sides)) < SIDES:
-            rows.append(GaugeRow(board.name, hole, "NA", None, None))
+            told = ("NA", None, None)
         elif number in pairs:
-            finding = judged.detections[pairs[number]]
             offset_mm = float(np.linalg.norm(places[pairs[number]] - centre)) / MM
-            rows.append(GaugeRow(board.name, hole, "hit", offset_mm, finding.score))
-        else:
-            rows.append(GaugeRow(board.name, hole, "miss", None, None))
+            told = ("hit", offset_mm, judged.detections[pairs[number]].score)
+        rows.append(GaugeRow(board.name, hole, counted, *told))
     inside = (np.abs(places) < np.array([board.width_mm, board.height_mm]) / 2 * MM).all(axis=-1)
     for mark in board.marks:
         inside &= (np.abs(places - np.array([mark.x_mm, mark.y_mm]) * MM) > mark.side_mm * MM).any(axis=-1)

@@ -228,7 +228,7 @@ def inspect(arguments: argparse.Namespace) -> int:
     threshold, origin, evidence = threshold_of(arguments, detector, cloud, evidence, silent_threshold)
     result = judged(detector, cloud, evidence, threshold)
     result = with_cut_told(result if mapped else with_faint_told(result, threshold))
-    seen = seen_on(gauge, result) if gauge else None
+    seen = seen_on(gauge, result, f"{detector.name} {detector.version}", threshold) if gauge else None
     found = (mapped, registrations, detector, settings, result, threshold, origin, seen)
     run = Inspection(arguments, recordings, choices, config, *found)
     _print(run)

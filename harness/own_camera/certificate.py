@@ -39,7 +39,8 @@ OF_SURFACES = (
     "Temporal noise: deviation of single pixels over frames, of z. Plane-fit rms: distance of points from their own "
     "plane. Dispersion: width that 95 % of a frame's points need, in the manner of ISO 10360-13; flatness: 99.7 %, in "
     "the manner of VDI/VDE 2634-2; all three include the surface's own shape and the lens' error. Fill rate: share of "
-    "pixels and frames with a return. LoD95: 1.96 deviations of a pixel's z, fixed pattern and rounding included."
+    "pixels and frames with a return. LoD95: 1.96 deviations of a pixel's z, fixed pattern and rounding included; for "
+    "more frames than were recorded it is extrapolated, noise falling with the square root of their number."
 )
 POD = (
     "a50, a90, a90/95 in the manner of MIL-HDBK-1823A, ASTM E2862 (hits and misses) and E3023 (signals); false calls"
@@ -115,9 +116,11 @@ def write_certificate(
         share += f" {implanted if study.name == 'implant' else 'The detection limits are simulated.'}"
     answer = f"{many(found.frames, 'frame')} in {many(len(found.captures), 'capture')}, {len(found.jumps_m)} displaced."
     for one in found.surfaces[:1]:
-        lod_mm = level_of_detection_mm(found, (one.temporal.value * MM) ** 2, LOD_FRAMES[-1])
+        recorded = next(int(capture.kept.sum()) for capture in found.captures if capture.name == one.capture)
+        lod_mm = level_of_detection_mm(found, (one.temporal.value * MM) ** 2, frames := min(recorded, LOD_FRAMES[-1]))
         noise = f"A pixel's noise is {one.temporal.value:.3g} mm at {one.distance_m:.2f} m"
-        answer = f"{noise}; {LOD_FRAMES[-1]} frames detect a change of {lod_mm:.3g} mm (LoD95). {answer}"
+        lod = f"the mean of {many(frames, 'recorded frame')} tells a change of {lod_mm:.3g} mm (LoD95)"
+        answer = f"{noise}; {lod}. {answer}"
     body = [PRINTED, heading("Unit"), bullets(f"{key}: {value}" for key, value in about.items())]
     body += [heading("Measured"), FLAT_SURFACES.grid(surfaces).html(), note(OF_SURFACES), CERTIFIED.grid(rows).html()]
     if study is not None:
@@ -125,7 +128,7 @@ def write_certificate(
         body += [note(POD.format(study.hit_radius_mm))]
     body += [heading("Validity"), bullets((share, *CONDITIONS)), note(f"{date.today().isoformat()}: {command}")]
     text = page(f"Certificate of measurement: {about['unit']}", answer, body, warnings=found.doubts)
-    told = {"results_version": RESULTS_VERSION, "about": about, "figures": rows}
+    told = {"results_version": RESULTS_VERSION, "about": about, "answer": answer, "figures": rows}
     told |= {"surfaces": FLAT_SURFACES.data(surfaces), "conditions": [share, *CONDITIONS]}
     told |= {"limits": LIMITS.data(limits), "doubts": found.doubts, "command": command}
     write_text(folder / "certificate.html", text)

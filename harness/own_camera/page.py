@@ -27,11 +27,12 @@ LOOKS = {MEASURED: (BLUE, "o"), SIMULATED: (ORANGE, "x"), KNOWN: (GREY, "+")}
 RANGE, ANGLE, AMPLITUDE = (f"noise, mm against {x}" for x in ("range, m", "angle, deg", "amplitude"))
 NEIGHBOURS, PATTERN = (f"correlation of {of} against pixels apart" for of in ("noise", "fixed pattern"))
 FRAMES, DROPPED = "displacement, mm against frame", "share without return against amplitude"
+SHOWN = (RANGE, ANGLE, AMPLITUDE, NEIGHBOURS, PATTERN, FRAMES, DROPPED)
 SHOWN_LAGS, SHOWN_PATTERN_LAGS = (1, 2, 3, 5), (1, 3, 5, 10)
 CAPTION = (
-    "Upper row: the surfaces that were found; temporal noise against range, the dots in cells of like angle and "
-    "brightness; its correlation between neighbours. Lower row: displacement of whole frames; dropouts against "
-    "amplitude; correlation of the fixed pattern. The simulation of the camera's file is orange."
+    "The surfaces that were found; temporal noise against range, angle and amplitude, each dot of pixels where all "
+    "three are alike; correlation of noise and of fixed pattern between neighbours, the Fourier transform of their "
+    "spectra; displacement of whole frames; dropouts. The simulation of the camera's file is orange."
 )
 Told = tuple[str, str, str, Reading, str]
 """Name, place, unit, value and meaning of a figure."""
@@ -42,17 +43,14 @@ def own_figures(found: Characteristics) -> Iterator[Told]:
     for one in found.surfaces:
         relief = "the surface's own shape and the lens' error included"
         yield "temporal noise", one.where, "mm", one.temporal, "deviation of single pixels over frames, of z"
-        for name, value, meaning in (
-            ("plane-fit rms, one frame", one.frame_rms_mm, f"spatial noise of points about their own plane; {relief}"),
-            ("plane-fit rms, average", one.average_rms_mm, f"the same of the average of all frames; {relief}"),
-            (
-                "flat-form dispersion, 95 %",
-                one.form95_mm,
-                f"width that 95 % of a frame's points need, in the manner of ISO 10360-13; {relief}",
-            ),
-            ("flatness, 99.7 %", one.form997_mm, f"in the manner of VDI/VDE 2634-2; {relief}"),
-        ):
-            yield name, one.where, "mm", Reading(value), meaning
+        forms = (
+            ("plane-fit rms, one frame", one.frame_rms_mm, "spatial noise of points about their own plane"),
+            ("plane-fit rms, average", one.average_rms_mm, "the same of the average of all frames"),
+            ("flat-form dispersion, 95 %", one.form95_mm, "width of 95 % of the points, in the manner of ISO 10360-13"),
+            ("flatness, 99.7 %", one.form997_mm, "width of 99.7 %, in the manner of VDI/VDE 2634-2"),
+        )
+        for name, value, meaning in forms:
+            yield name, one.where, "mm", Reading(value), f"{meaning}; {relief}"
         yield "fill rate", one.where, "1", Reading(one.fill_rate), "share of pixels and frames with a return"
     yield from shared_figures(found)
 
@@ -122,7 +120,7 @@ def write_page(
     write_table(folder, OWN_FIGURES, OWN_FIGURES.frame(rows))
     curves = [row for source, one in sources.items() for row in _curves(source, one)]
     write_table(folder, OWN_CURVES, OWN_CURVES.frame(curves))
-    drawn = svg("captures", (10.5, 6.4), title, lambda canvas: _draw(canvas, found, curves))
+    drawn = svg("captures", (8.6, 12.4), title, lambda canvas: _draw(canvas, found, curves))
     said = (
         "Simulated are frames of the camera's file before the same surfaces, taken as planes; they are analysed as the "
         "captures are. A ratio of 1 says that the file repeats the camera."
@@ -157,14 +155,14 @@ def _curves(source: str, found: Characteristics) -> Iterator[dict[str, Any]]:
 
 
 def _draw(canvas: Figure, found: Characteristics, curves: list[dict[str, Any]]) -> None:
-    axes, first = canvas.subplots(2, 3).ravel(), found.captures[0]
+    axes, first = canvas.subplots(4, 2).ravel(), found.captures[0]
     labels = np.full(first.stretch.shape, np.nan)
     for number, (_, mask) in enumerate(first.planes):
         labels[mask] = number
     axes[0].imshow(first.mean_m, cmap="gray_r")
     axes[0].imshow(labels, cmap="tab10", vmin=0, vmax=9, alpha=0.5, interpolation="nearest")
     axes[0].set(title=f"{len(first.planes)} flat surfaces, {first.name[:24]}", xticks=[], yticks=[])
-    for axis, diagram in zip(axes[1:], (RANGE, NEIGHBOURS, FRAMES, DROPPED, PATTERN), strict=True):
+    for axis, diagram in zip(axes[1:], SHOWN, strict=True):
         own = [row for row in curves if row["diagram"] == diagram]
         for source, (colour, marker) in LOOKS.items():
             points = [(row["x"], row["y"]) for row in own if row["source"] == source]

@@ -68,11 +68,9 @@ def notes(found: Mapod) -> list[str]:
         f"of the curve is w times as wide. Prior: ln k and ln w about 0 by Student's distribution with {FREEDOM:g} "
         f"degrees of freedom, with scales of a factor {PRIOR_SIZE:g} in k and {PRIOR_WIDTH:g} in w, and "
         "the simulated curve's own uncertainty; w below 1 within that uncertainty alone.",
-        "Combined: medians of the posterior, and for a90/95 its 95 % quantile, the largest over the models that fit "
-        "the simulated hits about equally well. Where the simulation is contradicted, the larger of the combined and "
-        "the measured limit counts.",
-        "Study and real inspection have to use the same detector, threshold and hit radius: a difference counts as an "
-        "error of the simulation.",
+        "Combined: medians of the posterior, and for a90/95 its 97.5 % quantile, where the likelihood ratio of the "
+        "handbook has the bound of simulated and of measured hits; the largest over the models that fit the simulated "
+        "hits about equally well. Where the simulation is contradicted, the larger of combined and measured counts.",
         "Were the simulated curve right, hits and misses as far from it as these would come with probability "
         f"{found.agrees:.2g}; below 0.05 that is a contradiction.",
         f"Stop rule: enough where a90/95 is at most {ENOUGH:g} times a90. It was fixed before any board.",
@@ -80,25 +78,32 @@ def notes(found: Mapod) -> list[str]:
     return [*said, *found.read.notes, VALIDITY]
 
 
+def doubts(found: Mapod) -> list[str]:
+    """Sentences on what makes the combined limit doubtful."""
+    said = [f"{found.unlike}: a difference counts as an error of the simulation"] if found.unlike else []
+    return said + ["the real hits and misses contradict the simulation"] * found.contradicted
+
+
 def mapod_parts(found: Mapod) -> list[str | Grid]:
     """Return what a terminal shows; what makes the limit doubtful comes first."""
-    warning = ["warning: the real hits and misses contradict the simulation"] if found.contradicted else []
-    told = [f"note: {one}" for one in notes(found)]
-    return [*warning, sizes_grid(found), "", BOARDS.grid(found.steps), "", *told, "", answer(found)]
+    shown: list[str | Grid] = [f"warning: {one}" for one in doubts(found)]
+    shown += [sizes_grid(found), "", BOARDS.grid(found.steps), "", *(f"note: {one}" for one in notes(found))]
+    return [*shown, "", answer(found)]
 
 
 def mapod_html(found: Mapod, command: str) -> str:
     """The page as text; it needs no network."""
     caption = (
         "The simulated curve, the one of the real hits (above) and misses (below) alone, and the combined one with its "
-        "90 % credible band, the widest over all simulated models."
+        "95 % credible band, the widest over all simulated models."
     )
     drawn = blocks.svg("mapod", SIZE_IN, answer(found), lambda figure: _draw(figure, found))
     body = [blocks.heading("Simulated, measured, combined"), sizes_grid(found).html()]
     body += [blocks.figure({"mapod": drawn}, "mapod", caption)]
     body += [blocks.heading("After each board"), BOARDS.grid(found.steps).html()]
     body += [blocks.heading("Notes"), blocks.bullets(notes(found)), *blocks.command_of(command)]
-    return blocks.page(f"Model-assisted probability of detection: {found.read.path.name}", answer(found), body)
+    title = f"Model-assisted probability of detection: {found.read.path.name}"
+    return blocks.page(title, answer(found), body, warnings=doubts(found))
 
 
 def save_mapod_png(path: Path, found: Mapod) -> None:

@@ -2,10 +2,11 @@
 
 Studies of a simulated camera are drawn from a curve with a50 = 4 and a90 = 5 mm, at places of their sizes that differ.
 The real curve is ``k`` times as far to the right and its rise ``w`` times as wide. Each campaign draws hits of real
-holes spread evenly over the drills from it, and corrects one of the studies, of which nothing but hits is known.
-``covered``: share of campaigns whose combined a90/95 is at or over the true a90; the quoted one, of a contradicted
-study the larger of combined and measured, is never smaller. Nominal: 95 %. Beside it stand the combined limit as a
-multiple of the true a90, and that of the real hits alone.
+holes spread evenly over the drills from it, and corrects a study of its own, of which nothing but hits is known:
+campaigns that share a study miss together, so that 100 of 10 studies would tell the share to 0.04, not to 0.02.
+``covered``: share of campaigns whose combined a90/95 is at or over the true a90, with its exact 95 % interval; the
+quoted one, of a contradicted study the larger of combined and measured, is never smaller. Nominal: 95 %. Beside it
+stand the combined limit as a multiple of the true a90, and that of the real hits alone.
 """
 
 from __future__ import annotations
@@ -22,15 +23,16 @@ import numpy as np
 if __name__ == "__main__":
     sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
 
+from harness.evaluation.intervals import clopper_pearson
 from harness.evaluation.pod.curve import PodCurve
 from harness.evaluation.pod.design import curve_through, even_sizes
 from harness.evaluation.pod.inspections import Inspections
 from harness.evaluation.pod.statement import PodStatement, state_hits
-from harness.evaluation.pod.transfer import Transfer
+from harness.evaluation.pod.transfer import LIMIT_AT, Transfer
 from harness.vocabulary.errors import UserError
 
 DRILLS_MM = 2.0, 12.0
-MEASURED = 30
+MEASURED = 40
 """Campaigns of a case, at most, of which the real hits alone are fitted."""
 
 
@@ -89,29 +91,27 @@ def combined_limits(study: PodStatement, size: np.ndarray, hits: np.ndarray) -> 
             weights = np.exp(value - value.max(axis=1, keepdims=True))[:, order]
             below = np.cumsum(weights, axis=1)
             shares = zip(below, weights, strict=True)
-            limits.append([np.interp(0.95 * sums[-1], sums - own / 2, sizes[order]) for sums, own in shares])
+            limits.append([np.interp(LIMIT_AT * sums[-1], sums - own / 2, sizes[order]) for sums, own in shares])
     return np.max(limits, axis=0)
 
 
 def coverage(
-    curve: PodCurve, cases: Sequence[tuple[float, float]], holes: int, *, studies: int, each: int, targets: int = 64
+    curve: PodCurve, cases: Sequence[tuple[float, float]], holes: int, *, campaigns: int, targets: int = 64
 ) -> list[Coverage]:
-    """Coverage of each case (k, w) with so many real ``holes``: ``each`` campaigns on each of ``studies`` studies."""
+    """Coverage of each case (k, w) with so many real ``holes``; each campaign corrects another study of ``targets``."""
     random = np.random.default_rng(1823)
-    size, drawn = even_sizes(holes, DRILLS_MM), drawn_studies(curve, studies, targets, random)
-    truths = [wrong_by(curve, *case) for case in cases]
+    size, truths = even_sizes(holes, DRILLS_MM), [wrong_by(curve, *case) for case in cases]
     chances = np.array([truth.pod(size) for truth in truths])
-    hits = random.random((studies, len(cases), each, holes)) < chances[:, None]
-    limits = np.stack(
-        [combined_limits(study, size, some.reshape(-1, holes)) for study, some in zip(drawn, hits, strict=True)]
-    ).reshape(studies, len(cases), each)
+    hits = random.random((campaigns, len(cases), holes)) < chances
+    studies = drawn_studies(curve, campaigns, targets, random)
+    limits = np.stack([combined_limits(study, size, some) for study, some in zip(studies, hits, strict=True)])
     rows = []
     for number, (case, truth) in enumerate(zip(cases, truths, strict=True)):
-        true_mm, own, some = truth.size_at(0.9), limits[:, number], hits[:, number]
-        alone = [measured_limit(size, hit) for hit in some.reshape(-1, holes)[:: -(-own.size // MEASURED)]]
-        scaled = own / true_mm
+        true_mm = truth.size_at(0.9)
+        alone = [measured_limit(size, hit) for hit in hits[:MEASURED, number]]
+        scaled = limits[:, number] / true_mm
         sizes = float(np.median(scaled)), float(np.quantile(scaled, 0.9)), float(np.median(alone)) / true_mm
-        rows.append(Coverage(*case, holes, own.size, float((scaled >= 1).mean()), *sizes))
+        rows.append(Coverage(*case, holes, campaigns, float((scaled >= 1).mean()), *sizes))
     return rows
 
 
@@ -126,20 +126,21 @@ def measured_limit(size: np.ndarray, hit: np.ndarray) -> float:
 def main() -> int:
     """Print a table for each number of holes."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--holes", type=int, nargs="+", default=[24, 36, 60])
+    parser.add_argument("--holes", type=int, nargs="+", default=[24, 60])
     parser.add_argument("--targets", type=int, default=64, help="simulated holes of each study")
-    parser.add_argument("--studies", type=int, default=30)
-    parser.add_argument("--each", type=int, default=10, help="campaigns of each study and case")
+    parser.add_argument("--campaigns", type=int, default=300, help="of each case, each with a study of its own")
     parser.add_argument("--link", default="logit")
     parser.add_argument("--log", action=argparse.BooleanOptionalAction, default=True)
     given = parser.parse_args()
     curve = curve_through(4.0, 5.0, given.link, log_size=given.log)
-    print("   k    w  holes  covered  median  90 %  measured", flush=True)
+    print("   k    w  holes  covered (95 % interval)  median  90 %  measured", flush=True)
     for holes in given.holes:
         cases = list(product((1.0, 1.25, 1.5, 2.0), (0.6, 1.0, 1.6)))
-        for row in coverage(curve, cases, holes, studies=given.studies, each=given.each, targets=given.targets):
+        for row in coverage(curve, cases, holes, campaigns=given.campaigns, targets=given.targets):
+            low, high = clopper_pearson(round(row.covered * row.campaigns), row.campaigns)
+            share = f"{row.covered:8.3f} ({low:.3f} to {high:.3f})"
             sizes = f"{row.median:7.2f} {row.high:5.2f} {row.measured:9.2f}"
-            print(f"{row.k:4g} {row.w:4g} {row.holes:6d} {row.covered:8.3f} {sizes}", flush=True)
+            print(f"{row.k:4g} {row.w:4g} {row.holes:6d} {share} {sizes}", flush=True)
     return 0
 
 
