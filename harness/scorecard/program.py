@@ -94,8 +94,10 @@ def _page(
         size, name = (9.5, 1.2 + 0.17 * len(ratios)), "ratios"
         drawn = {name: svg(name, size, "Simulated by published value", lambda canvas: _draw(canvas, ratios))}
         body.append(figure(drawn, name, CAPTION))
+    if failing := [score for score in real if not score.passes]:
+        body += [heading("What fails, and why"), scoring.SCORES.grid(failing).html()]
     without = [title for camera, title in titles.items() if all(score.figure.camera != camera for score in real)]
-    body += [scoring.SCORES.grid(real).html()] if real else []
+    body += [heading("Figures of real cameras"), scoring.SCORES.grid(real).html()] if real else []
     body += [note(f"No published figure is on file for {'; '.join(without)}.")] if without else []
     code = [score for score in scores if score.figure.kind == "code"]
     if code:

@@ -115,9 +115,7 @@ def _c2(case: Case) -> tuple[Answer, str]:
 def _c3(case: Case) -> tuple[Answer, str]:
     rows = case.found_with_many()
     if rows.empty:
-        none = "No hole is found with 50 frames." if (case.summary["frames"] == MANY).any() else ""
-        return "undecided", none or "No trial has 50 frames."
-
+        return "undecided", "No hole is found with 50 frames."
     parts: list[bool | None] = []
     said = []
     for _, row in rows.iterrows():
