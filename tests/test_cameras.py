@@ -109,6 +109,10 @@ def test_a_camera_like_another_states_only_what_differs(tmp_path):
         ("name: own\ntitle: t\nlike: [a]\n", "own.yaml:3:7: `like` is not the name of a camera"),
         (OWN + "photons: {signal_electrons: {value: -1.0, tag: M, source: guess}}\n", "own.yaml:4:"),
         (OWN + "lens: {fx: {value: 1.0, tag: M, source: guess}}\n", "unknown key `fx` in `lens`"),
+        (
+            OWN + "modulation: {frequencies_hz: {value: [2.0e+7], tag: M, source: guess}}\n",
+            "own.yaml:4:13: `modulation`: contrast needs one value for each",
+        ),
     ],
 )
 def test_mistakes_in_a_camera_like_another_are_told_where_they_stand(tmp_path, text, wanted):

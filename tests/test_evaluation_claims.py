@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from itertools import permutations
 
 import numpy as np
 import pandas as pd
 import pytest
 from scipy.stats import spearmanr
-from synthetic_tables import World, example, tables
+from synthetic_tables import World, example, joined, tables
 
 from harness.evaluation.profile import HoleInView, hole_shape, hole_shapes
 from harness.evaluation.summary import hole_list
@@ -127,6 +128,20 @@ def test_evidence_carries_the_numbers() -> None:
     assert "hole 4 +2.0 (1.5 to 2.5)" in verdict("C3", World(size_bias_mm=lambda diameter: 2.4)).evidence
     assert "that it falls with the diameter" in verdict("C4").evidence
     assert "ratio position to size 4.00" in verdict("C5").evidence
+
+
+def test_sizes_are_held_against_the_scatter_between_units_too() -> None:
+    biases = {"main": 0.4, "unit 2": 1.4, "unit 3": 1.2}
+    parts = [
+        tables(World(size_bias_mm=lambda _, bias=bias: bias), frames=(50,), variant=variant)
+        for variant, bias in biases.items()
+    ]
+    for number, part in enumerate(parts[1:], 2):
+        part.variants["settings"] = json.dumps({"source.camera.unit_seed": number})
+    other = tables(World(size_bias_mm=lambda _: 30.0), frames=(50,), variant="nearer")  # no unit: left out
+    evidence = next(v.evidence for v in score_claims(joined(*parts, other)) if v.claim == "C3")
+    assert "Between 3 units: hole 4 +1.9," in evidence  # 1.0 mm in the mean, by 0.53 mm
+    assert "Between units: not judged" in verdict("C3").evidence
 
 
 def test_the_table_of_claims_has_a_row_for_each_verdict() -> None:

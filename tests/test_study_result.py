@@ -155,6 +155,7 @@ class TestValidity:
             "mm long"
         )
         assert conditions_of({**facts, "sweep": {"source.target.damage.kind": ["gouge", "slot"]}}) == ""
+        assert conditions_of({"source": {"target": {"holes": [{}, {}, {}]}}}, 2).startswith("only 2 of 3 damages")
 
 
 def test_set_ups_that_lack_a_board_are_not_paired(study):

@@ -181,9 +181,9 @@ def test_a_check_of_the_code_passes_within_its_tolerance_only_and_is_counted_apa
     assert reality.limits == (0.5, float("inf")) and Score(reality, Reading(0.4)).ratio == pytest.approx(0.8)
     score = Score(wide, Reading(0.35))
     assert score.verdict == "pass (tolerance)"
-    assert "1 of 1 blind figures are within 25 %, 1 of them by a wider tolerance" in program._answer([score])
+    assert "1 of 1 values within 25 % (1 by a wider tolerance" in program._answer([score])
     answer = program._answer([Score(check, Reading(0.9)), Score(reality, Reading(0.4))])
-    assert answer.startswith("0 of 1 blind figures are within 25 %;")
+    assert answer.startswith("0 of 1 blind figures hold: ")
     assert "checks of the code 1 of 1. Fail without a stated reason: neighbours." in answer
 
 

@@ -44,7 +44,8 @@ def sweep_page(
     """Return the page of a sweep by the template ``name``: what all have in common, and its own ``parts``."""
     warnings = about.provenance.get("warnings", ())
     told = {"title": about.title, "answer": answer, "warnings": warnings, "figures": figures}
-    told |= {"scene": scene_svg(about.facts), "conditions": conditions_of(about.facts), "calls_note": CALLS_NOTE}
+    seen = int(tables.holes.groupby("variant")["hole"].nunique().min()) if len(tables.holes) else None
+    told |= {"scene": scene_svg(about.facts), "conditions": conditions_of(about.facts, seen), "calls_note": CALLS_NOTE}
     end = closing(about.provenance, about.experiment_yaml_text, left_out(tables.runs))
     return template(name).render(**told, closing=joined(end), **parts)
 

@@ -26,7 +26,6 @@ SEED = 1
 NOISE = NO_EFFECTS.model_copy(update={"noise": True, "ambient": True, "saturation": True})
 """The noise of each pixel, which the calibration point speaks of, without traits of a unit or of a frame."""
 STEADY = EffectsConfig().model_copy(update={"frame_jumps": False})
-JITTER = NOISE.model_copy(update={"frame_jumps": True})
 PATTERNED = NOISE.model_copy(update={"fixed_pattern": True})
 GROUPS = 10
 

@@ -266,7 +266,7 @@ def _named(score: Score) -> str:
 
 def _remarks(score: Score) -> str:
     why = f"Why it fails: {score.figure.fails}. " if score.figure.fails else ""
-    return why + score.figure.note
+    return why + score.figure.note[:1].upper() + score.figure.note[1:]
 
 
 VERSION = Column("results_version", "", lambda row: RESULTS_VERSION, "version of the tables' meaning")

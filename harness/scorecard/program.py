@@ -73,8 +73,7 @@ def run_scorecard(options: argparse.Namespace, command: str) -> int:
         if score.passes and score.figure.fails:
             print(f"{score.figure.name} passes: take `fails` off its entry", file=sys.stderr)
         if score.fell_behind:
-            low, high = score.figure.limits
-            told = f"simulated {score.simulated.value:.4g}, passes from {low:g} to {high:g}"
+            told = "simulated {:.4g}, passes from {:g} to {:g}".format(score.simulated.value, *score.figure.limits)
             print(f"{score.figure.name} ({score.figure.what()}) fails: {told}", file=sys.stderr)
     return int(any(score.fell_behind for score in scores))
 
@@ -94,8 +93,10 @@ def _page(
         size, name = (9.5, 1.2 + 0.17 * len(ratios)), "ratios"
         drawn = {name: svg(name, size, "Simulated by published value", lambda canvas: _draw(canvas, ratios))}
         body.append(figure(drawn, name, CAPTION))
+    if failing := [score for score in real if not score.passes]:
+        body += [heading("What fails, and why"), scoring.SCORES.grid(failing).html()]
     without = [title for camera, title in titles.items() if all(score.figure.camera != camera for score in real)]
-    body += [scoring.SCORES.grid(real).html()] if real else []
+    body += [heading("Figures of real cameras"), scoring.SCORES.grid(real).html()] if real else []
     body += [note(f"No published figure is on file for {'; '.join(without)}.")] if without else []
     code = [score for score in scores if score.figure.kind == "code"]
     if code:
@@ -118,11 +119,10 @@ def _draw(canvas: Canvas, scores: Sequence[scoring.Score]) -> None:
             axis.plot(np.maximum([known.low / value, known.high / value], 1e-3), [row, row], color=colour, linewidth=1)
         face = colour if score.figure.use == "blind" else "none"
         axis.plot(score.ratio, row, "o", color=colour, markerfacecolor=face, markersize=4)
-    names = [score.figure.name for score in scores]
     axis.set(xscale="log", xlim=(0.05, 5), ylim=(len(scores) - 0.5, -0.5), xlabel="simulated by published")
     axis.set_xticks([0.1, 0.25, 0.5, 1, 2, 4], ["0.1", "0.25", "0.5", "1", "2", "4"])
     axis.minorticks_off()
-    axis.set_yticks(range(len(names)), names, fontsize=7)
+    axis.set_yticks(range(len(scores)), [score.figure.name for score in scores], fontsize=7)
 
 
 def _answer(scores: Sequence[scoring.Score]) -> str:
@@ -138,9 +138,11 @@ def _answer(scores: Sequence[scoring.Score]) -> str:
         first = score.figure.camera.partition("_")[0]
         families.setdefault(FAMILIES.get(first, "other cameras"), []).append(score)
     each = ", ".join(f"{name} {share(own)}" for name, own in families.items())
-    text = f"{share(blind)} blind figures are within 25 %{f' ({each})' if len(families) > 1 else ''}"
+    values = [score for score in blind if score.figure.published.value is not None]
+    bounds = [score for score in blind if score.figure.published.value is None]
     wide = sum(score.passes_by_tolerance for score in blind)
-    text += f", {wide} of them by a wider tolerance of their source; " if wide else "; "
+    text = f"{share(blind)} blind figures hold{f' ({each})' if len(families) > 1 else ''}: {share(values)} values "
+    text += f"within 25 %{f' ({wide} by a wider tolerance of the source)' if wide else ''}, {share(bounds)} bounds; "
     text += f"of figures that calibrated a camera {share(by_use['calibration'])}; "
     text += f"of checks of the code {share(by_use['code'])}."
     new = [score.figure.name for score in scores if score.fell_behind]

@@ -16,9 +16,7 @@ from pydantic import Field
 
 from harness.scorecard.bench import (
     FLAT_PX,
-    JITTER,
     NOISE,
-    NOTHING,
     PATTERNED,
     STEADY,
     Bench,
@@ -47,8 +45,6 @@ camera, and the deviation's mean by under 1 %."""
 PATTERN_PATCH = (140, 180)
 LEAST_TILT = (0.05, 0.02)
 """Slopes of the frontal plane: 3 degrees, so that rounding of the output meets every phase of its step."""
-JUMP_MM = 5.0
-"""A frame whose mean is farther than this from the median of all is a jump, no jitter."""
 EDGE_PATCH = (40, 96)
 REACH_PX = 44.0
 """Distance from the edge within which pixels are counted: beyond the widest shadow at 0.75 m shorter than 44 pixels."""
@@ -267,19 +263,14 @@ def patch_correlation(bench: Bench, c: PatchConditions) -> Reading:
     return mean_of(product.mean(axis=1) / variance.mean(axis=1))
 
 
-def _mean_errors_mm(stack: FrameStack) -> np.ndarray:
-    """(n,) each frame's mean error over the pixels with a range; NaN where it has none."""
-    valid = np.isfinite(stack.z_m)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.where(valid, stack.z_m - stack.true_z_m, 0).sum(axis=(1, 2)) / valid.sum(axis=(1, 2)) / MM)
-
-
 @_quantity("systematic error", PlaneConditions)
 def systematic_error_mm(bench: Bench, c: PlaneConditions) -> Reading:
     """Greatest absolute mean error of z among ten units an hour after power-on, direct light only."""
-    units = range(1, bench.effort.units + 1)
-    stacks = (plane_stack(bench, c, STEADY, bench.effort.few_frames, unit) for unit in units)
-    errors = [abs(mean_of(_mean_errors_mm(stack)).value) for stack in stacks]
+    errors = []
+    for unit in range(1, bench.effort.units + 1):
+        stack = plane_stack(bench, c, STEADY, bench.effort.few_frames, unit)
+        error_m = (stack.z_m - stack.true_z_m)[np.isfinite(stack.z_m)]
+        errors.append(abs(error_m.mean()) / MM if error_m.size else np.nan)
     return Reading(float(np.fmax.reduce(errors)))
 
 
@@ -293,14 +284,6 @@ def fixed_pattern_mm(bench: Bench, c: PlaneConditions) -> Reading:
         if where.mean() > 0.5:
             found.append(fixed_pattern(np.nan_to_num(stack.z_m), where, stack.slopes, lags=12).std_m / MM)
     return mean_of(found)
-
-
-@_quantity("frame jitter", PlaneConditions)
-def frame_jitter_mm(bench: Bench, c: PlaneConditions) -> Reading:
-    """Deviation of a frame's mean over 960 pixels from frame to frame; jumps of over 5 mm left out."""
-    means = _mean_errors_mm(plane_stack(bench, c, JITTER, bench.effort.whole_frames))
-    steady = means[np.abs(means - np.median(means)) < JUMP_MM]
-    return jackknifed(steady, lambda m: float(m.std(ddof=1))) if steady.size >= 2 else NOTHING
 
 
 @lru_cache(maxsize=4)

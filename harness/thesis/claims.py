@@ -5,6 +5,7 @@ parameter of the experiment, and none is chosen to make a claim come out."""
 
 from __future__ import annotations
 
+import json
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -82,10 +83,12 @@ FEWEST_RANKED = 4
 
 @dataclass(frozen=True)
 class Case:
-    """The tables of one variant that rules judge by, and its averaged clouds."""
+    """The tables of one variant that rules judge by, and its averaged clouds. ``units``: summary rows of this variant
+    and of the variations that change the camera's unit alone."""
 
     variant: str
     summary: pd.DataFrame
+    units: pd.DataFrame
     holes: pd.DataFrame
     runs: pd.DataFrame
     probes: pd.DataFrame
@@ -112,9 +115,7 @@ def _c2(case: Case) -> tuple[Answer, str]:
 def _c3(case: Case) -> tuple[Answer, str]:
     rows = case.found_with_many()
     if rows.empty:
-        none = "No hole is found with 50 frames." if (case.summary["frames"] == MANY).any() else ""
-        return "undecided", none or "No trial has 50 frames."
-
+        return "undecided", "No hole is found with 50 frames."
     parts: list[bool | None] = []
     said = []
     for _, row in rows.iterrows():
@@ -124,7 +125,19 @@ def _c3(case: Case) -> tuple[Answer, str]:
         within, outside = interval.within(-1, 1), interval.above(1) or interval.below(-1)
         parts.append(True if within else False if outside else None)
         said.append(f"hole {row['hole']} {f'{ratio:+.1f} ({span(interval, 1)})' if interval.known else '–'}")
-    return decide(parts), f"(mean - true)/std by the thesis' measure: {', '.join(said)}."
+    return decide(parts), f"(mean - true)/std by the thesis' measure: {', '.join(said)}. {_between_units(case, rows)}"
+
+
+def _between_units(case: Case, rows: pd.DataFrame) -> str:
+    """Tell by how many deviations between units of the camera the mean size is off; ``rows``: the holes found."""
+    means = case.units[case.units["frames"] == MANY].pivot(
+        index="variant", columns="hole", values="extent_diameter_mean_mm"
+    )
+    if len(means) < FEWEST_UNITS:
+        return "Between units: not judged, as all repeats share one unit's pattern."
+    true = rows.set_index("hole")["true_diameter_mm"]
+    off = ((means.mean() - true) / means.std())[true.index]
+    return f"Between {len(means)} units: {', '.join(f'hole {hole} {ratio:+.1f}' for hole, ratio in off.items())}."
 
 
 def _c4(case: Case) -> tuple[Answer, str]:
@@ -216,9 +229,11 @@ def score_claims(
 ) -> list[Verdict]:
     """A verdict for each of `RULES` on one variant. ``summary`` saves making `summarise_holes` again."""
     summary = summarise_holes(tables.holes) if summary is None else summary
+    alone = tables.variants["settings"].map(lambda text: list(json.loads(text or "{}")) == [CAMERA_UNIT])
+    units = summary[summary["variant"].isin({variant, *tables.variants["variant"][alone]})]
     every = (summary, with_columns(tables.holes), tables.runs, tables.probes)
     summary, holes, runs, probes = (table[table["variant"] == variant] for table in every)
-    case = Case(variant, summary, holes, runs, probes, [one for one in examples if one.variant == variant])
+    case = Case(variant, summary, units, holes, runs, probes, [one for one in examples if one.variant == variant])
     return [verdict_of(claim, *rule(case)) for claim, rule in RULES.items()]
 
 

@@ -198,7 +198,7 @@ def _completed(source: Source, depth: int = 0) -> Source:
     beside = Path(source.origin).parent / name
     base = _completed(read_yaml(beside), depth + 1) if is_camera_path(name) else _named(name, depth + 1)
     found = replace(source, data={key: value for key, value in base.data.items() if key != "modes"})
-    found = replace(found, values={**base.values, (): source.place_of(())}, keys=base.keys)
+    found = replace(found, values={**base.values, **source.values}, keys={**base.keys, **source.keys})
     for path, value in _stated({key: value for key, value in source.data.items() if key != "like"}):
         found = found.with_value(path, with_value_at(found.data, path, value), source, path)
     return found

@@ -268,8 +268,8 @@ CONDITIONS = (
 """Settings that every set-up shares, in words, where no axis varies them."""
 
 
-def conditions_of(facts: Mapping[str, Any], limits: Sequence[SetUpLimit] = ()) -> str:
-    """Return what all set-ups have in common, damage first, in one line, and whether damage was out of view or lost."""
+def conditions_of(facts: Mapping[str, Any], inspected: int | None = None) -> str:
+    """Return what all set-ups have in common, damage first, in one line, and whether not all was ``inspected``."""
     said = [words] if (words := _damage_words(facts)) else []
     for path, words in CONDITIONS:
         value: Any = facts
@@ -280,11 +280,10 @@ def conditions_of(facts: Mapping[str, Any], limits: Sequence[SetUpLimit] = ()) -
         if value is not None and not varied and not told:
             text = words.format(camera_title(value) if isinstance(value, str) else value)
             said.append(text.replace(" 1 false calls", " 1 false call"))
-    drawn = facts.get("source", {}).get("target", {}).get("damage", {}).get("per_board", 0)
-    drawn *= (facts.get("study") or {}).get("boards", 0)
-    fewest = min((limit.targets for limit in limits), default=drawn)
-    if fewest < drawn:
-        said.append(f"only {fewest} of {drawn} damages drawn were in view and inspected by every set-up")
+    target, study = facts.get("source", {}).get("target") or {}, facts.get("study") or {}
+    declared = target.get("damage", {}).get("per_board", 0) * study.get("boards", 0) or len(target.get("holes") or ())
+    if inspected is not None and inspected < declared:
+        said.append(f"only {inspected} of {declared} damages were in view and inspected by every set-up")
     return ", ".join(said)
 
 
@@ -316,7 +315,7 @@ class StudyResult:
     @property
     def conditions(self) -> str:
         """Return what all set-ups have in common, in one line."""
-        return conditions_of(self.facts, self.limits)
+        return conditions_of(self.facts, min((limit.targets for limit in self.limits), default=None))
 
 
 def evaluate_study(
