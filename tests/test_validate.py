@@ -193,7 +193,7 @@ def test_the_table_tells_value_interval_published_and_source(tmp_path):
     lines = SCORES.grid(list(map(Score, figures, readings))).lines()
     assert len(lines) == 3
     for words in (
-        "azure_kinect_nfov",
+        "Azure Kinect DK NFOV unbinned",
         "1.5 m, albedo 0.8",
         "0.900",
         "0.880 to 0.920",
