@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -61,9 +60,9 @@ def main(options: argparse.Namespace, command: str) -> int:
 def write_comparison(comparison: Comparison, folder: Path, command: str) -> None:
     """Write `FILES` into ``folder``."""
     from harness.report.compare import compare_data, compare_html
-    from harness.vocabulary.files import write_text
+    from harness.vocabulary.files import write_json, write_text
 
-    write_text(folder / FILES[0], json.dumps(compare_data(comparison), indent=2, allow_nan=False) + "\n")
+    write_json(folder / FILES[0], compare_data(comparison))
     write_text(folder / FILES[1], compare_html(comparison, command))
 
 

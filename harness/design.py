@@ -55,12 +55,10 @@ Guess = tuple["PodCurve", str, tuple[float, float], float | None]
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0 (also where no plan shows a limit), 2 on a mistake of the user, 130 after Ctrl-C."""
-    import json
-
     from harness.evaluation.pod import design as plan
     from harness.report.design import StudyDesign, design_data, design_html, design_parts, save_design_png
     from harness.tables.text import show
-    from harness.vocabulary.files import write_text
+    from harness.vocabulary.files import write_json, write_text
     from harness.vocabulary.provenance import RESULTS_VERSION
 
     _refuse_what_does_not_belong(options)
@@ -76,8 +74,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     show(design_parts(design))
     if options.out is not None:
         data, picture, page = (options.out / name for name in FILES)
-        told = {"results_version": RESULTS_VERSION, **design_data(design), "command": command}
-        write_text(data, json.dumps(told, indent=2, allow_nan=False) + "\n")
+        write_json(data, {"results_version": RESULTS_VERSION, **design_data(design), "command": command})
         save_design_png(picture, design)
         write_text(page, design_html(design, command))
         print(f"wrote {data}, {picture.name}, {page.name}")

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.files import atomic_folder, write_text
+from harness.vocabulary.files import atomic_folder, write_json, write_text
 from harness.vocabulary.program import program, whole_number
 
 if TYPE_CHECKING:
@@ -132,8 +131,7 @@ def _write_beside(
         },
     }
     for name, data in files.items():
-        text = json.dumps({"results_version": RESULTS_VERSION, **data}, indent=2, allow_nan=False)
-        write_text(folder / name, text + "\n")
+        write_json(folder / name, {"results_version": RESULTS_VERSION, **data})
     write_text(folder / "experiment.yaml", resolved_yaml(experiment))
 
 

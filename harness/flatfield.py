@@ -51,10 +51,9 @@ def main(options: argparse.Namespace, command: str) -> int:
     from detectors.flat_field import save_flat_field
     from harness.inspection.told import mm, print_warnings
     from harness.report.blocks import save_png
-    from harness.report.findings import plain_json
     from harness.tables.flat_field import FLAT_CAPTURES, FLAT_FIGURES, figures_of
     from harness.tables.text import show
-    from harness.vocabulary.files import write_text
+    from harness.vocabulary.files import write_json
     from harness.vocabulary.provenance import RESULTS_VERSION, record
 
     if options.out.suffix.lower() != ".npz":
@@ -73,7 +72,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     save_flat_field(options.out, field)
     told = {"results_version": RESULTS_VERSION, "answer": answer, "warnings": field.warnings}
     told |= {"figures": FLAT_FIGURES.data(figures), "captures": FLAT_CAPTURES.data(captures)}
-    write_text(data, plain_json({**told, "provenance": record(command)}))
+    write_json(data, {**told, "provenance": record(command)})
     save_png(picture, (7.0, 5.4), lambda figure: _draw(figure, error_m, answer))
     print(f"wrote {options.out}, {data.name}, {picture.name}")
     return 0

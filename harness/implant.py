@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 from pathlib import Path
@@ -87,7 +86,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.tables.study import study_tables
     from harness.tables.text import show
     from harness.vocabulary.declaration.yaml_source import to_yaml
-    from harness.vocabulary.files import write_text
+    from harness.vocabulary.files import write_json, write_text
     from harness.vocabulary.provenance import RESULTS_VERSION, record
     from harness.vocabulary.seeds import canonical_json, digest
     from scenes.render.scene import load_mitsuba
@@ -154,7 +153,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     result = evaluate_study(study, tables, facts)
     write_text(options.out / STUDY.name, record_text(study))
     write_tables(options.out, {table: table.frame(rows) for table, rows in study_tables(result).items()}, provenance)
-    write_text(options.out / PROVENANCE.name, json.dumps(provenance, indent=2) + "\n")
+    write_json(options.out / PROVENANCE.name, provenance)
     page = options.out / REPORT.name
     write_text(page, study_html(result, (), provenance, to_yaml(facts), title))
     show([*(f"warning: {text}" for text in (COMPARED, *warnings)), *study_parts(result)])

@@ -55,12 +55,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0 (also where no limit is demonstrated), 2 on a mistake of the user, 130 after Ctrl-C."""
-    import json
-
     from harness.report.mapod import mapod_html, mapod_parts, save_mapod_png
     from harness.report.pod import pod_html, pod_parts, save_pod_png
     from harness.tables.text import show
-    from harness.vocabulary.files import write_text
+    from harness.vocabulary.files import write_json, write_text
     from harness.vocabulary.provenance import RESULTS_VERSION
 
     found: Any = _stated(options) if options.prior is None else _corrected(options)
@@ -69,8 +67,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     show(parts(found))
     stem = "pod" if options.prior is None else "mapod"
     data, picture, page = (options.out / f"{stem}.{ending}" for ending in ("json", "png", "html"))
-    told = {"results_version": RESULTS_VERSION, **found.to_data(), "command": command}
-    write_text(data, json.dumps(told, indent=2, allow_nan=False) + "\n")
+    write_json(data, {"results_version": RESULTS_VERSION, **found.to_data(), "command": command})
     save_png(picture, found)
     write_text(page, html(found, command))
     print(f"wrote {data}, {picture.name}, {page.name}")

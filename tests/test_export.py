@@ -203,7 +203,7 @@ def test_without_damage_nothing_is_listed_and_the_noise_is_another(
 ) -> None:
     free = exported(experiment, tmp_path / "free", "mcap", "--hole-free", "--views", "1", "--frames", "1")
     assert json.loads((free / "truth.json").read_text())["damages"] == []
-    first, second = (open_capture([folder / "view_00"]).first_frame().z_m for folder in (free, exports["mcap"]))
+    first, second = (next(open_capture([folder / "view_00"]).frames()).z_m for folder in (free, exports["mcap"]))
     assert not np.array_equal(first, second, equal_nan=True)
 
 

@@ -202,12 +202,12 @@ def test_a_recording_can_be_sent_to_another_process(tmp_path: Path) -> None:
 def test_colour_that_belongs_to_no_depth_picture_is_said(tmp_path: Path) -> None:
     folder = plane.write_open3d_folder(tmp_path / "plane", 2)
     pictures = sorted((folder / "color").iterdir())
-    assert open_capture([folder]).first_frame().rgb is not None
+    assert next(open_capture([folder]).frames()).rgb is not None
     for number, path in enumerate(pictures):
         path.rename(path.with_stem(str(100 + number)))
     recording = open_capture([folder])
     told = f"{len(pictures)} colour pictures: 2 depth pictures have no colour"
-    assert any(told in note for note in recording.notes) and recording.first_frame().rgb is None
+    assert any(told in note for note in recording.notes) and next(recording.frames()).rgb is None
 
 
 def test_colour_of_another_size_is_left_out_and_said(tmp_path: Path) -> None:
@@ -352,7 +352,7 @@ def test_pages_of_a_tiff_are_frames_and_three_channels_are_points(tmp_path: Path
     assert len(list(open_capture([tmp_path / "two.tiff"], lens=plane.LENS).frames())) == 2
     points = plane.points_m(frames[0]).astype(np.float32)
     cv2.imwrite(str(tmp_path / "xyz.tiff"), np.ascontiguousarray(points[..., ::-1]))
-    frame = open_capture([tmp_path / "xyz.tiff"]).first_frame()
+    frame = next(open_capture([tmp_path / "xyz.tiff"]).frames())
     assert np.allclose(frame.xy_m, points[..., :2], equal_nan=True)
     cv2.imwrite(str(tmp_path / "rgb.tiff"), np.zeros((72, 96, 3), np.uint16))
     for name in ("rgb.tiff", "cut.tiff"):
@@ -371,7 +371,7 @@ def test_frames_along_the_last_axis(tmp_path: Path) -> None:
         for frame, stored in zip(recording.frames(), stack, strict=True):
             assert np.allclose(frame.z_m, np.where(stored > 0, stored / 1e3, np.nan), equal_nan=True)
     np.save(tmp_path / "points.npy", plane.points_m(frames[0]))
-    assert open_capture([tmp_path / "points.npy"]).first_frame().xy_m is not None
+    assert next(open_capture([tmp_path / "points.npy"]).frames()).xy_m is not None
 
 
 def test_open3d_keeps_its_matrix_column_by_column(tmp_path: Path) -> None:
@@ -436,7 +436,7 @@ def test_exported_pictures_take_the_lens_from_the_calibration_beside_them(tmp_pa
 def test_lists_of_points_in_every_dialect(tmp_path: Path, head: str, apart: str, rest: str) -> None:
     path = plane.write_points(tmp_path / "c.txt", TRUE_M, head, apart, rest)
     recording = open_capture([path])
-    frame = recording.first_frame()
+    frame = next(recording.frames())
     assert not recording.organised and "single points" in recording.notes[0]
     np.testing.assert_allclose(points_of(recording, frame)[0], TRUE_M.reshape(-1, 3), atol=1e-6)
     assert (frame.rgb is not None) == ("16" in rest) and (frame.amplitude is not None) == ("7" in rest.split("0.7")[0])
@@ -453,7 +453,7 @@ def test_a_list_of_a_sensors_size_is_put_on_its_pixels_where_it_rises_as_they_do
     points[3, 5] = 0
     bare = plane.write_ply(tmp_path / "a.ply", points, grid=False)
     recording = open_capture([bare])
-    assert recording.organised and recording.first_frame().reason[3, 5] == Reason.NO_RETURN
+    assert recording.organised and next(recording.frames()).reason[3, 5] == Reason.NO_RETURN
     stated = plane.write_ply(tmp_path / "b.ply", TRUE_M, grid=False)
     stated.write_bytes(stated.read_bytes().replace(b"element", b"comment Width=96, Height=72\nelement", 1))
     assert open_capture([stated]).region.shape == (72, 96)
@@ -475,7 +475,7 @@ def test_a_height_map_is_a_cloud_in_parallel_projection(tmp_path: Path) -> None:
     heights[3, 5] = np.nan
     np.savez(tmp_path / "a.npz", height=heights, other=np.zeros((3, 3)))
     recording = open_capture([tmp_path / "a.npz"], pitch="0.5mm")
-    frame = recording.first_frame()
+    frame = next(recording.frames())
     assert recording.projection == "parallel" and recording.organised and recording.scale_m == 1e-3
     assert "towards the viewer" in recording.notes[0] and "relief" in recording.unit_from
     assert frame.reason[3, 5] == Reason.NO_RETURN and np.isnan(frame.z_m[3, 5])
@@ -486,7 +486,7 @@ def test_a_height_map_is_a_cloud_in_parallel_projection(tmp_path: Path) -> None:
     scipy.io.savemat(tmp_path / "a.mat", {"depth": -height_map(1e-3)})
     down = open_capture([tmp_path / "a.mat"], pitch="500um")
     assert down.scale_m == 1 and "away from the viewer" in down.notes[0]
-    np.testing.assert_allclose(down.first_frame().z_m[30, 60], frame.z_m[30, 60], atol=1e-4)
+    np.testing.assert_allclose(next(down.frames()).z_m[30, 60], frame.z_m[30, 60], atol=1e-4)
 
 
 def test_a_flat_height_map_has_no_findings_at_its_border_and_a_crater_is_one(
@@ -538,12 +538,12 @@ def test_the_raw_frame_of_a_plane(shared_data: Path) -> None:
     recording = open_capture(
         [shared_data / "vzense_plane" / "bg.bin"], lens=Lens(640, 480, 465.0, 465.0, 320.0, 240.0), raw="640x480"
     )
-    assert float(np.nanmedian(recording.first_frame().z_m)) == pytest.approx(0.918, abs=0.02)
+    assert float(np.nanmedian(next(recording.frames()).z_m)) == pytest.approx(0.918, abs=0.02)
 
 
 def test_the_interleaved_frame_of_another_maker(shared_data: Path) -> None:
     path, lens = shared_data / "adi_tof" / "frame_mode2.bin", Lens(512, 512, 400.0, 400.0, 256.0, 256.0)
     with pytest.raises(UserError, match="512x512:u2/5"):
         open_capture([path])
-    z_m = open_capture([path], lens=lens, raw="512x512:u2/5", unit="mm").first_frame().z_m
+    z_m = next(open_capture([path], lens=lens, raw="512x512:u2/5", unit="mm").frames()).z_m
     assert float(np.nanmedian(np.abs(np.diff(z_m)))) < 0.02

@@ -156,7 +156,7 @@ def test_a_lens_counts_only_where_the_points_lie_on_its_rays(tmp_path: Path) -> 
     beside = [("/a", bags.INFO, bags.info(shift_px=0.02)), ("/b", bags.INFO, bags.info(width=97))]
     apart = open_capture([bags.write_bag(tmp_path / "apart", [*beside, *points])])
     assert apart.lens is None and "no CameraInfo in the bag fits" in apart.notes[0]
-    assert apart.first_frame().xy_m is not None
+    assert next(apart.frames()).xy_m is not None
     right = [*beside, ("/c", bags.INFO, bags.info(shift_px=0.005))]
     assert open_capture([bags.write_bag(tmp_path / "right", [*right, *points])]).lens is not None
     # both ways give the same points, to what float32 leaves of x and y
@@ -252,8 +252,8 @@ def test_depth_images_with_their_lens_come_before_clouds(tmp_path: Path) -> None
     picture, lens = (DEPTH, bags.IMAGE, bags.depth_image(STORED)), (LENS_TOPIC, bags.INFO, bags.info())
     both = bags.write_bag(tmp_path / "both", [picture, lens, *bags.clouds(1)])
     recording = open_capture([both])
-    assert recording.first_frame().rgb is None and "not the clouds on /points2" in recording.notes[0]
-    assert open_capture([both], topic="points2").first_frame().rgb is not None
+    assert next(recording.frames()).rgb is None and "not the clouds on /points2" in recording.notes[0]
+    assert next(open_capture([both], topic="points2").frames()).rgb is not None
     lacking = bags.write_bag(tmp_path / "lacking", [picture, *bags.clouds(1)])
     assert "the clouds on /points2 are read" in open_capture([lacking]).notes[0]
     several = [picture, ("/camera/aligned_depth_to_color/image_raw", bags.IMAGE, bags.depth_image(STORED)), lens]
@@ -274,7 +274,7 @@ def test_realsense_names_and_its_unit(tmp_path: Path) -> None:
     ]
     recording = open_capture([bags.write_ros1(tmp_path / "a.bag", messages)])
     assert recording.lens == plane.LENS and recording.scale_m == 0.00025
-    np.testing.assert_allclose(np.nan_to_num(recording.first_frame().z_m), STORED / 1e3, rtol=1e-6)
+    np.testing.assert_allclose(np.nan_to_num(next(recording.frames()).z_m), STORED / 1e3, rtol=1e-6)
     assert recording.unit_text.startswith("depth unit 0.25 mm, from /device_0")
 
 
@@ -392,7 +392,7 @@ def test_a_recording_that_was_not_closed_has_no_metadata(tmp_path: Path) -> None
     folder = bags.write_bag(tmp_path / "bag", bags.clouds(1))
     (folder / "metadata.yaml").unlink()
     assert "has no metadata.yaml" in refusal(folder) and "bag.db3" in refusal(folder)
-    assert open_capture([folder / "bag.db3"]).first_frame().z_m.shape == VALID.shape
+    assert next(open_capture([folder / "bag.db3"]).frames()).z_m.shape == VALID.shape
 
 
 @pytest.mark.parametrize("text", ("rosbag2_bagfile_information: [", "rosbag2_bagfile_information: 3", "\xff"))

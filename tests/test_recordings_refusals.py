@@ -194,7 +194,7 @@ def test_planes_that_are_no_frames_of_one_scene_are_refused(tmp_path: Path, plan
     if (planes, axis) != ("x y z", -1):  # these are points
         message = refusal(tmp_path / "a.npy", lens=plane.LENS)
         assert f"{len(names)} planes" in message and "--array :N" in message
-        frame = open_capture([tmp_path / "a.npy"], lens=plane.LENS, array=f":{number}").first_frame()
+        frame = next(open_capture([tmp_path / "a.npy"], lens=plane.LENS, array=f":{number}").frames())
         np.testing.assert_allclose(np.nan_to_num(frame.z_m), z, rtol=1e-6)
 
 
@@ -264,7 +264,7 @@ def test_a_file_of_bare_numbers_needs_its_layout(tmp_path: Path) -> None:
     pixels["depth"], pixels["rest"] = STORED, 77
     path.write_bytes(pixels.tobytes())
     assert "the layout is another" in refusal(path, raw="96x72", lens=plane.LENS, array=":0")
-    read = open_capture([path], raw="96x72:u2/5", lens=plane.LENS).first_frame()
+    read = next(open_capture([path], raw="96x72:u2/5", lens=plane.LENS).frames())
     np.testing.assert_allclose(np.nan_to_num(read.z_m), STORED / 1e3, rtol=1e-6)
 
 

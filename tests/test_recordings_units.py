@@ -72,7 +72,7 @@ def test_no_return_is_said_and_left_out(tmp_path: Path) -> None:
     stored = noisy(0.7, 1e-3)
     stored[:7] = 65535
     recording = opened(tmp_path / "c", stored)
-    frame = recording.first_frame()
+    frame = next(recording.frames())
     assert (frame.reason[:7] == Reason.NO_RETURN).all() and np.isfinite(frame.z_m[7:]).all()
     assert "65535 taken as no return, 9.7 % of pixels" in recording.notes
 
@@ -80,7 +80,7 @@ def test_no_return_is_said_and_left_out(tmp_path: Path) -> None:
 def test_a_cloud_that_looks_backwards_is_turned_and_said(tmp_path: Path) -> None:
     points = plane.points_m(plane.depth_mm())
     recording = open_capture([plane.write_pcd(tmp_path / "c.pcd", points * [1, -1, -1])])
-    frame = recording.first_frame()
+    frame = next(recording.frames())
     assert any("turned" in note for note in recording.notes)
     np.testing.assert_allclose(np.dstack([frame.xy_m, frame.z_m]), points, atol=1e-6)
 
@@ -102,7 +102,7 @@ def test_the_unit_is_told_by_the_data_and_printed(tmp_path: Path, stored: np.nda
     np.save(tmp_path / "d.npy", stored)
     recording = open_capture([tmp_path / "d.npy"], lens=plane.LENS)
     assert recording.unit_text.startswith(f"depth unit {unit_mm:.4g} mm, from ")
-    assert np.nanmedian(recording.first_frame().z_m) == pytest.approx(0.7, rel=0.02)
+    assert np.nanmedian(next(recording.frames()).z_m) == pytest.approx(0.7, rel=0.02)
     usual = 1000.0 if stored.dtype.kind == "f" else 1.0
     assert bool(recording.warnings) == (unit_mm != usual)
 
@@ -140,14 +140,14 @@ def test_a_file_beside_the_pictures_states_the_unit(tmp_path: Path, key: str, va
     (tmp_path / "c" / "metadata.json").write_text(json.dumps({"serial": "f1", key: value}))
     recording = opened(tmp_path / "c", noisy(0.9, unit_mm / 1e3))
     assert recording.unit_text == f"depth unit {unit_mm:g} mm, from metadata.json" and not recording.warnings
-    assert np.nanmedian(recording.first_frame().z_m) == pytest.approx(0.9, rel=0.02)
+    assert np.nanmedian(next(recording.frames()).z_m) == pytest.approx(0.9, rel=0.02)
 
 
 def test_inches_are_asked_for_and_read(tmp_path: Path) -> None:
     np.save(tmp_path / "d.npy", noisy(1.1, 1e-5) / 2540)
     with pytest.raises(UserError, match=r"--unit in \(1\.1 m\)"):
         open_capture([tmp_path / "d.npy"], lens=plane.LENS)
-    z_m = open_capture([tmp_path / "d.npy"], lens=plane.LENS, unit="in").first_frame().z_m
+    z_m = next(open_capture([tmp_path / "d.npy"], lens=plane.LENS, unit="in").frames()).z_m
     assert np.nanmedian(z_m) == pytest.approx(1.1, rel=0.02)
 
 

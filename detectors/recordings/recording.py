@@ -133,10 +133,6 @@ class Recording:
             fix = "check the selected frames, and that the target was within the camera's range"
             raise UserError(f"{self.name}: not one valid pixel in {count} frame{'s' * (count != 1)}", fix=fix)
 
-    def first_frame(self) -> Frame:
-        """Return the first selected frame, checked. Raises UserError as `frames` does."""
-        return next(self.frames())
-
 
 @lru_cache(maxsize=2)
 def _returning_slopes(lens: Lens, region: Region) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from detectors import load_detector
@@ -16,7 +15,7 @@ from harness.report.findings import write_findings
 from harness.tables.outputs import EXPERIMENT, PROVENANCE
 from harness.tables.schema import write_table
 from harness.tables.trials import POINTS_OF_CAPTURES
-from harness.vocabulary.files import write_text
+from harness.vocabulary.files import write_json, write_text
 from harness.vocabulary.geometry import MM
 from harness.vocabulary.provenance import RESULTS_VERSION, record
 
@@ -52,7 +51,7 @@ def judge_captures(experiment: Experiment, out: Path, command: str) -> int:
         for left in cloud.left_out:
             print(f"  left out: {left.name}: {left.why}")
     origin = {"results_version": RESULTS_VERSION, **record(command)}
-    write_text(folder / PROVENANCE.name, json.dumps(origin, indent=2) + "\n")
+    write_json(folder / PROVENANCE.name, origin)
     write_table(folder, POINTS_OF_CAPTURES, POINTS_OF_CAPTURES.frame(rows))
     point_to(folder)
     print(f"findings: {folder}")

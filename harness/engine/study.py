@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import json
 import sys
 import time
 from collections import Counter
@@ -34,7 +33,7 @@ from harness.tables.study import study_tables
 from harness.tables.text import Grid, show
 from harness.tables.trials import ResultTables
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.files import RECORD_BYTES, bounded_bytes, strict_json, write_text
+from harness.vocabulary.files import RECORD_BYTES, bounded_bytes, strict_json, write_json, write_text
 from harness.vocabulary.path_names import in_words, names_of
 from harness.vocabulary.provenance import RESULTS_VERSION, check_version, record, source_digest
 from harness.vocabulary.seeds import digest
@@ -81,7 +80,7 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
                 shown = _write_report(folder, experiment, outcome, tables, provenance)
             else:
                 shown = _write_study(folder, experiment, plan, outcome, tables, provenance, engine)
-            write_text(folder / PROVENANCE.name, json.dumps(provenance, indent=2) + "\n")
+            write_json(folder / PROVENANCE.name, provenance)
         if options.cache_limit_gb is not None:
             trim_cache(cache, round(options.cache_limit_gb * 1e9), keep=[job.path for job in plan.renders])
     except KeyboardInterrupt:

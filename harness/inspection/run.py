@@ -30,10 +30,11 @@ from detectors.views import PreparedView, View
 from harness.inspection import arguments as asked
 from harness.inspection import told
 from harness.inspection.gauge import HITS_AND_MISSES, GaugeSeen, read_gauge, seen_on
-from harness.report.findings import Judged, plain_json, write_findings
+from harness.report.findings import Judged, write_findings
 from harness.tables.outputs import GAUGE_ROWS
 from harness.tables.text import show
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import plain_json
 from harness.vocabulary.geometry import MM, Cloud
 from harness.vocabulary.provenance import RESULTS_VERSION, record
 

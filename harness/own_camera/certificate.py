@@ -6,7 +6,6 @@ were used. Nothing here is an accredited calibration."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from datetime import date
 from pathlib import Path
@@ -24,7 +23,7 @@ from harness.report.blocks import bullets, heading, note, page
 from harness.tables.characteristics import CERTIFIED, FLAT_SURFACES
 from harness.tables.limits import LIMITS
 from harness.tables.text import many
-from harness.vocabulary.files import write_text
+from harness.vocabulary.files import write_json, write_text
 from harness.vocabulary.geometry import MM, transform_points
 from harness.vocabulary.provenance import RESULTS_VERSION
 
@@ -132,4 +131,4 @@ def write_certificate(
     told |= {"surfaces": FLAT_SURFACES.data(surfaces), "conditions": [share, *CONDITIONS]}
     told |= {"limits": LIMITS.data(limits), "doubts": found.doubts, "command": command}
     write_text(folder / "certificate.html", text)
-    write_text(folder / "certificate.json", json.dumps(told, indent=2, ensure_ascii=False) + "\n")
+    write_json(folder / "certificate.json", told)

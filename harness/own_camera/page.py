@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +14,7 @@ from harness.scorecard.bench import Reading
 from harness.tables.characteristics import OWN_CURVES, OWN_FIGURES, OwnFigure
 from harness.tables.schema import Estimate, write_table
 from harness.tables.text import show
-from harness.vocabulary.files import write_text
+from harness.vocabulary.files import write_json, write_text
 from harness.vocabulary.geometry import MM
 from harness.vocabulary.provenance import RESULTS_VERSION, record
 
@@ -129,7 +128,7 @@ def write_page(
     body += [OWN_FIGURES.grid(rows, heads=heads).html(), *command_of(command)]
     write_text(path, page(title, answer, body, warnings=warnings))
     origin = {"results_version": RESULTS_VERSION, **record(command), **facts, "warnings": warnings}
-    write_text(folder / "provenance.json", json.dumps(origin, indent=2) + "\n")
+    write_json(folder / "provenance.json", origin)
     print(f"wrote {path} and the tables")
 
 

@@ -4,7 +4,6 @@ All files of one run are written beside their final names first and renamed toge
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -17,7 +16,7 @@ import numpy as np
 from detectors.interface import Detection, Evidence, Measurement, MissingReturns
 from harness.report.clouds import residual_bar, residual_norm
 from harness.tables import outputs, trials
-from harness.vocabulary.files import atomic_path, jsonable
+from harness.vocabulary.files import atomic_path, plain_json
 from harness.vocabulary.geometry import MM, Cloud
 
 if TYPE_CHECKING:
@@ -148,11 +147,6 @@ def json_text(judged: Judged, about: Mapping[str, Any]) -> str:
         for finding, m in zip(judged.findings, judged.measurements, strict=True)
     ]
     return plain_json({"findings_version": trials.FINDINGS_VERSION, "findings": rows, **about})
-
-
-def plain_json(data: Mapping[str, Any]) -> str:
-    """Plain data and NumPy's numbers as JSON; null where there is no number."""
-    return json.dumps(jsonable(data), indent=2, allow_nan=False) + "\n"
 
 
 def ply_bytes(cloud: Cloud, detections: Sequence[Detection]) -> bytes:

@@ -11,7 +11,6 @@ depth image is interpolated linearly where the board's plane projects to)."""
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -31,7 +30,7 @@ from harness.scorecard.figures import BESIDE, Beside
 from harness.tables.schema import write_table
 from harness.tables.text import show
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.files import write_text
+from harness.vocabulary.files import write_json, write_text
 from harness.vocabulary.geometry import MM, Cloud, Lens, invert, transform_points
 from harness.vocabulary.provenance import RESULTS_VERSION, record
 from scenes.render.cache import cached_view
@@ -223,7 +222,7 @@ def run_board(options: argparse.Namespace, recording: Recording | None, command:
     write_text(options.out / "capture.html", page(title, answer, [*body, *command_of(command)], under))
     files = [str(path) for path in recording.files] if recording else []
     origin = {"results_version": RESULTS_VERSION, **record(command), "experiment": experiment.digest, "files": files}
-    write_text(options.out / "provenance.json", json.dumps(origin, indent=2) + "\n")
+    write_json(options.out / "provenance.json", origin)
     print(f"wrote {options.out / 'capture.html'}")
     return 0
 

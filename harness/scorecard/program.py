@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -17,7 +16,7 @@ from harness.scorecard.bench import FULL
 from harness.scorecard.quantities import QUANTITIES
 from harness.tables.schema import write_table
 from harness.tables.text import show
-from harness.vocabulary.files import write_text
+from harness.vocabulary.files import write_json, write_text
 from harness.vocabulary.provenance import RESULTS_VERSION, record
 from scenes.sensor.camera import camera_digest, load_camera
 
@@ -64,7 +63,7 @@ def run_scorecard(options: argparse.Namespace, command: str) -> int:
     }
     answer = _answer(scores)
     write_table(options.out, scoring.SCORES, scoring.SCORES.frame(scores))
-    write_text(options.out / "provenance.json", json.dumps(provenance, indent=2) + "\n")
+    write_json(options.out / "provenance.json", provenance)
     write_text(options.out / "scorecard.html", _page(answer, scores, titles, provenance, command))
     show([scoring.SCORES.grid(scores, terminal=True)])
     print(answer)

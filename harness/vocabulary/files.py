@@ -283,6 +283,16 @@ def _digest_of(path: Path, size: int, changed_ns: int) -> str:
         return hashlib.file_digest(stream, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
 
 
+def write_json(path: Path, data: Mapping[str, Any]) -> None:
+    """Write `plain_json` atomically. Raises UserError as `atomic_path` does."""
+    write_text(path, plain_json(data))
+
+
+def plain_json(data: Mapping[str, Any]) -> str:
+    """Return readable JSON of `jsonable` data."""
+    return json.dumps(jsonable(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
 def jsonable(value: Any) -> Any:
     """Return plain data, tuples, arrays and NumPy's numbers as JSON's types: None for what is no finite number."""
     if isinstance(value, Mapping):

@@ -6,7 +6,6 @@ height runs with the rows from the top (+y): row 0 begins at v = 0. The centre o
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates, zoom
 from scipy.optimize import brentq
 
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.files import bounded_bytes, write_bytes, write_text
+from harness.vocabulary.files import bounded_bytes, write_bytes, write_json
 from harness.vocabulary.geometry import MM
 from harness.vocabulary.provenance import RESULTS_VERSION
 from harness.vocabulary.seeds import random_stream
@@ -357,7 +356,7 @@ def write_truth(target: Target, path: Path) -> None:
     """Write as JSON: version, declaration, ``T_camera_board`` (metres) and one row in millimetres per damage."""
     data = {"results_version": RESULTS_VERSION, "target": target.config.to_data()}
     data |= {"T_camera_board": target.T_camera_board.tolist(), "damages": [each.to_row() for each in target.truth]}
-    write_text(path, json.dumps(data, indent=2) + "\n")
+    write_json(path, data)
 
 
 def _ply(target: Target) -> bytes:
