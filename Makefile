@@ -15,7 +15,7 @@ test: .venv/.ready
 test-all: .venv/.ready
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 
-lint: .venv/.ready
+lint: .venv/.installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
@@ -49,12 +49,16 @@ lock: .venv/.ready
 	$(BIN)/pip-compile --quiet --extra dev --extra cluster --extra peers --generate-hashes --strip-extras --allow-unsafe \
 	  --no-emit-index-url --no-emit-trusted-host --no-emit-find-links -o requirements.lock pyproject.toml
 
-.venv/.ready: requirements.lock pyproject.toml
+# pip would compile every file of every package, which takes as long as the rest; Python compiles what it imports.
+.venv/.installed: requirements.lock pyproject.toml
 	@echo "Setting up .venv: install the locked packages (1 of 3, the longest part) ..."
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile --require-hashes -r requirements.lock
 	@echo "Setting up .venv: install tofpod (2 of 3) ..."
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	touch $@
+
+.venv/.ready: .venv/.installed
 	@echo "Setting up .venv: compile the inner loops (3 of 3) ..."
 	$(BIN)/python -m harness.prepare
 	touch $@
