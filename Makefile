@@ -9,11 +9,12 @@ unexport PYTHONDONTWRITEBYTECODE
 sweep: .venv/.ready
 	$(BIN)/python -m harness.sweep experiments/averaging.yaml
 
+# Three processes for two cores, as some tests wait for nodes and time limits.
 test: .venv/.ready
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile -m "not slow"
 
 test-all: .venv/.ready
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile
 
 lint: .venv/.installed
 	$(BIN)/ruff check .
