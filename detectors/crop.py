@@ -54,14 +54,9 @@ class Candidate:
     grid: Cloud
 
     @property
-    def pixels(self) -> int:
-        """Number of its pixels."""
-        return int(np.count_nonzero(self.own))
-
-    @property
     def share(self) -> float:
         """Part of all pixels."""
-        return self.pixels / self.own.size
+        return float(self.own.mean())
 
     @cached_property
     def depths_m(self) -> tuple[float, float, float]:

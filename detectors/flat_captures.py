@@ -87,10 +87,6 @@ class PatternChange:
         """The rms by which they differ beyond their noise."""
         return float(np.sqrt(max(self.difference_m**2 - self.noise_m**2, 0.0)))
 
-    def is_change_of(self, rms_m: float) -> bool:
-        """Return whether a pattern of this rms changed from one part to the other."""
-        return self.difference_m > SURE * self.noise_m and self.excess_m > STABLE_SHARE * rms_m
-
 
 @dataclass(frozen=True)
 class Separated:
@@ -255,7 +251,8 @@ def _with_doubts(found: Separated) -> Separated:
         told += ": the surface's own shape cannot be told from the pattern, and the surface is taken to be flat"
         said.append(f"{told} (move the camera by {LEAST_SHIFT_M / MM:.0f} mm; if along the surface, state --poses)")
     parts = ((found.in_time, "from the first captures to the last"), (found.in_range, "with distance"))
-    changes = [(part, apart) for part, apart in parts if part is not None and part.is_change_of(rms_m)]
+    known = [(part, apart) for part, apart in parts if part is not None and part.difference_m > SURE * part.noise_m]
+    changes = [(part, apart) for part, apart in known if part.excess_m > STABLE_SHARE * rms_m]
     # of two parts that scatter by t each, the mean is off a third one by 3/2 t^2, and their difference is 2 t^2
     variance_m2 = field.variance_m2 + 0.75 * max((part.excess_m for part, _ in changes), default=0.0) ** 2
     if changes:

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import ndtri, ndtri_exp, owens_t
 
 from detectors.interface import Detection, Evidence, Measurement, MissingReturns
-from detectors.masks import grown, holes_filled, parts_with
+from detectors.masks import grown, holes_filled, nearest_pixel, parts_with
 from detectors.measure import local_plane
 from harness.vocabulary.geometry import Cloud, Reason
 from harness.vocabulary.seeds import random_stream
@@ -36,7 +36,9 @@ TAIL_CLUSTERS = 60  # largest simulated clusters from which the fall of their nu
 SLOWEST_FALL = math.log(2.0)  # fall without simulated clusters to tell: each further pixel halves a cluster's chance
 DISCS_PX, LOUD_SIGMAS = (1.5, 2.5, 3.5), 3.0
 """Radii of the discs in which missing pixels are counted, and scores beside which they are not taken for chance."""
-REACH_PX = 2  # A depth finding so near to pixels without return belongs to the same damage: half of a 5 x 5 window
+REACH_PX, APART = 2, 0.8
+"""A depth finding so near to pixels without return (half of a 5 x 5 window) is of the same damage, unless its centre is
+so many of its radii and two windows away: that of a disc beside them is 1 away, that of a disc's other half 0.6."""
 RING_PX = 4  # width of the ring of judged pixels that places the surface at a hole
 HIGHEST_SCORE = 37.0  # standard deviations; beyond it float64 knows no probability
 REASONS: dict[int, str] = {
@@ -141,17 +143,24 @@ def one_damage_once(
     shape: tuple[int, int], found: tuple[Detection, ...], missing: tuple[Detection, ...]
 ) -> tuple[Detection, ...]:
     """Return findings by depth and by missing returns (flat indices into a grid of ``shape``) as one list, strongest
-    first; where two of them touch (`REACH_PX`) they are the same damage, and the larger stands for it."""
+    first; where two of them are the same damage (`REACH_PX`, `APART`) the larger stands for it."""
     kept, depth = list(missing), list(found)
     for hole in missing:
         area = _filled(shape, hole.pixels)
-        near = grown(area, REACH_PX).ravel()
-        touching = [other for other in depth if near[other.pixels].any()]
-        if any(len(other.pixels) >= area.sum() for other in touching):
+        apart, _ = nearest_pixel(area)
+        same = [_is_same(apart, other.pixels) for other in depth]
+        if any(len(other.pixels) >= area.sum() for other, one in zip(depth, same, strict=True) if one):
             kept.remove(hole)
         else:
-            depth = [other for other in depth if not near[other.pixels].any()]
+            depth = [other for other, one in zip(depth, same, strict=True) if not one]
     return tuple(sorted((*depth, *kept), key=lambda each: -each.score))
+
+
+def _is_same(apart: np.ndarray, pixels: np.ndarray) -> bool:
+    """Return whether a depth finding and an area without return, ``apart`` (h, w) pixels away, are one damage."""
+    row, column = (round(float(places.mean())) for places in np.unravel_index(pixels, apart.shape))
+    far = apart[row, column] > max(APART * math.sqrt(len(pixels) / math.pi), 2.0 * REACH_PX)
+    return bool(apart.flat[pixels].min() <= math.sqrt(2) * REACH_PX and not far)
 
 
 def measure_missing(cloud: Cloud, evidence: Evidence, detection: Detection) -> Measurement:

@@ -23,13 +23,12 @@ def main(options: argparse.Namespace, command: str) -> int:
     from scenes.sensor.source import SimulatedUnit
 
     began = time.perf_counter()
-    print("compiling the cameras ..", flush=True)
+    print("compiling the cameras and averages ..", flush=True)
     for name in camera_names():
         camera = load_camera(name)
         row, column = int(camera.nominal_lens.cy), int(camera.nominal_lens.cx)
         view = plane_view(camera, Region(row - 20, row + 20, column - 30, column + 30), 0.7, 0.6, 0.05, 0.02)
         list(SimulatedUnit(camera, CameraConfig(name=name), view).capture(1, 1).frames())
-    print("compiling averages ..", flush=True)
     camera = load_camera("azure_kinect_nfov")
     view = plane_view(camera, Region(300, 340, 300, 360), 0.7, 0.6, 0.05, 0.02)
     view.phasor[:, 18:24, 28:34] *= 1j

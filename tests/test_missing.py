@@ -178,6 +178,17 @@ def test_a_hole_seen_by_depth_and_by_missing_returns_is_one_damage() -> None:
     assert [(one.kind, one.score) for one in kept] == [("no return", 12.0), ("depth", 6.0)]
 
 
+def test_a_hole_beside_a_place_without_return_is_damage_of_its_own() -> None:
+    gone, hole = disc(60, 45, 24), disc(60, 62, 10)  # their edges touch
+    nothing = Detection(12.0, np.flatnonzero(gone), np.zeros(3), "no return")
+    kept = one_damage_once(SHAPE, (depth_finding(hole),), (nothing,))
+    assert [one.kind for one in kept] == ["no return", "depth"]
+    # one hole, half of which returned nothing
+    half = Detection(12.0, np.flatnonzero(gone & (U >= 60)), np.zeros(3), "no return")
+    kept = one_damage_once(SHAPE, (depth_finding(gone & (U < 60)),), (half,))
+    assert len(kept) == 1
+
+
 def test_findings_without_return_stand_in_the_table_and_a_map_of_blind_pixels_beside_it(tmp_path: Path) -> None:
     cloud = without(plane(seed=1), disc(30.2, 70.1, 12))
     detector = load_detector("thesis", {"crop": {"kind": "none"}})

@@ -115,7 +115,7 @@ def choice_facts(choice: Choice | None) -> dict[str, Any] | None:
             "extent_mm": [side / MM for side in each.extent_m],
             "share_of_view": each.share,
             "tilt_deg": each.tilt_deg,
-            "pixels": each.pixels,
+            "pixels": int(each.own.sum()),
         }
         for n, each in enumerate(choice.candidates, start=1)
     ]
