@@ -22,10 +22,10 @@ from harness.vocabulary.geometry import MM, Cloud, Region, rotate_vectors
 OTHER_DAMAGE_SIGMAS = 5.0
 """Pixels of the patch that stand out by so much and do not touch the detection belong to something else."""
 OPEN_M = 20.0 * MM
-"""The contour counts what is deeper as so deep: of an oblique hole it outlines the mouth, not what shows through."""
+"""Greater depths count as this one in the contour, which follows an oblique hole's mouth, not what shows through."""
 CONTOUR_ZOOM = 4  # sub-pixels of the half-depth contour along each axis
 SHARPER_PX, SHARPER_GAIN = (1.0, 2.0, 3.0, 5.0), 9.0
-"""Blurs that a recording may have below that of its noise, and the gain in chi square beyond which one is believed."""
+"""Blurs below that of the noise that are tried for a recording, and the gain in chi square that accepts one."""
 
 
 class HoleModelConfig(Config):
@@ -158,7 +158,7 @@ def _sides(around: _Surroundings, near: np.ndarray) -> tuple[float, float, np.nd
 class _Surroundings:
     """A detection and its neighbourhood. ``offset_m`` of the residual round about; ``sign`` and ``peak_m`` of the
     detection's own less that; ``reach_px``: half of the blur. ``origin_m``: the surface's point at (``u0``, ``v0``).
-    ``sharper_px``: less blur that the image may have, as its noise may be blurred by more than the scene."""
+    ``sharper_px``: smaller blurs to try, as noise may be blurred more than the scene."""
 
     patch: HolePatch
     own: np.ndarray
@@ -321,7 +321,7 @@ def _by_contour(measured: Measurement, around: _Surroundings, doubt: str) -> Mea
     v, u = (float((axis.mean() + 0.5) / CONTOUR_ZOOM - 0.5) for axis in np.nonzero(inside))
     area = inside.sum() / CONTOUR_ZOOM**2 * around.area_m2
     diameter_m = 2.0 * float(np.sqrt(area / np.pi))
-    if not hollow.any():  # a pixel that the edge cuts counts as inside by its cut's depth
+    if not hollow.any():  # a pixel at the rim exceeds half of `OPEN_M` though mostly outside
         diameter_m -= (1.0 - top_m / around.peak_m) * math.sqrt(around.area_m2)
     depth_m = np.nan if hollow.sum() > around.own.sum() else around.sign * around.peak_m
     note = doubt + "; from the contour at half depth, without standard errors"

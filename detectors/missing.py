@@ -37,8 +37,8 @@ SLOWEST_FALL = math.log(2.0)  # fall without simulated clusters to tell: each fu
 DISCS_PX, LOUD_SIGMAS = (1.5, 2.5, 3.5), 3.0
 """Radii of the discs in which missing pixels are counted, and scores beside which they are not taken for chance."""
 REACH_PX, APART = 2, 0.8
-"""A depth finding so near to pixels without return (half of a 5 x 5 window) is of the same damage, unless its centre is
-so many of its radii and two windows away: that of a disc beside them is 1 away, that of a disc's other half 0.6."""
+"""A depth finding within `REACH_PX` of pixels without return (half of a 5 x 5 window) is the same damage, unless its
+centre is `APART` of its radius and 2 `REACH_PX` away: 1 radius for a disc beside them, 0.6 for a disc's other half."""
 RING_PX = 4  # width of the ring of judged pixels that places the surface at a hole
 HIGHEST_SCORE = 37.0  # standard deviations; beyond it float64 knows no probability
 REASONS: dict[int, str] = {

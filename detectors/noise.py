@@ -14,8 +14,8 @@ REACH_FRAMES, REACH_WINDOW_PX, REACH_PIXELS, FARTHEST_LAG_PX = 6, 384, 5000, 30
 """Frames that are looked at, the side of the window about the middle of the valid pixels, and pixels that must be valid
 in two frames: the correlation of so many, of which 25 are alike, is known to 0.07."""
 LONE_LEVEL_PX, LONE_SIGMAS, LONE_MOST_PX = 21, 5.0, 7
-"""Side of the square whose mean is the level in a lone frame; deviations from it beyond which lies an edge; longest lag
-that is the noise's and not a pattern's or the surface's."""
+"""Side of the square of the local mean in a lone frame; deviations that mark an edge; longest lag that is taken for the
+noise's own, not a pattern's or the surface's."""
 LEAST_FRAMES, SCATTER_PX = 4, 7
 """Frames from which on their scatter tells noise, averaged over a square: known to 12 % from 49 x 3 differences."""
 SHARED = 0.1  # correlation below which pixels share nothing: a box of b pixels falls below it at lag b, up to 9 pixels
@@ -87,7 +87,7 @@ def rounding_floor(cloud: Cloud, mask: np.ndarray) -> float:
 
 def noise_reach_px(frames: Sequence[Frame], z_step_m: float) -> float:
     """Return the lag, in pixels, at which the noise of neighbours along rows and columns stops being alike: the median
-    over pairs of successive frames; of a lone frame beside its own level, which holds for white noise beyond the
+    over pairs of successive frames. A lone frame is judged by its deviations from its local mean, where they exceed the
     rounding to ``z_step_m``. 0 for unknown (no noise beyond the rounding, movement, or a bent surface in one frame)."""
     lags: list[int] = []
     lone = len(frames) == 1
@@ -101,7 +101,7 @@ def noise_reach_px(frames: Sequence[Frame], z_step_m: float) -> float:
         known = np.isfinite(difference)
         if lone:
             noise = _levelled(difference, known, LONE_LEVEL_PX)
-            if (sigma := sigma_of(noise[known])) < 0.5 * z_step_m:  # noise of .4 steps hides them, but for a hundredth
+            if (sigma := sigma_of(noise[known])) < 0.5 * z_step_m:  # steps correlate the rounding of quieter noise
                 continue
             known &= np.abs(noise) < LONE_SIGMAS * sigma
             noise = _levelled(difference, known, LONE_LEVEL_PX)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -235,6 +237,18 @@ def test_standard_errors_cover_the_truth(count: int) -> None:
     wider = np.sqrt(200 / count)
     assert np.all(np.abs(scores.mean(axis=0)) < 0.25 * wider)
     assert np.all(np.abs(scores.std(axis=0) - 1.02) < 0.2 * wider)
+
+
+@pytest.mark.parametrize(("reach_px", "low_mm", "high_mm"), [(5.0, 8.0, 10.5), (0.0, 0.0, 7.5)])
+def test_the_picture_of_a_recording_decides_that_it_is_sharper_than_its_noise(reach_px, low_mm, high_mm) -> None:
+    board = Board(9.0, 9.0, wall=0.0, blur=1, emitter_mm=(0.0, 0.0, 0.0))
+    cloud, evidence = board.seen(0.5, 3)
+    cloud = replace(
+        cloud, noise_reach_px=reach_px
+    )  # 0: no recording, so that the model's own blur of 5 pixels is taken
+    white = np.pad([[1.0]], 10)
+    m = measure_detection(cloud, evidence, strongest(cloud, evidence, 5.0), HoleModelConfig(), white)
+    assert low_mm * 1e-3 < m.model_diameter_m < high_mm * 1e-3
 
 
 def test_a_hole_lost_in_the_blur_falls_back_and_says_so() -> None:
