@@ -56,6 +56,17 @@ def unpictured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("harness.report.findings._save", lambda path, _: path.write_bytes(b""))
 
 
+@pytest.fixture
+def unsaved(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures are drawn but not written, which is most of a page's time, for tests that look at the words about them;
+    ``monkeypatch.undo()`` in one that looks at figures too."""
+
+    def save(_figure: object, target: object, **_how: object) -> None:
+        target.write_bytes(b"") if isinstance(target, Path) else target.write("<svg></svg>")  # type: ignore[attr-defined]
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", save)
+
+
 @pytest.fixture(scope="session")
 def tiny_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished sweep before the thesis' target, by worker processes, with tiny.yaml beside it; not to be changed."""

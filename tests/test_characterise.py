@@ -107,6 +107,7 @@ def figures_of(folder: Path) -> pd.DataFrame:
     return pd.read_csv(folder / "characteristics.csv")
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_an_empirical_camera_s_truth_is_found_again(truth, tmp_path, capsys):
     """Noise law, correlation, dropouts, jitter, jumps and pattern within 10 %, and a file that repeats them."""
     paths = [
@@ -151,6 +152,7 @@ def test_an_empirical_camera_s_truth_is_found_again(truth, tmp_path, capsys):
     assert "Measured and simulated" in page and "/tmp" not in re.sub(r"<pre>.*?</pre>", "", page, flags=re.DOTALL)
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_edges_and_a_single_distance_without_amplitude(truth, tmp_path, capsys):
     """The gap at a slanted step is found again; what one distance and no amplitude cannot tell is said first."""
     slopes = truth.nominal_lens.region_slopes(truth.nominal_lens.whole)
@@ -170,6 +172,7 @@ def test_edges_and_a_single_distance_without_amplitude(truth, tmp_path, capsys):
     assert rows.loc["gap at an edge", "ratio"] == pytest.approx(1.0, abs=0.15)
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_a_known_camera_s_gain_and_pattern_are_found_again(tmp_path, capsys):
     """A unit of the L515 with other numbers: its gain within 10 %."""
     data = YAML(typ="safe").load((Path(load_camera.__globals__["CAMERA_FOLDER"]) / "realsense_l515.yaml").read_text())

@@ -84,6 +84,21 @@ def test_two_units_or_units_that_differ_leave_the_claim_undecided():
     assert judged(varied).verdict == "undecided"
 
 
+def test_a_variation_by_another_camera_takes_no_units_away():
+    """A fourth camera file with one unit, as a variation that stands for one of the three."""
+    found = cameras({"azure_kinect_nfov": (3, 4), "kinect_v2": (4, 5), "realsense_l515": (4, 4)})
+    summary = summarise_holes(
+        pd.concat(
+            [found.holes.assign(**{UNIT: unit, "variant": found.holes["variant"] + f", {unit}"}) for unit in range(3)]
+        ),
+        AXES,
+    )
+    fourth = summary[(summary[UNIT] == 0) & (summary[AXES[0]] == "realsense_l515")]
+    both = pd.concat([summary, fourth.assign(**{AXES[0]: "realsense_l515_lines"})], ignore_index=True)
+    assert claim_c11(both, AXES) == claim_c11(summary, AXES)
+    assert claim_c11(both, AXES).verdict == "borne out"
+
+
 def test_not_judged_without_the_three_cameras_or_without_fifty_frames():
     found = cameras({"azure_kinect_nfov": (3, 4), "kinect_v2": (4, 5), "realsense_l515": (4, 4)})
     summary = summarise_holes(found.holes, AXES[:2])

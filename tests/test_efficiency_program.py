@@ -24,6 +24,7 @@ def results(study_out: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(run, tmp_path / "tiny" / run.name, dirs_exist_ok=True, ignore=lambda *_: [".lock"]))
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_detectors_stand_beside_the_ideal_observer(
     results: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -156,6 +156,7 @@ def test_interrupted_sweep_keeps_what_is_finished_and_says_how_to_go_on(finished
     assert journal.damaged == []
 
 
+@pytest.mark.slow
 def test_workers_end_with_a_driver_that_is_killed(finished, tmp_path):
     """SIGKILL to the driver alone, in the middle of its trials: soon no process of the sweep is left."""
     cut = tmp_path / "killed"

@@ -135,6 +135,7 @@ def test_every_fault_costs_its_own_job_only(cluster):
     assert {how.state for how in again.values()} == {"done"} and len(ended) == 120
 
 
+@pytest.mark.slow  # test_engine_processes has deaths without a cluster
 def test_a_node_killed_from_outside_costs_nothing(cluster, tmp_path):
     """SIGKILL to a dask worker in the middle of its jobs: they run on the other, and the nanny starts a new one."""
     jobs = [Job(f"slow {n}", "trials", note_node_and_sleep, (str(tmp_path / f"{n}"), 0.4)) for n in range(12)]
@@ -164,6 +165,7 @@ def test_a_node_of_several_processes_uses_them_all_each_in_one_thread_whatever_i
     assert len(used) > 1 and set(used.values()) == {1}, used
 
 
+@pytest.mark.slow
 def test_the_scheduler_gone_is_a_clear_message(tmp_path):
     with processes(tmp_path / "mortal") as mortal:
         mortal.worker("--no-nanny")
@@ -202,6 +204,7 @@ def test_a_worker_with_other_code_is_refused(tmp_path):
             pass
 
 
+@pytest.mark.slow
 def test_a_cluster_of_dask_jobqueue(tmp_path):
     pytest.importorskip("dask_jobqueue")
     local = {"cores": 1, "processes": 1, "memory": "1GB", "python": sys.executable}

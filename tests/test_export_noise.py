@@ -27,7 +27,14 @@ def statistics(frames: list[np.ndarray]) -> tuple[dict[str, float], float]:
     return told, float(np.isfinite(frames).mean())
 
 
-@pytest.mark.parametrize("name", ["azure_kinect_nfov", "kinect_v2", "realsense_l515"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("azure_kinect_nfov", marks=pytest.mark.slow),
+        "kinect_v2",
+        pytest.param("realsense_l515", marks=pytest.mark.slow),
+    ],
+)
 def test_the_table_has_the_statistics_of_the_full_model(name):
     """Deviation within 5 %, correlations within 0.05, near and far, bright and dark."""
     camera, table = load_camera(name), table_of(name)

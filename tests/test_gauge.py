@@ -136,6 +136,7 @@ def captured(folder: Path, truth: Gauge, hidden: tuple[int, ...] = ()) -> Path:
     return folder
 
 
+@pytest.mark.usefixtures("unsaved")
 @pytest.mark.usefixtures("unpictured")
 def test_a_capture_of_the_board_gives_hits_and_misses(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     truth = read_gauge(made / "gauge.json")

@@ -140,6 +140,7 @@ def recorded(folder: Path, frames: int = FRAMES) -> Path:
     return folder
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_the_program_states_a_limit_of_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     folder = recorded(tmp_path / "wall")
     out = tmp_path / "out"

@@ -116,8 +116,8 @@ def test_holes_that_show_a_backing_of_another_colour_are_no_marks(backing):
 @pytest.mark.parametrize(
     ("sigma_m", "samples", "turn_deg", "half_size"),
     [
-        pytest.param(5e-5, 1, 4.0, (0.02, 0.006), id="pixelation"),
-        pytest.param(5e-4, 1, 15.0, (0.008, 0.008), id="turned squares"),
+        pytest.param(5e-5, 1, 4.0, (0.02, 0.006), id="pixelation", marks=pytest.mark.slow),
+        pytest.param(5e-4, 1, 15.0, (0.008, 0.008), id="turned squares", marks=pytest.mark.slow),
         pytest.param(2e-3, 3, 4.0, (0.02, 0.006), id="mixed colours, depth noise"),
     ],
 )

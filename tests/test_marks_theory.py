@@ -54,7 +54,9 @@ def test_the_lattice_error_is_that_of_random_shifts(length, breadth, turn):
     np.testing.assert_allclose(np.diag(centroid_covariance_px2(polygon)), errors.var(axis=0), rtol=0.15)
 
 
-@pytest.mark.parametrize("turn", [0.0, 3.0, 10.0])
+@pytest.mark.parametrize(
+    "turn", [pytest.param(0.0, marks=pytest.mark.slow), 3.0, pytest.param(10.0, marks=pytest.mark.slow)]
+)
 def test_a_region_known_by_its_pixels_alone_states_its_error_within_a_factor(turn):
     rng = random_stream(2, "regions", turn)
     errors, stated = [], []

@@ -87,6 +87,7 @@ def test_the_same_input_gives_the_same_bytes(small):
     assert first == second
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_a_page_of_another_target_does_not_mention_the_thesis(small):
     page = perspectives_html(small, [], About(provenance(), YAML, "Several perspectives"))
     assert "thesis" not in page.lower()
@@ -106,6 +107,7 @@ def test_a_variation_stands_beside_its_set_up_though_its_frames_differ(page):
     assert "5 of 11 <small>7–11" in row
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_nothing_finished_is_said(found):
     empty = replace(found, **{name: getattr(found, name).iloc[:0] for name in ("holes", "runs", "probes")})
     page = perspectives_html(empty, [], About(provenance(), YAML, "T", True))
@@ -113,6 +115,7 @@ def test_nothing_finished_is_said(found):
     assert page.count("? undecided</td>") == 4
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_a_missing_set_up_leaves_a_dash(small):
     gone = name_of(2, "cpd", "fusion")
     names = ("holes", "runs", "probes")
@@ -122,6 +125,7 @@ def test_a_missing_set_up_leaves_a_dash(small):
     assert ">nan" not in page
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_the_report_has_a_page_for_each_map_that_turns(small, tmp_path):
     path = write_report(tmp_path, small, [*examples(), map_example(2)], provenance(), YAML, "T")
     files = sorted(file.name for file in tmp_path.iterdir())

@@ -37,6 +37,7 @@ def stated(folder: Path) -> dict[str, Any]:
 # ---- what it says ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_the_handbooks_hits_and_misses(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """MIL-HDBK-1823A example 3, logit on the size as it is: a50 .1156, a90 .1709, a90/95 .1974, deviance 77."""
     file = str(shared_data / "pod" / "example3_hitmiss.csv")
@@ -57,6 +58,7 @@ def test_the_handbooks_hits_and_misses(shared_data: Path, tmp_path: Path, capsys
     assert [row["model"] for row in said["models"] if row["chosen"]] == ["logit, size"]
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_the_handbooks_signals(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """MIL-HDBK-1823A example 1: a50 8.8, a90 12.69, a90/95 13.68 with the signal against ln size."""
     file = str(shared_data / "pod" / "example1_ahat.csv")
@@ -71,6 +73,7 @@ def test_the_handbooks_signals(shared_data: Path, tmp_path: Path, capsys: pytest
     assert "A flaw of 13.68 is found" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_without_a_choice_the_least_deviance_decides(tmp_path: Path) -> None:
     file = table(tmp_path / "a.csv", size=SIZES, hit=hits())
     assert main([str(file), "--hit", "hit", "--size", "size", "--out", str(tmp_path)]) == 0
@@ -80,6 +83,7 @@ def test_without_a_choice_the_least_deviance_decides(tmp_path: Path) -> None:
     assert said["a50"] < said["a90"] < said["a90_95"]["size"]
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_the_limit_is_the_largest_of_the_models_that_fit_about_as_well(tmp_path: Path) -> None:
     """The curve is the best model's, the limit that of all within 2 of its deviance; a model asked for is alone."""
     sizes = np.linspace(0.5, 10.0, 400)
@@ -95,6 +99,7 @@ def test_the_limit_is_the_largest_of_the_models_that_fit_about_as_well(tmp_path:
     assert stated(tmp_path)["a90_95"]["size"] == near[0]["a90_95"]["size"]
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_limits_that_hang_on_the_model_are_warned_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Twenty targets do not tell links apart."""
     few = table(tmp_path / "few.csv", size=SIZES[::3], hit=hits(SIZES[::3]))
@@ -106,6 +111,7 @@ def test_limits_that_hang_on_the_model_are_warned_of(tmp_path: Path, capsys: pyt
     assert "a90/95 differ" in (tmp_path / "pod.html").read_text()
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_repeats_are_not_targets(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Every target inspected five times, alike each time: the limit is that of the targets."""
     single = read_inspections(table(tmp_path / "one.csv", size=SIZES, hit=hits()), "size", ["hit"])
@@ -119,6 +125,7 @@ def test_repeats_are_not_targets(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert (said["inspections"], said["targets"]) == (300, 60)
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_what_is_not_demonstrated_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Detection that hardly grows with size supports no limit; exit code 0, no number anywhere."""
     sizes = np.arange(1.0, 21.0)
@@ -144,6 +151,7 @@ def test_the_band_reaches_90_percent_at_the_limit(tmp_path: Path, model: dict) -
     assert np.all(said.curve.pod(said.sizes) <= upper + 1e-9)
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_a_ceiling_that_the_data_ask_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A fifth of the targets is hidden and never found: the first line says so."""
     sizes = np.linspace(0.5, 12.0, 200)
@@ -163,6 +171,7 @@ def signals(sizes: np.ndarray) -> np.ndarray:
     return 100 * sizes + np.random.default_rng(7).normal(0, 80, len(sizes))
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_signals_measured_repeatedly(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The same signal four times over is one signal: same curve, same limit; and the wrong one beside it."""
     sizes = np.linspace(1, 10, 50)
@@ -185,6 +194,7 @@ def test_signals_measured_repeatedly(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert float(np.interp(0.9, once.band[0], once.sizes)) == pytest.approx(once.bound.value, rel=2e-3)
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_unflawed_sites_give_the_probability_of_a_false_positive(tmp_path: Path) -> None:
     """2,000 sites with noise of 150 +- 100 and a decision at 400, censored at 50: PFP = 1 - F(2.5) = 0.62 %."""
     noise = np.random.default_rng(3).normal(150, 100, 2000)
@@ -216,6 +226,7 @@ def test_mistakes_with_signals_are_explained(tmp_path: Path, capsys: pytest.Capt
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_small_studies_and_separation_are_noted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = table(tmp_path / "a.csv", size=np.arange(12), hit=(np.arange(12) > 5).astype(int))
     assert main([str(file), "--hit", "hit", "--size", "size", "--out", str(tmp_path)]) == 0
@@ -331,6 +342,7 @@ def test_a_mark_that_may_part_thousands_is_told(tmp_path: Path) -> None:
     assert read.notes == ("a: '1,251' was read as 1.251; write thousands without a mark if it is more",)
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_inspectors_in_columns_with_gaps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The handbook's layout: a row for each flaw, a column for each inspector; a flaw is one target."""
     first, second = hits(seed=4), hits(seed=5).astype(object)
@@ -345,6 +357,7 @@ def test_inspectors_in_columns_with_gaps(tmp_path: Path, capsys: pytest.CaptureF
     assert (stated(tmp_path)["inspections"], stated(tmp_path)["targets"]) == (118, 60)
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_a_sheet_of_excel_reads_as_its_csv(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     openpyxl = pytest.importorskip("openpyxl")
     book = openpyxl.Workbook()

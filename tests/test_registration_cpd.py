@@ -158,11 +158,13 @@ def test_a_loose_tolerance_stops_early_and_a_tight_one_runs_on():
     assert loose.converged and loose.iterations < 5 < tight.iterations
 
 
+@pytest.mark.slow
 def test_the_covariance_is_that_of_repeats():
     """120 repeats of 300 noisy points: the mean of d'C^-1 d over repeats is 6 for a true covariance.
 
-    The clouds' noise is independent from point to point, and each cube of 5 pitches holds one point, so the sandwich is
-    exact up to its own scatter; the limits are factors of 1.6 in variance, five standard errors of the mean or more.
+    The clouds' noise is independent from point to point, and each cube of 5 pitches holds one point. The covariance
+    may overstate the variances by a factor of 1.6 (it does so by 1.5), and may not understate them: the upper limit is
+    three standard errors of the mean above 6, so that half the covariance fails.
     """
     truth, noise = cloud(300), 0.001
     distances = []
@@ -181,7 +183,7 @@ def test_the_covariance_is_that_of_repeats():
             ]
         )
         distances.append(error @ np.linalg.solve(covariance, error))
-    assert 6 / 1.6 < np.mean(distances) < 6 * 1.6
+    assert 6 / 1.6 < np.mean(distances) < 6 + 3 * np.sqrt(12 / 120)
 
 
 def test_points_all_over_a_flat_disc_hold_no_turn():

@@ -130,6 +130,7 @@ def test_answer_counts_and_verdicts_are_told(page: str) -> None:
     assert "No trial failed." in page
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_a_page_of_another_target_does_not_mention_the_thesis(results: Tables, page: str) -> None:
     other = report_html(results, [example(50), example(1, noise_mm=0.9)], About(provenance(), YAML, "Dents"))
     assert "thesis" in page
@@ -139,6 +140,7 @@ def test_a_page_of_another_target_does_not_mention_the_thesis(results: Tables, p
     assert "If facts were otherwise" in other
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_a_claim_that_fails_is_shown_as_failing() -> None:
     world = World(rate=lambda hole, frames: float(hole >= 2), size_bias_mm=lambda diameter: 3.0)
     told = provenance() | {
@@ -153,6 +155,7 @@ def test_a_claim_that_fails_is_shown_as_failing() -> None:
     assert "a: 1" in page
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_little_data_still_make_a_page() -> None:
     few = tables(World(repeats=1, rate=lambda hole, frames: 0.0), frames=(1,))
     page = report_html(few, [], About({}, "", "Averaging", True))
@@ -178,6 +181,7 @@ def test_an_all_invalid_cloud_is_drawn() -> None:
     ET.fromstring(residual_figure([blank]))
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_the_file_is_written_whole_or_refused(tmp_path: Path) -> None:
     one = tables(frames=(50,))
     path = write_report(tmp_path / "new", one, [], provenance(), YAML, "Averaging")

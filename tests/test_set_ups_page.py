@@ -74,6 +74,7 @@ def test_the_same_input_gives_the_same_bytes(varied, page):
     assert set_ups_html(varied, clouds(), About(provenance(), YAML, "Three cameras", True)) == page
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_a_page_of_another_target_does_not_mention_the_thesis():
     other = set_ups_html(cameras(SMALLEST), [], About(provenance(), YAML, "Three cameras"))
     assert "thesis" not in other.lower() and "C11" not in other
@@ -113,6 +114,7 @@ def test_the_table_has_the_counts_of_both_numbers_of_frames():
     assert re.match(r"Kinect v2, distance 0.5 m +50 +8 of 11 4–11 +6.35$", lines[6])
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_failures_and_missing_set_ups_are_told():
     found = cameras(SMALLEST)
     gone = set_up_name("kinect_v2", 1.0)
@@ -140,6 +142,7 @@ def test_effects_have_a_figure_and_a_table():
     assert "all effects together move the 50 % size by +4.76 mm" in page
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_the_page_of_several_set_ups_is_chosen_by_the_tables(tmp_path):
     several = write_report(tmp_path / "a", cameras(SMALLEST), [], provenance(), YAML, "T").read_text()
     assert "Holes found" in headings(several)

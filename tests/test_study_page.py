@@ -172,6 +172,7 @@ def test_false_calls_stand_beside_the_wanted_rate(page: str) -> None:
     assert "shuffled positions" in text
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_a_threshold_that_noise_cannot_set_is_warned_of_first() -> None:
     """In the first lines of the page and of the terminal, with the place; not at ten deviations, not where given."""
     result = judged(small(SetUp()))
@@ -199,6 +200,7 @@ def test_a_threshold_that_noise_cannot_set_is_warned_of_first() -> None:
     assert "What set each threshold" not in html(told_nothing)
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_an_axis_may_hold_mappings() -> None:
     """Without a limit too, which is told above the figure at the value's place."""
     shapes = ({"kind": "flat"}, {"kind": "cylinder", "radius_mm": 300.0})
@@ -221,6 +223,7 @@ def test_validity_is_the_results_own(whole: StudyResult, page: str) -> None:
     assert '<section class="sheet">' in page
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_where_nothing_is_found_the_page_says_so() -> None:
     page = html(judged(small(SetUp(a50_mm=60.0))))
     left_out = ("Limits against what was varied", "Size and depth", "Examples")
@@ -229,6 +232,7 @@ def test_where_nothing_is_found_the_page_says_so() -> None:
     assert "nan" not in words(page).split()
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_where_everything_is_found_the_bound_needs_no_curve() -> None:
     result = judged(small(SetUp(a50_mm=-60.0)))
     page = html(result)
@@ -246,6 +250,7 @@ def test_the_depths_that_are_drawn_stand_in_their_file(whole: StudyResult) -> No
             np.testing.assert_array_equal(rows[name], getattr(one.surface, column))
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_depths_without_a_surface_say_why() -> None:
     page = html(judged(small(SetUp(a50_mm=60.0), depths_mm=(2.0, 10.0))))
     assert "No surface: every damage fared alike" in section(page, "Size and depth")
@@ -258,6 +263,7 @@ def beyond() -> StudyResult:
     return judged(small(*set_ups, depths_mm=(2.0, 10.0)))
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_no_number_on_the_page_lies_beyond_the_sizes_inspected(beyond: StudyResult) -> None:
     page = html(beyond, (example(where="at"),))
     largest = beyond.limits[0].largest_mm
@@ -294,6 +300,7 @@ def test_one_set_up_has_no_axis_and_one_depth_no_surface(single_page: str) -> No
     assert "Size and depth" not in headings(page)
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_given_thresholds_and_no_hole_free_boards() -> None:
     study = small(SetUp())
     record: StudyRecord = study_record(study)

@@ -304,7 +304,7 @@ def claim_c11(summary: pd.DataFrame, axes: Sequence[str]) -> Verdict | None:
     cameras. At a place a camera's counts are those of all its units, and of all variations of it there."""
     if CAMERA not in axes or not {BEST, *OTHERS} <= set(summary[CAMERA]):
         return None
-    rows = summary[summary["frames"] == MANY]
+    rows = summary[(summary["frames"] == MANY) & summary[CAMERA].isin((BEST, *OTHERS))]
     if rows.empty:
         return verdict_of("C11", "undecided", f"Not judged: no trial has {MANY} frames.")
     others = [path for path in axes if path not in (CAMERA, CAMERA_UNIT)]
