@@ -54,7 +54,7 @@ lock: .venv/.ready
 .venv/.installed: requirements.lock pyproject.toml
 	@echo "Setting up .venv: install the locked packages (1 of 3, the longest part) ..."
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile --require-hashes -r requirements.lock
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile --no-deps --require-hashes -r requirements.lock
 	@echo "Setting up .venv: install tofpod (2 of 3) ..."
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
 	touch $@
