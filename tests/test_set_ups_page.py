@@ -118,10 +118,10 @@ def test_failures_and_missing_set_ups_are_told():
     gone = set_up_name("kinect_v2", 1.0)
     parts = ("holes", "runs", "probes", "noise")
     found = replace(found, **{name: getattr(found, name)[getattr(found, name)["variant"] != gone] for name in parts})
-    said = provenance() | {"failures": [{"what": "damaged-00001", "why": "ValueError: empty crop"}]}
+    said = provenance() | {"failures": [{"what": "damaged-00001", "state": "failed", "why": "ValueError: empty crop"}]}
     kept = [cloud for cloud in clouds() if cloud.variant != gone]
     page = set_ups_html(found, kept, About(said, YAML, "Three cameras"))
-    assert "damaged-00001: ValueError: empty crop" in page
+    assert "damaged-00001: failed: ValueError: empty crop" in page
     assert gone not in page
     assert ">nan" not in page
 
