@@ -81,7 +81,7 @@ def test_a_page_of_another_target_does_not_mention_the_thesis():
 
 def test_the_answer_says_what_each_camera_finds_and_the_verdict(page):
     answer = re.search(r'<p class="answer">(.*?)</p>', page).group(1)
-    said = "with 50 averaged frames: Azure Kinect DK NFOV unbinned 9, 8; Kinect v2 8, 7; RealSense L515 XGA 8, 8."
+    said = "with 50 averaged frames: Azure Kinect DK NFOV unbinned: 9, 8; Kinect v2: 8, 7; RealSense L515 XGA: 8, 8."
     assert f"Found of 11 holes at 0.5 m, 1 m {said}" in answer
     # one unit of each camera
     assert "is undecided" in answer
