@@ -8,6 +8,7 @@ from dataclasses import replace
 from html import unescape
 
 import numpy as np
+import pandas as pd
 import pytest
 from synthetic_tables import CAMERAS, World, cameras, example, joined, placed, provenance, set_up_name, tables
 from test_limits import switched
@@ -48,6 +49,15 @@ def page(varied):
 
 def headings(page: str) -> list[str]:
     return [unescape(text) for text in re.findall(r"<h2>(.*?)</h2>", page)]
+
+
+def test_rows_name_their_axes_beside_a_variation_that_leaves_them_empty():
+    found = {"source.camera.name": ["kinect_v2"] * 4 + [None], "source.camera.unit_seed": [1, 1, 2, 2, None]}
+    found |= {"source.target.distance_m": [0.5, 1.0, 0.5, 1.0, None], "is_variation": [False] * 4 + [True]}
+    axes = pd.DataFrame({"path": list(found)[:3], "name": ["camera", "unit seed", "distance"], "unit": ["", "", "m"]})
+    layout = Layout.of(replace(tables(World()), variants=pd.DataFrame({"variant": [*"abcde"], **found}), axes=axes))
+    assert layout.rows == {"Kinect v2, unit seed 1": ["a", "b"], "Kinect v2, unit seed 2": ["c", "d"]}
+    assert layout.columns == ("0.5 m", "1 m")
 
 
 def test_every_section_is_there_and_nothing_comes_from_outside(page):

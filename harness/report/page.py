@@ -183,7 +183,8 @@ class Layout:
         paths = [str(path) for path in tables.axes["path"]]
         values = list(dict.fromkeys(set_ups[paths[-1]])) if len(paths) > 1 else []
         rows: dict[str, list[str]] = {}
-        held = [set_ups[path].convert_dtypes() for path in paths[:-1]]  # a column with a gap has no whole numbers
+        # a column that variations leave empty has no whole numbers
+        held = [set_ups[path].convert_dtypes().tolist() for path in paths[:-1]]
         for variant, *places in zip(set_ups["variant"], *held, strict=True):
             said = map("{}={}".format, paths, map(canonical_json, places))
             rows.setdefault(", ".join(map(in_words, said)), []).append(str(variant))
