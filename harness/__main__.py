@@ -88,12 +88,16 @@ def _told(name: str, rest: list[str]) -> int:
 
 
 def _completion() -> str:
-    """Return a script that completes programs, options and experiments; all else is a file's name."""
+    """Return a script that completes programs, options, experiments and cameras; all else is a file's name."""
+    from scenes.sensor.camera import camera_names
+
     experiments, cases = sorted(path.stem for path in shipped("experiments").glob("*.yaml")), []
     for program in programs():
         actions = importlib.import_module(f"harness.{program}").main.parser()._actions
         words = [option for action in actions for option in action.option_strings]
-        words += experiments if any(action.dest == "experiment" for action in actions) else []
+        takes = {action.dest for action in actions}
+        words += experiments if "experiment" in takes else []
+        words += camera_names() if "camera" in takes else []
         cases.append(f'    {program}) COMPREPLY=($(compgen -W "{" ".join(words)}" -- "$word"));;')
     return COMPLETION.format(programs=" ".join(programs()), options="\n".join(cases))
 

@@ -81,9 +81,8 @@ def _read(path: Path) -> tuple[Any, dict[str, Any]]:
     import pyarrow.parquet as pq
 
     from harness.evaluation import atlas
-    from harness.tables.limits import LIMITS
 
-    file = path / LIMITS.files[1] if path.is_dir() else path
+    file = path / "limits.parquet" if path.is_dir() else path
     legal = "limits.parquet of a study over cameras and distances, as experiments/atlas.yaml makes it"
     if not file.is_file():
         raise UserError(f"{file}: there is no such table of limits", legal=legal, fix="tofpod sweep atlas computes it")

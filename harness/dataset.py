@@ -147,6 +147,7 @@ def _finish(out: Path, samples: list[Sample], about: dict[str, Any]) -> None:
     from harness.engine.boards import INDEX, INSET_PX, SPLITS, read_truth
     from harness.exchange import coco_data
     from harness.report.blocks import template
+    from harness.vocabulary.path_names import camera_title
 
     truths = {sample.name: read_truth(out, sample.name) for sample in samples}
     kinds = sorted({damage["kind"] for truth in truths.values() for damage in truth["damages"]})
@@ -156,7 +157,8 @@ def _finish(out: Path, samples: list[Sample], about: dict[str, Any]) -> None:
             pictures = [truths[each.name] for each in samples if (each.category, each.split) == (category, split)]
             text = json.dumps(coco_data(pictures, kinds, info), separators=(",", ":"))
             write_text(out / "coco" / f"{category}_{split}.json", text + "\n")
-    write_text(out / "README.md", template("dataset_card.md").render(about=about, inset=INSET_PX))
+    card = template("dataset_card.md").render(about=about, inset=INSET_PX, title=camera_title)
+    write_text(out / "README.md", card)
     write_text(out / INDEX, json.dumps({**about, "samples": [*truths]}, indent=1) + "\n")
 
 

@@ -54,7 +54,7 @@ def test_the_handbooks_hits_and_misses(shared_data: Path, tmp_path: Path, capsys
     deviances = [row["deviance"] for row in said["models"]]
     assert deviances == sorted(deviances)
     assert len(deviances) == 8
-    assert "0.1974 inch" in printed
+    assert "A flaw of 0.20 inch is found" in printed
     assert [row["model"] for row in said["models"] if row["chosen"]] == ["logit, size"]
 
 
@@ -70,7 +70,7 @@ def test_the_handbooks_signals(shared_data: Path, tmp_path: Path, capsys: pytest
     assert said["a90"] == pytest.approx(12.69, abs=0.005)
     assert said["a90_95"]["size"] == pytest.approx(13.68, abs=0.005)
     assert said["numbers"]["mu"] == pytest.approx(2.175, abs=5e-4)
-    assert "A flaw of 13.68 is found" in capsys.readouterr().out
+    assert "A flaw of 14 is found" in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("unsaved")

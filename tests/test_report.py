@@ -143,16 +143,15 @@ def test_a_page_of_another_target_does_not_mention_the_thesis(results: Tables, p
 @pytest.mark.usefixtures("unsaved")
 def test_a_claim_that_fails_is_shown_as_failing() -> None:
     world = World(rate=lambda hole, frames: float(hole >= 2), size_bias_mm=lambda diameter: 3.0)
-    told = provenance() | {
-        "failures": ["repeat 7 ended: <out of memory>", {"what": "repeat 3", "why": "boom"}, {"a": 1}]
-    }
+    failures = [{"what": "repeat 7", "state": "crashed", "why": "<out of memory>"}]
+    failures += [{"what": f"repeat {number}", "state": "failed", "why": "boom"} for number in range(5)]
+    told = provenance() | {"failures": failures}
     page = report_html(tables(world, frames=(1, 50)), [example(50, "cylinder")], About(told, YAML, "Averaging", True))
     assert page.count("✗ not borne out") >= 4
     assert "More than the thesis: 2–3" in page
-    assert "3 parts of the experiment failed" in page
-    assert "repeat 7 ended: &lt;out of memory&gt;" in page
-    assert "repeat 3: boom" in page
-    assert "a: 1" in page
+    assert "6 parts of the experiment failed" in page
+    assert "repeat 7: crashed: &lt;out of memory&gt;" in page
+    assert "repeat 0, repeat 1, repeat 2 and 2 others: failed: boom" in page
 
 
 @pytest.mark.usefixtures("unsaved")

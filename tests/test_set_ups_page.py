@@ -8,6 +8,7 @@ from dataclasses import replace
 from html import unescape
 
 import numpy as np
+import pandas as pd
 import pytest
 from synthetic_tables import CAMERAS, World, cameras, example, joined, placed, provenance, set_up_name, tables
 from test_limits import switched
@@ -50,6 +51,15 @@ def headings(page: str) -> list[str]:
     return [unescape(text) for text in re.findall(r"<h2>(.*?)</h2>", page)]
 
 
+def test_rows_name_their_axes_beside_a_variation_that_leaves_them_empty():
+    found = {"source.camera.name": ["kinect_v2"] * 4 + [None], "source.camera.unit_seed": [1, 1, 2, 2, None]}
+    found |= {"source.target.distance_m": [0.5, 1.0, 0.5, 1.0, None], "is_variation": [False] * 4 + [True]}
+    axes = pd.DataFrame({"path": list(found)[:3], "name": ["camera", "unit seed", "distance"], "unit": ["", "", "m"]})
+    layout = Layout.of(replace(tables(World()), variants=pd.DataFrame({"variant": [*"abcde"], **found}), axes=axes))
+    assert layout.rows == {"Kinect v2, unit seed 1": ["a", "b"], "Kinect v2, unit seed 2": ["c", "d"]}
+    assert layout.columns == ("0.5 m", "1 m")
+
+
 def test_every_section_is_there_and_nothing_comes_from_outside(page):
     assert headings(page) == [
         "Holes found",
@@ -82,7 +92,7 @@ def test_a_page_of_another_target_does_not_mention_the_thesis():
 
 def test_the_answer_says_what_each_camera_finds_and_the_verdict(page):
     answer = re.search(r'<p class="answer">(.*?)</p>', page).group(1)
-    said = "with 50 averaged frames: Azure Kinect DK NFOV unbinned 9, 8; Kinect v2 8, 7; RealSense L515 XGA 8, 8."
+    said = "with 50 averaged frames: Azure Kinect DK NFOV unbinned: 9, 8; Kinect v2: 8, 7; RealSense L515 XGA: 8, 8."
     assert f"Found of 11 holes at 0.5 m, 1 m {said}" in answer
     # one unit of each camera
     assert "is undecided" in answer
@@ -120,10 +130,10 @@ def test_failures_and_missing_set_ups_are_told():
     gone = set_up_name("kinect_v2", 1.0)
     parts = ("holes", "runs", "probes", "noise")
     found = replace(found, **{name: getattr(found, name)[getattr(found, name)["variant"] != gone] for name in parts})
-    said = provenance() | {"failures": [{"what": "damaged-00001", "why": "ValueError: empty crop"}]}
+    said = provenance() | {"failures": [{"what": "damaged-00001", "state": "failed", "why": "ValueError: empty crop"}]}
     kept = [cloud for cloud in clouds() if cloud.variant != gone]
     page = set_ups_html(found, kept, About(said, YAML, "Three cameras"))
-    assert "damaged-00001: ValueError: empty crop" in page
+    assert "damaged-00001: failed: ValueError: empty crop" in page
     assert gone not in page
     assert ">nan" not in page
 

@@ -24,7 +24,7 @@ PROVENANCE = {
     "dirty": False,
     "seed": 3,
     "seconds": {"render": 12.0, "trials": 30.0},
-    "failures": ["board 3 <&> fell over"],
+    "failures": [{"what": "board 3", "state": "failed", "why": "<&> fell over"}],
 }
 YAML = "name: limits # <few> & many\n"
 SECTIONS = [
@@ -142,7 +142,7 @@ def test_every_figure_has_words_for_those_who_cannot_see(structure: Structure, w
 def test_the_users_words_are_escaped(page: str) -> None:
     assert "<h1>Limits of &lt;cameras&gt;</h1>" in page
     assert "depth &lt;near&gt;, 1\u00a0frame" in page
-    assert "board 3 &lt;&amp;&gt; fell over" in page
+    assert "board 3: failed: &lt;&amp;&gt; fell over" in page
     assert "&lt;few&gt; &amp; many" in page
     assert "<near>" not in page
     assert "<few>" not in page

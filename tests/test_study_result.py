@@ -104,7 +104,7 @@ class TestValidity:
     def test_what_was_inspected_and_counts_as_a_hit(self, result):
         seen = section(result, "What was inspected")
         assert "128 damages on 16 boards, 1 to 14 mm in diameter" in seen
-        assert "each inspected 2 times with new noise" in seen and "capture.frames: 1, 10." in seen
+        assert "each inspected 2 times with new noise" in seen and "Varied: frames 1; frames 10." in seen
         assert "within 15 mm" in section(result, "What counts as a hit")
 
     def test_departures_are_those_of_this_study(self, result):

@@ -55,6 +55,7 @@ def test_completion_is_a_script_that_knows_programs_and_options(capsys):
         ("sw", 1, "sweep"),
         ("sweep --ca", 2, "--calibration --cache-limit"),
         ("sweep aver", 2, "averaging"),
+        ("ask --camera kinect_v2_", 3, "kinect_v2_libfreenect2"),
     ):
         ran = subprocess.run(
             ["bash", "-c", script + ask.format(words, place)], capture_output=True, text=True, check=True

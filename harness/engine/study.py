@@ -356,5 +356,5 @@ def without_limit(
         why = Counter([*causes, "its trials did not end"]).most_common(1)[0][0]
         if own and all(one.state == "failed" and not one.is_bug for one in own):
             why = f"the camera sees nothing of the board here that could be judged ({why})"
-        said.setdefault(why, []).append(point.label)
+        said.setdefault(why, []).append(in_words(point.label))
     return [f"no limit for {'; '.join(labels)}: {why}" for why, labels in said.items()]

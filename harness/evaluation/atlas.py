@@ -13,9 +13,9 @@ from itertools import combinations
 
 import numpy as np
 import pandas as pd
-from scipy import stats
+from scipy import special
 
-from harness.evaluation.intervals import CONFIDENCE
+from harness.evaluation.intervals import UPPER
 
 CAMERA, DETECTOR, DAMAGE = "source.camera.name", "detector.name", "source.target.damage"
 AXES = {
@@ -90,7 +90,7 @@ class LimitSurface:
         row = _rows(_scaled(wanted[None], list(self.grid.values())), self.terms)[0]
         middle = float(row @ self.coefficients)
         spread = np.hypot(np.sqrt(row @ self.covariance @ row), self.error)
-        half = float(stats.t.ppf(0.5 + CONFIDENCE / 2, self.degrees) * spread)
+        half = float(special.stdtrit(self.degrees, UPPER) * spread)
         a90, low, high = (float(np.exp(middle + end)) for end in (0.0, -half, half))
         return Answer(a90, low, high, largest_mm)
 
@@ -125,7 +125,7 @@ def _surface(camera: str, kind: str, detector: str, rows: pd.DataFrame, axes: Se
     known = np.isfinite(a90) & (a90 <= largest) & ~rows["is_at_most"].to_numpy(bool)
     beyond = (a90 > largest) | (rows["hits"].to_numpy() == 0)
     with np.errstate(all="ignore"):
-        variance = (np.log(high / low) / (2 * stats.norm.ppf(0.5 + CONFIDENCE / 2))) ** 2
+        variance = (np.log(high / low) / (2 * special.ndtri(UPPER))) ** 2
     sure = np.isfinite(variance) & (low > 0) & (variance < UNKNOWN_VARIANCE)
     variance = np.where(sure, np.maximum(variance, 1e-4), UNKNOWN_VARIANCE)
     scaled = _scaled(nodes, list(grid.values()))

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import stats
+from scipy import special
 
 from harness.vocabulary.errors import UserError
 
@@ -57,7 +57,7 @@ def wilson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray, np.ndar
     """Wilson's score interval of a proportion, element by element: (low, high), NaN where ``trials`` is 0. Coverage is
     near nominal on average over the proportion; `clopper_pearson` is never below nominal and wider."""
     k, n = np.broadcast_arrays(np.asarray(successes, float), np.asarray(trials, float))
-    z2 = stats.norm.ppf(UPPER) ** 2
+    z2 = special.ndtri(UPPER) ** 2
     with np.errstate(invalid="ignore", divide="ignore"):
         centre = (k + z2 / 2) / (n + z2)
         half = np.sqrt(z2) / (n + z2) * np.sqrt(k * (n - k) / n + z2 / 4)
@@ -69,16 +69,16 @@ def wilson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray, np.ndar
 def clopper_pearson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Clopper and Pearson's exact interval of a proportion, element by element; NaN where ``trials`` is 0."""
     k, n = np.broadcast_arrays(np.asarray(successes, float), np.asarray(trials, float))
-    low = np.where(k == 0, 0.0, stats.beta.ppf(1 - UPPER, k, n - k + 1))
-    high = np.where(k == n, 1.0, stats.beta.ppf(UPPER, k + 1, n - k))
+    low = np.where(k == 0, 0.0, special.betaincinv(k, n - k + 1, 1 - UPPER))
+    high = np.where(k == n, 1.0, special.betaincinv(k + 1, n - k, UPPER))
     return np.where(n > 0, low, np.nan), np.where(n > 0, high, np.nan)
 
 
 def poisson_rate(count: ArrayLike, exposure: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Garwood's exact interval of a Poisson rate, ``count`` events in ``exposure`` (runs, areas), NaN where 0."""
     k, time = np.broadcast_arrays(np.asarray(count, float), np.asarray(exposure, float))
-    low = np.where(k == 0, 0.0, stats.chi2.ppf(1 - UPPER, 2 * k) / 2)
-    high = stats.chi2.ppf(UPPER, 2 * k + 2) / 2
+    low = np.where(k == 0, 0.0, special.gammaincinv(k, 1 - UPPER))
+    high = special.gammaincinv(k + 1, UPPER)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(time > 0, low / time, np.nan), np.where(time > 0, high / time, np.nan)
 
@@ -87,12 +87,14 @@ def mean_t(mean: ArrayLike, std: ArrayLike, n: ArrayLike) -> tuple[np.ndarray, n
     """Student's interval from a sample's mean, standard deviation (n - 1) and size; NaN below two values."""
     m, s, k = np.broadcast_arrays(np.asarray(mean, float), np.asarray(std, float), np.asarray(n, float))
     size = np.where(k >= 2, k, np.nan)
-    half = stats.t.ppf(UPPER, size - 1) * s / np.sqrt(size)
+    half = special.stdtrit(size - 1, UPPER) * s / np.sqrt(size)
     return m - half, m + half
 
 
 def mean_difference(first: ArrayLike, second: ArrayLike) -> Interval:
     """Welch's interval of mean(first) - mean(second); a point where neither varies, unknown below two values each."""
+    from scipy import stats
+
     a, b = np.asarray(first, float), np.asarray(second, float)
     if min(len(a), len(b)) < 2:
         return UNKNOWN
@@ -111,7 +113,7 @@ def standardised_bias(bias: float, std: float, n: int) -> Interval:
         ratio = 0.0 if bias == 0 else float(np.copysign(np.inf, bias))
         return Interval(ratio, ratio)
     ratio = bias / std
-    half = float(stats.norm.ppf(UPPER) * np.sqrt(1 / n + ratio**2 / (2 * n)))
+    half = float(special.ndtri(UPPER) * np.sqrt(1 / n + ratio**2 / (2 * n)))
     return Interval(ratio - half, ratio + half)
 
 
@@ -185,11 +187,11 @@ def threshold_for_rate(
     # The margin is for rounding where (n + 1) * wanted is a whole number.
     k = min(int(np.floor((n + 1) * wanted * (1 + 1e-12))) - 1, n - 1)
     if k < 0:
-        said = f"{n} hole-free runs of {area_m2:.4g} m² are too few for a rate of {rate_per_m2:g} per m² of false calls"
+        said = f"{n} hole-free runs of {area_m2:.2g} m² are too few for a rate of {rate_per_m2:g} per m² of false calls"
         fix = "simulate more hole-free boards, or ask for a higher rate"
         raise UserError(said, legal=f"at least {int(np.ceil(1 / wanted * (1 - 1e-12))) - 1} runs", fix=fix)
     value = float(np.sort(scores)[n - 1 - k])
     above = int(np.sum(scores > value))
-    bound = float(stats.beta.ppf(confidence, above + 1, n - above))
+    bound = float(special.betaincinv(above + 1, n - above, confidence))
     rate, upper = -np.log1p(-np.array([(above + 1) / (n + 1), bound])) / area_m2
     return Threshold(value, float(rate), float(upper), confidence, n, above)

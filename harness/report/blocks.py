@@ -30,6 +30,7 @@ SHOWN_FIRST = (*("commit", "dirty", "seed", "started", "machine", "mitsuba_varia
 MOST_VALUES = 81
 """Points of a line whose values a pointer can read."""
 SHOWN_APART = ("command", "seconds", "failures")
+NAMED = 3  # Trials of one failure that are named, at most
 
 
 def template(name: str, folder: Path | None = None) -> Template:
@@ -108,13 +109,14 @@ def command_of(command: str) -> list[Markup]:
 
 def closing(provenance: Mapping[str, Any], experiment_yaml_text: str, left_out: str = "") -> list[Markup]:
     """The sections of every page of a sweep; ``left_out``: a sentence on frames that were left out of averages."""
-    failures = [
-        f"{each['what']}: {each['why']}" if isinstance(each, Mapping) and set(each) == {"what", "why"} else plain(each)
-        for each in provenance.get("failures", ())
-    ]
-    missing = f"{many(len(failures), 'part')} of the experiment failed: not in any number above."
-    parts = [heading("Failures"), paragraph(missing if failures else "No trial failed.")]
-    parts += [tag("p", text, kind="fail") for text in failures]
+    said: dict[str, list[str]] = {}
+    for each in provenance.get("failures", ()):
+        said.setdefault(f"{each['state']}: {each['why']}", []).append(each["what"])
+    missing = f"{many(sum(map(len, said.values())), 'part')} of the experiment failed: not in any number above."
+    parts = [heading("Failures"), paragraph(missing if said else "No trial failed.")]
+    for why, parts_of in said.items():
+        others = f" and {len(parts_of) - NAMED} others" if len(parts_of) > NAMED else ""
+        parts.append(tag("p", f"{', '.join(parts_of[:NAMED])}{others}: {why}", kind="fail"))
     parts += [paragraph(left_out)] if left_out else []
     seconds = dict(provenance.get("seconds", {}))
     rows = [(stage, f"{float(value):.1f}") for stage, value in seconds.items()]

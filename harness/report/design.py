@@ -54,7 +54,7 @@ class StudyDesign:
 
     def text(self, size: float) -> str:
         """A size with its unit."""
-        return f"{size:.4g}" + (f" {self.unit}" if self.unit else "") if np.isfinite(size) else "no size at all"
+        return f"{size:.3g}" + (f" {self.unit}" if self.unit else "") if np.isfinite(size) else "no size at all"
 
 
 def design_html(design: StudyDesign, command: str) -> str:
@@ -111,7 +111,7 @@ def guess_text(design: StudyDesign) -> str:
 
 
 def _size(value: float) -> str:
-    return f"{value:#.4g}".rstrip(".") if np.isfinite(value) else "none"
+    return f"{value:#.3g}".rstrip(".") if np.isfinite(value) else "none"
 
 
 PLANS = Table(

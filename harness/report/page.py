@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,12 +28,14 @@ from harness.thesis.claims import Verdict
 from harness.thesis.inference import borne_out_if
 from harness.vocabulary.files import write_text
 from harness.vocabulary.path_names import in_words
+from harness.vocabulary.seeds import canonical_json
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
 GUIDE = "#cfd6dd"
+MOST_ROWS = 4  # Rows of set-ups that the answer names one by one
 
 
 def rates_figure(main: pd.DataFrame) -> str:
@@ -61,15 +64,20 @@ def limits_figure(compared: pd.DataFrame, layout: Layout, frames: Sequence[int])
         top = 1.15 * float(np.nanmax([*compared["limit_mm"], 1.0]))
         for axes, n in zip(panels, frames, strict=True):
             limits = compared[compared["frames"] == n].set_index("variant")["limit_mm"]
-            for (title, variants), marker, colour in zip(layout.rows.items(), MARKERS, COLOURS, strict=False):
+            styles = product(("-", "--"), zip(MARKERS, COLOURS, strict=True))
+            for (title, variants), (line, (marker, colour)) in zip(layout.rows.items(), styles, strict=False):
                 values = [float(limits.get(variant, np.nan)) for variant in variants]
-                axes.plot(layout.column_values, values, marker=marker, ms=5, color=colour, label=title, alpha=0.9)
+                axes.plot(layout.column_values, values, line, marker=marker, ms=5, color=colour, label=title, alpha=0.9)
             axes.set_xticks(layout.column_values, [f"{value:g}" for value in layout.column_values])
             axes.set(ylim=(0, top), ylabel="smallest diameter found (mm)", xlabel=layout.column_name)
             axes.set_title(many(n, "frame"))
-        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(layout.rows))
+        columns = int(13 * width_in / (8 + max(map(len, layout.rows))))  # some 13 letters an inch
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=max(columns, 1))
 
-    return blocks.svg("limits", (1 + 3.2 * len(frames), 3.6), "Smallest diameter found by each set-up.", draw)
+    width_in = 1 + 3.2 * len(frames)
+    return blocks.svg(
+        "limits", (width_in, 3.2 + 0.1 * len(layout.rows)), "Smallest diameter found by each set-up.", draw
+    )
 
 
 def noise_figure(noise: pd.DataFrame) -> str:
@@ -175,9 +183,11 @@ class Layout:
         paths = [str(path) for path in tables.axes["path"]]
         values = list(dict.fromkeys(set_ups[paths[-1]])) if len(paths) > 1 else []
         rows: dict[str, list[str]] = {}
-        for _, row in set_ups.iterrows():
-            title = ", ".join(axis_value(path, row[path]) for path in paths[:-1])
-            rows.setdefault(title, []).append(str(row["variant"]))
+        # a column that variations leave empty has no whole numbers
+        held = [set_ups[path].convert_dtypes().tolist() for path in paths[:-1]]
+        for variant, *places in zip(set_ups["variant"], *held, strict=True):
+            said = map("{}={}".format, paths, map(canonical_json, places))
+            rows.setdefault(", ".join(map(in_words, said)), []).append(str(variant))
         if any(len(names) != len(values) for names in rows.values()):  # set-ups drawn at random fill no grid
             return Layout({in_words(str(name)): [str(name)] for name in set_ups["variant"]})
         numbers = tuple(float(v) for v in values) if all(isinstance(v, int | float) for v in values) else ()
@@ -195,7 +205,7 @@ def set_ups_html(
     verdict = next(iter(verdicts_of(found)), None)
     layout, frames = Layout.of(tables), sections.shown_frames(compared)
     figures: dict[str, str] = {}
-    if len(compared) and layout.column_values and len(layout.rows) <= len(COLOURS):
+    if len(compared) and layout.column_values and len(layout.rows) <= 2 * len(COLOURS):
         figures["limits"] = limits_figure(compared, layout, frames)
     figures |= {} if costs.empty else {"effects": effects_figure(costs)}
     shown = [row for row in sections.records(compared) if row["frames"] in frames]
@@ -211,6 +221,7 @@ def set_ups_html(
         rule=sections.rule_note(int(compared["repeats"].max()) if len(compared) else 0, LIMIT_RULE, rule),
         posterior=blocks.joined(posterior_section(posterior)) if posterior is not None else "",
         found=sections.set_ups_grid(compared).html(),
+        rows=len(shown),
         costs="" if costs.empty else _costs_grid(costs).html(),
         errors=SET_UPS.grid(shown, only=("set-up", "frames", *ERRORS.values())).html(),
         cameras=SET_UPS.grid(shown, only=CAMERA).html(),
@@ -227,8 +238,11 @@ def set_ups_answer(compared: pd.DataFrame, layout: Layout, costs: pd.DataFrame, 
     frames = sections.shown_frames(compared)
     many_frames = compared[compared["frames"] == frames[-1]]
     found = {row["variant"]: len(row["found"]) for row in sections.records(many_frames)}
-    rows = [f"{row} {', '.join(str(found.get(name, '–')) for name in names)}" for row, names in layout.rows.items()]
+    rows = [f"{row}: {', '.join(str(found.get(name, '–')) for name in names)}" for row, names in layout.rows.items()]
     where = f" at {', '.join(layout.columns)}" if layout.columns else ""
+    if len(rows) > MOST_ROWS:
+        ends = (min(found, key=found.__getitem__), max(found, key=found.__getitem__))
+        rows = [" to ".join(f"{found[name]} ({in_words(name)})" for name in ends)]
     said = [f"Found of {int(compared['holes'].max())} holes{where} with {_averaged(frames[-1])}: {'; '.join(rows)}."]
     said = said if costs.empty else []
     for (named, count), at in costs_by_place(costs).items():

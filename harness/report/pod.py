@@ -13,7 +13,7 @@ from harness.evaluation.pod.statement import POD, PodStatement
 from harness.report import blocks
 from harness.report.blocks import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, RED
 from harness.tables.schema import Column, Table
-from harness.tables.text import Grid
+from harness.tables.text import ROUGH, Grid
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -77,9 +77,10 @@ def pod_parts(statement: PodStatement) -> list[str | Grid]:
 def sizes_grid(statement: PodStatement) -> Grid:
     """a50, a90 and a90/95: size, and how it was found."""
     of = f", the largest of {len(statement.fits)} models" if len(statement.fits) > 1 else ""
-    rows = [(name, sized(getattr(statement, name), statement.unit), "estimate") for name in ("a50", "a90")]
+    digits, unit = _digits(statement), statement.unit
+    rows = [(name, sized(getattr(statement, name), unit, digits), "estimate") for name in ("a50", "a90")]
     how = f"{statement.bound.method}{of}: the limit to quote"
-    rows.append(("a90/95", _bound_text(statement.bound, statement.unit), how))
+    rows.append(("a90/95", _bound_text(statement.bound, unit, digits), how))
     return Grid.of(("", "size", "how"), rows, left=3)
 
 
@@ -109,8 +110,13 @@ def fit_grid(statement: PodStatement) -> Grid:
     return Grid.of(("of the fit", "value"), ((name, f"{value:.5g}") for name, value in statement.numbers.items()))
 
 
-def _bound_text(bound: Bound, unit: str) -> str:
-    return sized(bound.value, unit) if bound.demonstrated else "not demonstrated"
+def _bound_text(bound: Bound, unit: str, digits: int = 2) -> str:
+    return sized(bound.value, unit, digits) if bound.demonstrated else "not demonstrated"
+
+
+def _digits(statement: PodStatement) -> int:
+    """Three digits where a90 and its bound are so near that the third says something, else two."""
+    return 3 if 2 * (statement.bound.value - statement.a90) <= ROUGH * statement.a90 else 2
 
 
 def save_pod_png(path: Path, statement: PodStatement) -> None:
@@ -123,16 +129,17 @@ def answer(statement: PodStatement) -> str:
     """The limit in one sentence."""
     size = f"{statement.bound.confidence:.0%} confidence".replace("%", " %")
     if statement.bound.demonstrated:
-        limit = sized(statement.bound.value, statement.unit)
+        limit = sized(statement.bound.value, statement.unit, _digits(statement))
         return f"A flaw of {limit} is found 90 % of the time, with {size} (a90/95, {statement.bound.method})."
     return f"a90/95 is not demonstrated: {statement.bound.why.removeprefix('not demonstrated: ')}."
 
 
-def sized(value: float, unit: str) -> str:
-    """A size with four significant digits and its unit; a word where it is no size."""
+def sized(value: float, unit: str, digits: int = 2) -> str:
+    """A size with that many significant digits and its unit; a word where it is no size."""
     if not np.isfinite(value):
         return "not reached"
-    return f"{value:#.4g}".rstrip(".") + (f" {unit}" if unit else "")
+    decimals = max(0, digits - 1 - int(f"{value:.{digits - 1}e}".partition("e")[2]))
+    return f"{value:.{decimals}f}" + (f" {unit}" if unit else "")
 
 
 def axis_text(column: str, unit: str) -> str:
@@ -182,7 +189,8 @@ def draw_pod(axes: Axes, statement: PodStatement) -> None:
         ("a90", statement.a90, POD, ORANGE),
         ("a90/95", statement.bound.value, POD, RED),
     ):
-        text = sized(value, statement.unit) if name != "a90/95" or np.isfinite(value) else "not demonstrated"
+        text = sized(value, statement.unit, _digits(statement))
+        text = text if name != "a90/95" or np.isfinite(value) else "not demonstrated"
         inside = sizes[0] <= value <= sizes[-1]
         if inside:
             axes.plot([value, value], [0, pod], color=colour, lw=1.1)

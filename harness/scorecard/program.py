@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harness.report.blocks import BLUE, RED, command_of, figure, heading, note, page, plain, svg, tag
+from harness.report.blocks import BLUE, GREY, RED, command_of, figure, heading, note, page, plain, svg, tag
 from harness.scorecard import figures as scoring
 from harness.scorecard.bench import FULL
 from harness.scorecard.quantities import QUANTITIES
 from harness.tables.schema import write_table
 from harness.tables.text import show
 from harness.vocabulary.files import write_json, write_text
+from harness.vocabulary.path_names import camera_title
 from harness.vocabulary.provenance import RESULTS_VERSION, record
 from scenes.sensor.camera import camera_digest, load_camera
 
@@ -121,7 +122,12 @@ def _draw(canvas: Canvas, scores: Sequence[scoring.Score]) -> None:
     axis.set(xscale="log", xlim=(0.05, 5), ylim=(len(scores) - 0.5, -0.5), xlabel="simulated by published")
     axis.set_xticks([0.1, 0.25, 0.5, 1, 2, 4], ["0.1", "0.25", "0.5", "1", "2", "4"])
     axis.minorticks_off()
-    axis.set_yticks(range(len(scores)), [score.figure.name for score in scores], fontsize=7)
+    axis.set_yticks(range(len(scores)), [score.figure.what().partition(", stored")[0] for score in scores], fontsize=6)
+    cameras = [camera_title(score.figure.camera) for score in scores]
+    for row, title in enumerate(cameras):
+        if row == 0 or title != cameras[row - 1]:
+            axis.axhline(row - 0.5, color=GREY, linewidth=0.6)
+            axis.text(4.8, row, title, ha="right", va="center", fontsize=7, weight="bold")
 
 
 def _answer(scores: Sequence[scoring.Score]) -> str:

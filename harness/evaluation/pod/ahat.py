@@ -110,7 +110,7 @@ def fit_ahat(
     if per_target > 1:
         notes.append(f"{per_target:.3g} signals per target: covariance multiplied by that, {targets} targets count")
     if not sizes.min() <= (a90 := curve.size_at(0.9)) <= sizes.max():
-        notes.append(f"a90 = {a90:.4g} lies outside the sizes inspected ({sizes.min():.4g} to {sizes.max():.4g})")
+        notes.append(f"a90 = {a90:.3g} lies outside the sizes inspected ({sizes.min():.4g} to {sizes.max():.4g})")
     log_likelihood = line.log_likelihood - (float(y[~(below | above)].sum()) if log_signal else 0.0)  # the Jacobian
     numbers = (float(b0), float(b1), line.tau, covariance, log_likelihood, -2 * log_likelihood)
     axes = (log_size, log_signal, decision, left, right, tuple(notes))

@@ -113,7 +113,7 @@ class PodStatement:
         limits = [row.bound.value for row in self.models if row.deviance <= most]
         if max(limits) <= (1 + APART) * min(limits):
             return doubts
-        texts = [f"{one:.4g}" if np.isfinite(one) else "not demonstrated" for one in (min(limits), max(limits))]
+        texts = [f"{one:.3g}" if np.isfinite(one) else "not demonstrated" for one in (min(limits), max(limits))]
         return [f"{len(limits)} models fit about equally well, and their a90/95 differ: {' to '.join(texts)}", *doubts]
 
     def to_data(self) -> dict[str, Any]:
@@ -164,7 +164,7 @@ def state_hits(
     if fit.targets < LEAST_TARGETS:
         notes.append(f"{fit.targets} independent targets; MIL-HDBK-1823A asks for at least {LEAST_TARGETS}")
     if limit.demonstrated and limit.value > (largest := float(size.max())):
-        notes.append(f"a90/95 = {limit.value:.4g} lies beyond the largest size inspected, {largest:.4g}")
+        notes.append(f"a90/95 = {limit.value:.3g} lies beyond the largest size inspected, {largest:.4g}")
     if any(test.needed for test in tests):
         likeliest = min(tests, key=lambda test: test.p_value)
         speaks = f"the data speak for {TESTED[likeliest.beyond]} (p = {likeliest.p_value:.2g})"

@@ -18,7 +18,7 @@ from harness.evaluation.study.curves import ChanceHits
 from harness.evaluation.study.limit import ALL_FOUND, DRAWS, PodSurface, SetUpLimit, limit_of, surface_of
 from harness.evaluation.study.record import SetUpRecord, StudyRecord
 from harness.tables.trials import ResultTables
-from harness.vocabulary.path_names import camera_title
+from harness.vocabulary.path_names import camera_title, in_words
 from harness.vocabulary.seeds import canonical_json
 
 if TYPE_CHECKING:
@@ -152,7 +152,8 @@ def _inspected(limits: Sequence[SetUpLimit], sweep: Mapping[str, Sequence[Any]])
             text += "" if times == 1 else f", each inspected {times:.3g} times with new noise"
             said.setdefault(text, []).append(limit.record.label)
     whose = {text: "" if len(said) == 1 else f"{', '.join(labels)}: " for text, labels in said.items()}
-    axes = (f"{path}: {', '.join(map(str, values))}." for path, values in sweep.items())
+    words = ([in_words(f"{path}={canonical_json(value)}") for value in values] for path, values in sweep.items())
+    axes = (f"Varied: {'; '.join(each)}." for each in words)
     return (*(f"{labels}{text}." for text, labels in whose.items()), *axes)
 
 
