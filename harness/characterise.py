@@ -89,6 +89,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     noise = ", ".join(f"{one.temporal.value:.3g} mm at {one.distance_m:.2f} m" for one in found.surfaces[:3])
     answer = f"Temporal noise of single pixels: {noise}." if noise else "No flat surface was found."
     warnings = [*(warning for recording in recordings for warning in recording.warnings), *found.doubts]
+    repeated = []
     for figure in ("fill rate", "temporal noise"):
         off = [abs(row.ratio - 1) for row in rows if row.figure == figure]
         worst = max(np.nan_to_num(off, nan=1.0), default=0.0)
@@ -96,7 +97,8 @@ def main(options: argparse.Namespace, command: str) -> int:
             wrong = f"{CAMERA_FILE} has the captures' {figure} wrong by up to {100 * worst:.0f} %"
             warnings.insert(0, f"{wrong}: limits that are simulated with it are wrong, too")
         elif noise:
-            answer += f" {CAMERA_FILE} repeats the {figure} within {100 * worst:.0f} %."
+            repeated.append(f"the {figure} within {100 * worst:.1g} %")
+    answer += f" {CAMERA_FILE} repeats {' and '.join(repeated)}." if repeated else ""
     print_warnings(warnings)
     for recording, capture in zip(recordings, captures, strict=True):
         print(f"{recording.name}: {len(capture.z_m)} frames, {recording.unit_text}")
