@@ -137,8 +137,8 @@ class StillCapture:
         shapes_m = []
         for plane, mask in self.planes:
             use, flat_m = mask & np.isfinite(self.mean_m), plane.z_along_m(self.slopes)
-            fit = fit_surface(*self.slopes[use].T, 1 / self.mean_m[use], SMOOTH)
-            off_m = 1 / fit.evaluate(*np.moveaxis(self.slopes, -1, 0)) - flat_m
+            fit = fit_surface(self.slopes[use, 0], self.slopes[use, 1], 1 / self.mean_m[use], SMOOTH)
+            off_m = 1 / fit.evaluate(self.slopes[..., 0], self.slopes[..., 1]) - flat_m
             shapes_m.append(flat_m + np.clip(off_m, off_m[use].min(), off_m[use].max()))
         return tuple(shapes_m)
 

@@ -63,8 +63,8 @@ def shared_figures(found: Characteristics) -> Iterator[Told]:
         for lag in SHOWN_LAGS:
             alike = Reading(float(found.correlation[axis, lag]))
             yield "noise correlation", f"{name}, lag {lag}", "1", alike, "of neighbours' temporal noise"
-        share = np.cumsum(density_of(found.correlation[axis]))
-        half = Reading(float(np.interp(0.5 * share[-1], share, FREQUENCIES)))
+        power = np.cumsum(density_of(found.correlation[axis]))
+        half = Reading(float(np.interp(0.5 * power[-1], power, FREQUENCIES)))
         yield (
             "noise spectrum",
             f"along {name}",
