@@ -24,6 +24,8 @@ OTHER_DAMAGE_SIGMAS = 5.0
 OPEN_M = 20.0 * MM
 """Greater depths count as this one in the contour, which follows an oblique hole's mouth, not what shows through."""
 CONTOUR_ZOOM = 4  # sub-pixels of the half-depth contour along each axis
+EXPLAINED = 0.5
+"""Share of a detection's mean residual that its fit must show: waves of the noise may take up a smooth dent."""
 SHARPER_PX, SHARPER_GAIN = (1.0, 2.0, 3.0, 5.0), 9.0
 """Blurs below that of the noise that are tried for a recording, and the gain in chi square that accepts one."""
 
@@ -278,16 +280,19 @@ def _modelled(around: _Surroundings, config: HoleModelConfig) -> tuple[HoleFit |
     if patch.used.sum() < 6:
         return None, "the model of a blurred hole does not fit"
     start = (u0, v0, radius, around.sign * around.peak_m, around.offset_m)
-    fit, pixels = fit_hole(patch, *start), int(patch.used.sum())
+    fit, seen_by, pixels = fit_hole(patch, *start), patch, int(patch.used.sum())
     for side in around.sharper_px if fit.misfit else ():
-        other = fit_hole(replace(patch, blur_px=(side, side)), *start)
+        narrower = replace(patch, blur_px=(side, side))
+        other = fit_hole(narrower, *start)
         gain = pixels * (fit.misfit**2 - other.misfit**2)
         if other.converged and gain > (SHARPER_GAIN * other.misfit**2 if fit.converged else 0.0):
-            fit = other
+            fit, seen_by = other, narrower
     h, w = own.shape
     row, column = round(fit.v_px), round(fit.u_px)
     is_near = 0 <= row < h and 0 <= column < w and grown(own, around.reach_px + 1)[row, column]
-    if not (fit.converged and is_near and fit.misfit < MOST_MISFIT):
+    fitted = pictures(seen_by, np.array([[fit.u_px, fit.v_px, fit.radius_m, fit.depth_m, fit.wall]]))[0][own].mean()
+    share = fitted / (patch.residual_m[own].mean() - fit.offset_m)
+    if not (fit.converged and is_near and fit.misfit < MOST_MISFIT and share > EXPLAINED):
         return None, "the model of a blurred hole does not fit"
     if abs(fit.depth_m) > config.linear_depth_mm * MM:
         return None, too_deep

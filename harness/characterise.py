@@ -7,6 +7,7 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
+from harness.inspection.arguments import add_reading
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
 
@@ -20,8 +21,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--out", required=True, type=Path, metavar="DIR", help="folder for the page, the tables and my_camera.yaml")
     like = "refit this camera's model (a name or a .yaml file); without it, the file is an empirical camera"
     add("--like", metavar="CAMERA", help=like)
-    add("--unit", help="unit of the stored distances: mm, m, cm, um, in, tum (5000/m) or N/m")
-    add("--intrinsics", metavar="FILE|CAMERA", help="the lens: a file, or a camera's nominal lens by name")
+    add_reading(add)
     add("--poses", type=Path, metavar="FILE", help="where the camera stood for each PATH, as for harness.detect")
     add("--albedo", type=float, default=0.6, help="albedo that the surfaces are taken to have (default: 0.6)")
     add("--rate", type=float, metavar="FPS", help="frames per second (default: of --like, or 30)")
@@ -47,7 +47,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     import numpy as np
 
     from harness.evaluation.study.record import read_record
-    from harness.inspection.arguments import read_poses, refuse_repeats
+    from harness.inspection.arguments import read_poses, reading_of, refuse_repeats
     from harness.inspection.told import print_notes, print_warnings
     from harness.own_camera.camera_file import Stated, camera_of_size, opened_as, simulated, with_lens, write_camera
     from harness.own_camera.certificate import write_certificate
@@ -66,7 +66,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     study = read_record(options.study) if options.study else None
     poses = read_poses(options.poses, len(options.paths)) if options.poses else None
     refuse_repeats(options.paths)
-    recordings = [opened_as(options.like, [path], options.intrinsics, unit=options.unit) for path in options.paths]
+    reading = reading_of(options)
+    recordings = [opened_as(options.like, [path], options.intrinsics, **reading) for path in options.paths]
     captures = list(map(read_still, recordings))
     if options.like:
         with_lens(options.like, captures[0].lens)  # of another size it cannot be refitted
@@ -89,6 +90,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     noise = ", ".join(f"{one.temporal.value:.3g} mm at {one.distance_m:.2f} m" for one in found.surfaces[:3])
     answer = f"Temporal noise of single pixels: {noise}." if noise else "No flat surface was found."
     warnings = [*(warning for recording in recordings for warning in recording.warnings), *found.doubts]
+    repeated = []
     for figure in ("fill rate", "temporal noise"):
         off = [abs(row.ratio - 1) for row in rows if row.figure == figure]
         worst = max(np.nan_to_num(off, nan=1.0), default=0.0)
@@ -96,7 +98,8 @@ def main(options: argparse.Namespace, command: str) -> int:
             wrong = f"{CAMERA_FILE} has the captures' {figure} wrong by up to {100 * worst:.0f} %"
             warnings.insert(0, f"{wrong}: limits that are simulated with it are wrong, too")
         elif noise:
-            answer += f" {CAMERA_FILE} repeats the {figure} within {100 * worst:.0f} %."
+            repeated.append(f"the {figure} within {100 * worst:.1g} %")
+    answer += f" {CAMERA_FILE} repeats {' and '.join(repeated)}." if repeated else ""
     print_warnings(warnings)
     for recording, capture in zip(recordings, captures, strict=True):
         print(f"{recording.name}: {len(capture.z_m)} frames, {recording.unit_text}")

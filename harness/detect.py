@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from harness.inspection.arguments import DEFAULT_DETECTOR, DEFAULT_FALSE_CALLS, LEGAL_CROP, MARKS, MERGES, METHODS
+from harness.inspection import arguments as asked
 from harness.vocabulary.program import program, whole_number
 
 
@@ -18,13 +18,12 @@ def _options(parser: argparse.ArgumentParser) -> None:
     )
     add("paths", nargs="+", type=Path, metavar="PATH", help=formats)
     add("--out", type=Path, metavar="DIR", help="write tables, pictures and clouds here (docs/recordings.md)")
-    add("--unit", help="of the stored distances: mm, m, cm, um, in, tum (5000/m) or N/m; default: as the data say")
-    add("--intrinsics", metavar="FILE|CAMERA", help="lens of the depth pixels: a file, or a camera's nominal one")
-    crop = f"the target: {LEGAL_CROP}; auto: the nearest large smooth surface less 3 pixels of its rim (crop.inset_px)"
+    asked.add_reading(add)
+    crop = f"the target: {asked.LEGAL_CROP}; auto: the nearest large smooth surface without its rim (crop.inset_px)"
     add("--crop", default="auto", metavar="KIND", help=crop)
     target = "with --crop auto: take surface N of those that a run lists and that targets.png shows"
     add("--target", type=whole_number(10**9), metavar="N", help=target)
-    add("--detector", default=DEFAULT_DETECTOR, help=f"detector's name (default: {DEFAULT_DETECTOR})")
+    add("--detector", default=asked.DEFAULT_DETECTOR, help=f"detector's name (default: {asked.DEFAULT_DETECTOR})")
     setting = "detector's setting by dotted path: surface.degree=5"
     add("--set", action="append", default=[], metavar="KEY=VALUE", help=setting)
     mesh = "the undamaged part's mesh, laid onto the cloud; --set surface.reference.unit=m, .front=-y"
@@ -32,7 +31,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     averages = ("mean", "median", "clipped")
     add("--average", choices=averages, default="mean", help="how frames are averaged (default: mean)")
     add("--max-frames", type=whole_number(10**9), metavar="N", help="use the first N frames only")
-    calls = f"false calls expected here, by the noise towards the camera (default: {DEFAULT_FALSE_CALLS:g})"
+    calls = f"false calls expected here, by the noise towards the camera (default: {asked.DEFAULT_FALSE_CALLS:g})"
     add("--false-calls", type=float, metavar="N", help=calls)
     add("--threshold", type=float, metavar="K", help="threshold in units of score instead")
     flat = "take this unit's fixed pattern, as harness.flatfield measured it, off each capture"
@@ -41,10 +40,6 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--gauge", type=Path, metavar="FILE.json", help=gauge)
     quiet = "calibrate the threshold on this capture of an undamaged target"
     add("--quiet-capture", type=Path, metavar="PATH", help=quiet)
-    add("--topic", help="of a ROS bag: the topic with the depth images or clouds (default: the only one)")
-    add("--array", metavar="NAME[:NUMBER]", help="of a .npz, .mat or .npy: the array, and which of several maps in it")
-    add("--pitch", metavar="LENGTH", help="the array is a height map with this distance between pixels, such as 0.5mm")
-    add("--raw", metavar="LAYOUT", help="of a file of bare numbers: WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]], 640x480:u2")
     add = parser.add_argument_group(
         "several views of one target",
         "Each PATH is one view, --crop cuts the target out of each, and the detector judges all that is merged (or"
@@ -52,10 +47,15 @@ def _options(parser: argparse.ArgumentParser) -> None:
         " mapping.marks.dictionary=DICT_4X4_50, mapping.registration.points=target (icp and cpd on the whole target,"
         " not on the points of the marks).",
     ).add_argument
-    add("--register", choices=METHODS, metavar="METHOD", help=f"register the views by {', '.join(METHODS)}")
-    add("--merge", choices=MERGES, metavar="KIND", help=f"merge them by {', '.join(MERGES)} (default: fusion)")
+    add("--register", choices=asked.METHODS, metavar="METHOD", help=f"register the views by {', '.join(asked.METHODS)}")
+    add(
+        "--merge",
+        choices=asked.MERGES,
+        metavar="KIND",
+        help=f"merge them by {', '.join(asked.MERGES)} (default: fusion)",
+    )
     marks = "marks: colour (strips that stand apart; default), red (the thesis' rule), coded (ArUco, AprilTag)"
-    add("--marks", choices=MARKS, metavar="KIND", help=marks)
+    add("--marks", choices=asked.MARKS, metavar="KIND", help=marks)
     poses = "where the views may stand, for a start: JSON with 4x4 matrices in metres, or TUM's groundtruth.txt"
     add("--poses", type=Path, metavar="FILE", help=poses)
 

@@ -160,10 +160,8 @@ def _pixels(camera: AnyCamera) -> tuple[np.ndarray, np.ndarray]:
     if not isinstance(camera, AmcwCamera):
         return slopes.astype(np.float32), np.ones(slopes.shape[:2], np.float32)
     model = AmcwImager(camera, CameraConfig(name=camera.name), lens.whole, slopes)
-    angle_deg = np.degrees(np.arctan(np.hypot(slopes[..., 0], slopes[..., 1])))
-    full, cutoff = camera.emitter.full_half_angle_deg.value, camera.emitter.cutoff_half_angle_deg.value
-    lit = np.clip((cutoff - angle_deg) / (cutoff - full), 0.0, 1.0)
-    return slopes.astype(np.float32), np.where(model.outside_mask, 0.0, model.gathered * lit).astype(np.float32)
+    lit = np.where(model.outside_mask, 0.0, model.gathered * camera.optics.cone(slopes))
+    return slopes.astype(np.float32), lit.astype(np.float32)
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from harness.inspection.arguments import add_reading
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Lens
 from harness.vocabulary.program import program
@@ -29,8 +30,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("paths", nargs="+", type=Path, metavar="PATH", help="captures, in any format that harness.detect reads")
     written = "the flat field; a .json of its figures and a .png of the map are written beside it"
     add("--out", type=Path, required=True, metavar="FILE.npz", help=written)
-    add("--unit", help="unit of the stored distances: mm, m, cm, um, in, tum (5000/m) or N/m")
-    add("--intrinsics", metavar="FILE|CAMERA", help="the lens: a file, or a camera's nominal lens by name")
+    add_reading(add)
     add("--crop", default="auto", metavar="KIND", help="the part that shows the wall, as for harness.detect")
     poses = "where the camera stood, as for harness.detect: the surface's own shape then counts as no noise"
     add("--poses", type=Path, metavar="FILE", help=poses)
@@ -97,13 +97,13 @@ def _captures(options: argparse.Namespace) -> tuple[Lens, list[FlatCapture], lis
     from detectors.crop import crop
     from detectors.flat_captures import flattened
     from detectors.local import LocalConfig
-    from harness.inspection.arguments import crop_from_text, opened, read_poses, refuse_repeats
+    from harness.inspection.arguments import crop_from_text, opened, read_poses, reading_of, refuse_repeats
     from harness.vocabulary.declaration.diagnose import settings_of
 
     config = settings_of(LocalConfig, {"crop": crop_from_text(options.crop)}, f"--crop {options.crop}").crop
     poses = read_poses(options.poses, len(options.paths)) if options.poses else (None,) * len(options.paths)
     refuse_repeats(options.paths)
-    recordings = [opened([path], options.intrinsics, unit=options.unit) for path in options.paths]
+    recordings = [opened([path], options.intrinsics, **reading_of(options)) for path in options.paths]
     first = recordings[0]
     for path, recording in zip(options.paths, recordings, strict=True):
         if recording.lens is None:

@@ -50,8 +50,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--detector", default=asked.DEFAULT_DETECTOR, help=f"detector's name (default: {asked.DEFAULT_DETECTOR})")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="detector's setting: surface.degree=5")
     add("--crop", default="auto", metavar="KIND", help=f"which part is the target: {asked.LEGAL_CROP}")
-    add("--unit", help="unit of the stored distances: mm, m, cm, um, in, tum (5000/m) or N/m")
-    add("--intrinsics", metavar="FILE|CAMERA", help="the lens: a file, or a camera's nominal lens by name")
+    asked.add_reading(add)
     add("--out", type=Path, default=Path("results/implant"), metavar="DIR", help="default: results/implant")
 
 
@@ -107,7 +106,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     how = (options.hit_radius * MM, options.threshold, own_threshold)
     judging = Judging(options.detector, canonical_json(settings), *how)
     asked.refuse_repeats(options.paths)
-    opened = [opened_as(options.camera, [path], options.intrinsics, unit=options.unit) for path in options.paths]
+    reading = asked.reading_of(options)
+    opened = [opened_as(options.camera, [path], options.intrinsics, **reading) for path in options.paths]
     scans = [Scan(recording, judging) for recording in opened]
     family = _family(options, scans)
     cache = options.out / ".cache" / "renders"

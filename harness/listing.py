@@ -1,4 +1,4 @@
-"""Entries that `harness.ls` lists and `harness.clean` removes: tofpod's own in ``--out``, never through a link."""
+"""Entries that `harness.ls` lists and renders that `harness.clean` removes: tofpod's own, never through a link."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ import io
 import os
 import re
 import secrets
-import stat
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from harness.tables.outputs import EXPERIMENT, JOURNAL, LATEST, LOCK_NAME, PROVENANCE, is_output
+from harness.tables.outputs import EXPERIMENT, LATEST, PROVENANCE
 from harness.tables.text import Grid, many
 from harness.vocabulary.declaration.yaml_source import read_yaml
 from harness.vocabulary.errors import UserError
@@ -25,7 +24,7 @@ from harness.vocabulary.path_names import names_of, value_text
 from harness.vocabulary.plug_ins import Offer, PlugIns
 from harness.vocabulary.provenance import RESULTS_VERSION
 from harness.vocabulary.seeds import canonical_json
-from scenes.render.cache import StoredFile, leftovers, longest_unused, removed, stored_renders
+from scenes.render.cache import StoredFile, leftovers, longest_unused, stored_renders
 
 BYTES = {"kB": 1e3, "MB": 1e6, "GB": 1e9, "TB": 1e12}  # powers of ten, as disks are sold
 
@@ -200,7 +199,6 @@ def reference() -> str:
 
 EXPERIMENT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 DIGEST_NAME = re.compile(r"[0-9a-f]{16}")
-POINT_NAME = re.compile(r"point-[0-9]{3,6}")  # name of a folder with the findings in a real capture
 SHOWN_SETTINGS = 6
 
 
@@ -354,10 +352,6 @@ def point_to(run: Path) -> None:
 # ---------------------------------------------------------------- removal
 
 
-OURS = b"# tofpod experiment "  # first words of an experiment.yaml that a sweep wrote
-UNFINISHED_NAME = re.compile(r"\.(?P<stem>.+)\.\w{8}\.part(?P<suffix>\.\w+)")  # what a killed process was writing
-
-
 def refuse_links(*paths: Path) -> None:
     """Raise UserError where a path is a link."""
     for path in paths:
@@ -371,66 +365,3 @@ def cache_removal(folder: Path, limit_bytes: int | None) -> list[StoredFile]:
     if limit_bytes is None:
         return stored_renders(folder) + leftovers(folder, 0.0)
     return longest_unused(stored_renders(folder), limit_bytes, ()) + leftovers(folder)
-
-
-def chosen_results(out: Path, name: str) -> list[Path]:
-    """Return the folders of results named ``NAME`` or ``NAME/DIGEST``. Raises UserError where there are none."""
-    experiment, slash, digest = name.partition("/")
-    if not EXPERIMENT_NAME.fullmatch(experiment) or (slash and not DIGEST_NAME.fullmatch(digest)):
-        legal = "NAME or NAME/DIGEST, as python -m harness.ls results shows them"
-        raise UserError(f"{name!r} names no results", legal=legal)
-    parent = Path(out) / experiment
-    refuse_links(parent, *([parent / digest] if slash else []))
-    found = [path for path in folders_in(parent, DIGEST_NAME) if not slash or path.name == digest]
-    if not found:
-        raise UserError(f"{parent / digest if slash else parent}: holds no results", fix="python -m harness.ls results")
-    for folder in found:
-        # every sweep begins with its declaration, whose first line says whose it is
-        first = b""
-        with contextlib.suppress(OSError), (folder / EXPERIMENT.name).open("rb") as file:
-            first = file.read(len(OURS))
-        if first != OURS:
-            message = f"{folder}: has no experiment.yaml of tofpod's, so it is no folder of results"
-            raise UserError(message, fix="remove it by hand, if it is to go")
-    return found
-
-
-def removable(folder: Path) -> list[StoredFile]:
-    """Return the files of a folder of results that tofpod wrote, locks last."""
-    from harness.engine.journal import SEGMENT_NAME
-
-    found = []
-    for path in files_below(folder):
-        with contextlib.suppress(OSError):
-            file = path.lstat()
-            *above, name = path.relative_to(folder).parts
-            unfinished = UNFINISHED_NAME.fullmatch(name)
-            name = name if unfinished is None else unfinished["stem"] + unfinished["suffix"]
-            if above[:1] == [JOURNAL]:
-                ours = len(above) == 1 and SEGMENT_NAME.fullmatch(name) is not None
-            elif not above:
-                ours = is_output(name, "results") or LOCK_NAME.fullmatch(name) is not None
-            else:
-                ours = len(above) == 1 and POINT_NAME.fullmatch(above[0]) is not None and is_output(name, "capture")
-            if ours and stat.S_ISREG(file.st_mode):
-                found.append(StoredFile(path, file.st_size, file.st_mtime))
-    return sorted(found, key=lambda one: (LOCK_NAME.fullmatch(one.path.name) is not None, one.path))
-
-
-def remove_results(folders: Sequence[Path], files: Iterable[StoredFile]) -> list[StoredFile]:
-    """Remove files, empty folders, and `latest` where its run is gone. Returns what is gone."""
-    gone = removed(files)
-    for folder in folders:
-        _remove_empty(*folders_in(folder, re.compile(f"{JOURNAL}|{POINT_NAME.pattern}")), folder)
-    for parent in {folder.parent for folder in folders}:
-        named = latest_run(parent)
-        if named is not None and not (parent / named / EXPERIMENT.name).exists():
-            (parent / LATEST).unlink(missing_ok=True)
-        _remove_empty(parent)
-    return gone
-
-
-def _remove_empty(*folders: Path) -> None:
-    for folder in folders:
-        with contextlib.suppress(OSError):
-            folder.rmdir()

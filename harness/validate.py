@@ -6,6 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from harness.inspection.arguments import READING, add_reading, reading_of
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program, whole_number
 
@@ -19,8 +20,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     capture = parser.add_argument_group("a real capture")
     put = capture.add_argument
     put("--capture", type=Path, nargs="+", metavar="PATH", help="frames of a static scene, in any format of detect's")
-    put("--unit", help="unit of the stored distances: mm, m, cm, um, in, tum (5000/m) or N/m")
-    put("--intrinsics", metavar="FILE|CAMERA", help="the lens of the depth pixels: a file, or a camera's nominal lens")
+    add_reading(put)
     put("--frames", type=whole_number(4096), metavar="N", help="use the first N frames only")
     put("--mask", type=Path, metavar="PNG", help="use the pixels only that are not black here")
     put("--board", type=Path, metavar="YAML", help="an experiment with a drilled board: set this beside the capture")
@@ -48,10 +48,10 @@ def main(options: argparse.Namespace, command: str) -> int:
 
         if options.camera or options.mask:
             raise UserError("--camera and --mask do not go with --board: the experiment names the camera")
-        reading = {"unit": options.unit, "frames": slice(options.frames) if options.frames else None}
+        reading = {**reading_of(options), "frames": slice(options.frames) if options.frames else None}
         recording = opened(options.capture, options.intrinsics, **reading) if options.capture else None
         return run_board(options, recording, command)
-    for name in ("unit", "intrinsics", "frames", "mask"):
+    for name in (*READING, "intrinsics", "frames", "mask"):
         if getattr(options, name) is not None:
             raise UserError(f"--{name} belongs to a capture, and none is named", fix="add --capture PATH")
     from harness.scorecard.program import run_scorecard

@@ -39,6 +39,11 @@ class Optics:
     farthest_m: float = float("inf")
     limits_along: Literal["ray", "axis"] = "ray"
 
+    def cone(self, slopes: np.ndarray) -> np.ndarray:
+        """Return the emitter's light along rays from it (..., 2) relative to the axis."""
+        full, cutoff = np.cos(np.radians([self.full_half_angle_deg, self.cutoff_half_angle_deg]))
+        return np.clip((1 / np.sqrt(1 + (slopes**2).sum(axis=-1)) - cutoff) / (full - cutoff), 0.0, 1.0)
+
     def content(self) -> dict[str, Any]:
         """Plain data of everything here that can change a render; equal for cameras that share renders."""
         return {

@@ -208,7 +208,11 @@ def test_real_walls(shared_data, tmp_path, capsys):
         rows = figures_of(tmp_path)
         noise = rows[rows["figure"] == "temporal noise"]
         assert len(noise) == 2 and noise["ratio"].between(0.85, 1.15).all()
+        shape = rows[rows["figure"].isin(["plane-fit rms, one frame", "plane-fit rms, average", "fill rate"])]
+        assert len(shape) == 6 and shape["ratio"].between(0.9, 1.1).all()
     assert "the surface's own shape cannot be told" in capsys.readouterr().out
+    emitter = read_camera(tmp_path / "my_camera.yaml").emitter
+    assert emitter.mask_slopes.tag == "O" and len(emitter.mask_slopes.value) > 6  # the wall's corner lies outside six
 
 
 def test_bad_input_is_one_message(tmp_path, capsys):

@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from declared_results import is_output
 
 from harness.efficiency import main
 from harness.engine import ideal
 from harness.tables.efficiency import EFFICIENCY_TABLES
-from harness.tables.outputs import EFFICIENCY_PAGE, EXPERIMENT, STUDY, is_output
+from harness.tables.outputs import EFFICIENCY_PAGE, EXPERIMENT, STUDY
 
 
 @pytest.fixture

@@ -59,6 +59,8 @@ def test_too_little_light_and_ranges_out_of_reach_return_nothing():
     far = np.full(noise.shape, 12.0)
     assert np.isnan(noise(far, np.full(noise.shape, 0.01), rng)).all()
     assert np.isnan(noise(np.full(noise.shape, 0.01), np.ones(noise.shape), rng)).all()
+    for dark in (0.0, -1.0, np.nan):
+        assert np.isnan(noise(np.full(noise.shape, 1.0), np.full(noise.shape, dark), rng)).all()
     near = noise(np.full(noise.shape, 1.0), np.full(noise.shape, 0.6), rng)
     # inside the lit hexagon, not in the corners
     assert np.isfinite(near[250:350, 270:370]).all() and np.isnan(near[0, 0])

@@ -251,6 +251,20 @@ def test_the_picture_of_a_recording_decides_that_it_is_sharper_than_its_noise(re
     assert low_mm * 1e-3 < m.model_diameter_m < high_mm * 1e-3
 
 
+def test_a_smooth_dent_is_not_taken_for_waves_of_the_noise() -> None:
+    board = Board(9.0, 9.0, wall=0.0)
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    # a cap 48 mm wide; half of its depth lies within 34 mm
+    board.image = 7e-3 * np.clip(1 - ((u - WIDTH / 2) ** 2 + (v - HEIGHT / 2) ** 2) / 16.0**2, 0, None)
+    cloud, evidence = board.seen(0.05, 3)
+    lag = np.abs(np.arange(-28, 29))
+    short, long = (np.outer(row, row) for row in (np.clip(1 - lag / 4, 0, None), np.exp(-(lag**2) / (2 * 6.3**2))))
+    core = detection_of(cloud, 9.0, np.flatnonzero(board.image > 6.3e-3))
+    m = measure_detection(cloud, evidence, core, HoleModelConfig(), 0.3 * short + 0.7 * long)
+    assert m.model_depth_m == pytest.approx(7e-3, abs=1.5e-3)
+    assert m.model_diameter_m == pytest.approx(34e-3, abs=5e-3)
+
+
 def test_a_hole_lost_in_the_blur_falls_back_and_says_so() -> None:
     m = measured(Board(2.0, 12.7, wall=0.3), 0.15, 3, threshold=4.0)
     assert m.model_note.startswith("diameter and depth cannot be told apart") and "half depth" in m.model_note

@@ -257,6 +257,21 @@ def test_fixed_pattern_belongs_to_the_unit_not_to_the_region():
     assert np.array_equal(stack(a, 1)[0], stack(b, 1)[0][a.region.within(b.region)])
 
 
+def test_two_files_that_bear_one_name_have_their_own_pattern():
+    other = with_number(CAMERA, "fixed_pattern", "smooth_mm", 3 * CAMERA.fixed_pattern.smooth_mm.value)
+    config = CameraConfig(effects=NO_EFFECTS.model_copy(update={"fixed_pattern": True}))
+    region = CAMERA.nominal_lens.whole
+    slopes = CAMERA.nominal_lens.region_slopes(region)
+    own, wider = (AmcwImager(each, config, region, slopes).static_error_m.std() for each in (CAMERA, other))
+    assert wider > 1.5 * own
+
+
+def test_a_changed_number_changes_what_follows_from_it():
+    assert CAMERA.optics.cutoff_half_angle_deg < 60.0
+    wide = with_number(CAMERA, "emitter", "cutoff_half_angle_deg", 60.0)
+    assert wide.optics.cutoff_half_angle_deg == 60.0
+
+
 def test_shorter_captures_are_prefixes_and_streams_are_repeatable():
     unit = unit_at(0.8)
     long, short = stack(unit, 4), stack(unit, 2)

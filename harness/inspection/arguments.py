@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +30,24 @@ PREFIX = "mapping."  # begins the --set keys from views to one cloud; all others
 STATED_SURFACE = ("surface=", "surface.degree", "surface.method", "surface.drop")
 """Settings that state a polynomial: without any of them the surface's shape is chosen by evidence."""
 LEGAL_CROP = "auto, none, box:x0,x1,y0,y1,z0,z1 (mm, camera frame), polygon:u,v,u,v,u,v.. (pixels)"
+
+
+READING = ("unit", "topic", "array", "pitch", "raw")  # options that `open_capture` takes as they are
+
+
+def add_reading(add: Callable[..., Any]) -> None:
+    """Add the options that say how captures are read, by a parser's or a group's ``add_argument``."""
+    add("--unit", help="of the stored distances: mm, m, cm, um, in, tum (5000/m) or N/m; default: as the data say")
+    add("--intrinsics", metavar="FILE|CAMERA", help="lens of the depth pixels: a file, or a camera's nominal one")
+    add("--topic", help="of a ROS bag: the topic with the depth images or clouds (default: the only one)")
+    add("--array", metavar="NAME[:NUMBER]", help="of a .npz, .mat or .npy: the array, and which of several maps in it")
+    add("--pitch", metavar="LENGTH", help="the array is a height map with this distance between pixels, such as 0.5mm")
+    add("--raw", metavar="LAYOUT", help="of a file of bare numbers: WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]], 640x480:u2")
+
+
+def reading_of(options: argparse.Namespace) -> dict[str, Any]:
+    """Return what `add_reading`'s options state but the lens, for `opened`."""
+    return {name: getattr(options, name) for name in READING}
 
 
 def refuse_misfits(arguments: argparse.Namespace, paths: list[Path]) -> None:

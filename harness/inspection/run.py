@@ -239,11 +239,8 @@ def inspect(arguments: argparse.Namespace) -> int:
 
 
 def _opened(arguments: argparse.Namespace, paths: Sequence[Path]) -> Recording:
-    names = ("unit", "topic", "array", "pitch", "raw")
     frames = slice(arguments.max_frames) if arguments.max_frames else None
-    return asked.opened(
-        paths, arguments.intrinsics, frames=frames, **{name: getattr(arguments, name) for name in names}
-    )
+    return asked.opened(paths, arguments.intrinsics, frames=frames, **asked.reading_of(arguments))
 
 
 def _averaged(arguments: argparse.Namespace, recording: Recording, field: FlatField | None) -> Cloud:

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import ndimage
+from scipy.spatial import ConvexHull
 
 from detectors.recordings import Recording
 from harness.inspection.arguments import opened
@@ -186,6 +187,9 @@ def _refitted(like: str, found: Characteristics, albedo: float, source: str) -> 
     if isinstance(camera, EmpiricalCamera) or not found.surfaces:
         what = "is an empirical camera" if found.surfaces else "is refitted on flat surfaces, and none was found"
         raise UserError(f"--like {like}: {what}", fix="leave out --like: the file is then an empirical camera")
+    for key, value in _field(camera, found) if isinstance(camera, AmcwCamera) else ():
+        camera = with_number(camera, "emitter", key, value)
+        yield Stated("emitter", key, value, f"contains every pixel with a return; {source}")
     camera, gain = _gain(with_number(camera, "engine", "output_step_mm", _step_mm(found)), found, albedo)
     yield Stated("photons", "signal_electrons", gain, f"gives the temporal noise, albedo {albedo:g}; {source}")
     again = simulated(camera, found, albedo, FEW_FRAMES)
@@ -204,6 +208,20 @@ def _refitted(like: str, found: Characteristics, albedo: float, source: str) -> 
         ratios = [(a.amplitude / b.amplitude)[a.steady & b.steady] for a, b in pairs]  # type: ignore[operator]
         told = f"half of the pixels of amplitude {faint:.4g} return nothing; {source}"
         yield Stated("engine", "min_amplitude_units", faint / float(np.nanmedian(np.concatenate(ratios))), told)
+
+
+def _field(camera: AmcwCamera, found: Characteristics) -> Iterator[tuple[str, Any]]:
+    """Yield the emitter's numbers that leave out pixels which return, widened: the lit polygon, and where the cone's
+    light ends, which fades over as many degrees as before."""
+    often = [np.isfinite(capture.z_m).mean(axis=0) >= 0.5 for capture in found.captures]
+    seen = np.concatenate([capture.slopes[mask] for capture, mask in zip(found.captures, often, strict=True)])
+    if camera.emitter.mask_slopes is not None:
+        around = ConvexHull(np.round([*camera.emitter.mask_slopes.value, *seen], 3))
+        yield "mask_slopes", tuple(map(tuple, around.points[around.vertices]))
+    full_deg, cutoff_deg = camera.emitter.full_half_angle_deg.value, camera.emitter.cutoff_half_angle_deg.value
+    widest_deg = float(np.degrees(np.arctan(np.linalg.norm(seen, axis=1).max())))
+    if widest_deg > cutoff_deg:
+        yield "cutoff_half_angle_deg", widest_deg + cutoff_deg - full_deg
 
 
 def _gain(camera: Any, found: Characteristics, albedo: float) -> tuple[Any, float]:
@@ -226,9 +244,9 @@ def _gain(camera: Any, found: Characteristics, albedo: float) -> tuple[Any, floa
 def simulated(
     camera: AnyCamera, found: Characteristics, albedo: float, frames: int | None = None
 ) -> list[StillCapture]:
-    """Return the captures as a unit of the camera would have taken them: the same surfaces, which the fitted planes
-    stand for, as bright as recorded; with as many frames, or ``frames``. Not simulated: the surfaces' own relief, light
-    between them, the emitter's shadow behind an edge, and what lies beside them."""
+    """Return the captures as a unit of the camera would have taken them: the same surfaces, by smooth fits, as bright
+    as recorded; with as many frames, or ``frames``. Not simulated: relief finer than the fits, light between surfaces,
+    the emitter's shadow behind an edge, and what lies beside the surfaces."""
     return [_again(camera, one, albedo, frames or len(one.z_m), number) for number, one in enumerate(found.captures)]
 
 
@@ -245,9 +263,10 @@ def _again(camera: AnyCamera, capture: StillCapture, albedo: float, frames: int,
             # half of each pixel along an edge lies on the other surface: the mean over all places of an edge on pixels
             halves = np.stack([labels, np.where(labels > 0, ndimage.maximum_filter(labels, 3), 0)])
         z_m = np.full(halves.shape, np.nan)
-        for place, (plane, _) in enumerate(capture.planes, start=1):
-            z_m = np.where(halves == place, plane.z_along_m(capture.slopes), z_m)
+        for place, shape_m in enumerate(capture.shapes_m, start=1):
+            z_m = np.where(halves == place, shape_m, z_m)
     light = albedo * capture.cosine / (z_m * capture.stretch) ** 2 / (z_m.size / capture.cosine.size)
+    light *= camera.optics.cone(capture.slopes)
     unit = SimulatedUnit(camera, config, image_view(camera, lens.whole, z_m, light))
     if capture.amplitude is not None:
         plain = measure.mean_amplitude([next(iter(unit.capture(1, SEED).frames())).amplitude])

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from detectors.recordings.depth_images import read_picture
+from harness.inspection.arguments import reading_of
 from harness.inspection.told import print_notes, print_warnings
 from harness.own_camera.camera_file import camera_of_size, opened_as, simulated, with_lens
 from harness.own_camera.measure import characteristics, read_still
@@ -27,7 +28,7 @@ def run_capture(options: argparse.Namespace, command: str) -> int:
         raise UserError(f"--albedo {options.albedo:g}", legal="above 0 and up to 1")
     first = slice(options.frames) if options.frames else None
     known = options.camera[0] if options.camera else None
-    recording = opened_as(known, options.capture, options.intrinsics, unit=options.unit, frames=first)
+    recording = opened_as(known, options.capture, options.intrinsics, frames=first, **reading_of(options))
     capture = read_still(recording, None if options.mask is None else read_mask(options.mask))
     name = known or camera_of_size(capture.lens)
     camera, found = with_lens(name, capture.lens), characteristics([capture])

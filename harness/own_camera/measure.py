@@ -16,9 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import ndimage, optimize, stats
 
-from detectors.flat_captures import Separated, flattened, separated
+from detectors.flat_captures import SMOOTH, Separated, flattened, separated
 from detectors.noise import LEAST_FRAMES, rounding_left_m2
 from detectors.recordings import Recording
+from detectors.surface import fit_surface
 from harness.scorecard import bench
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, Lens
@@ -129,6 +130,17 @@ class StillCapture:
             along = plane.normal[2] + self.slopes[mask] @ plane.normal[:2]
             cosine[mask] = np.abs(along) / self.stretch[mask]
         return cosine
+
+    @cached_property
+    def shapes_m(self) -> tuple[np.ndarray, ...]:
+        """z (h, w) of each flat surface as a smooth fit, with its relief and the lens' error, and beyond its pixels."""
+        shapes_m = []
+        for plane, mask in self.planes:
+            use, flat_m = mask & np.isfinite(self.mean_m), plane.z_along_m(self.slopes)
+            fit = fit_surface(self.slopes[use, 0], self.slopes[use, 1], 1 / self.mean_m[use], SMOOTH)
+            off_m = 1 / fit.evaluate(self.slopes[..., 0], self.slopes[..., 1]) - flat_m
+            shapes_m.append(flat_m + np.clip(off_m, off_m[use].min(), off_m[use].max()))
+        return tuple(shapes_m)
 
     def whole(self, mask: np.ndarray) -> np.ndarray:
         """Return a surface's pixels (h, w) bool, those without a return among them, without its rim."""

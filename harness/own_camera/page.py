@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.signal.windows import parzen
 
 from harness.own_camera.measure import Characteristics
 from harness.report.blocks import BLUE, GREY, ORANGE, command_of, figure, heading, page, paragraph, svg
@@ -25,13 +26,15 @@ MEASURED, SIMULATED, KNOWN = "measured", "simulated", "known camera"
 LOOKS = {MEASURED: (BLUE, "o"), SIMULATED: (ORANGE, "x"), KNOWN: (GREY, "+")}
 RANGE, ANGLE, AMPLITUDE = (f"noise, mm against {x}" for x in ("range, m", "angle, deg", "amplitude"))
 NEIGHBOURS, PATTERN = (f"correlation of {of} against pixels apart" for of in ("noise", "fixed pattern"))
+SPECTRUM, OF_PATTERN = (f"spectrum of {of} against cycles per pixel" for of in ("noise", "fixed pattern"))
 FRAMES, DROPPED = "displacement, mm against frame", "share without return against amplitude"
-SHOWN = (RANGE, ANGLE, AMPLITUDE, NEIGHBOURS, PATTERN, FRAMES, DROPPED)
+SHOWN = (RANGE, ANGLE, AMPLITUDE, NEIGHBOURS, PATTERN, SPECTRUM, OF_PATTERN, FRAMES, DROPPED)
+FREQUENCIES = np.linspace(0, 0.5, 41)
 SHOWN_LAGS, SHOWN_PATTERN_LAGS = (1, 2, 3, 5), (1, 3, 5, 10)
 CAPTION = (
     "The surfaces that were found; temporal noise against range, angle and amplitude, each dot of pixels where all "
-    "three are alike; correlation of noise and of fixed pattern between neighbours, the Fourier transform of their "
-    "spectra; displacement of whole frames; dropouts. The simulation of the camera's file is orange."
+    "three are alike; correlation of noise and of fixed pattern between neighbours along x and y, and their spectra, "
+    "where white noise would be 1; displacement of whole frames; dropouts. The camera file's simulation is orange."
 )
 Told = tuple[str, str, str, Reading, str]
 """Name, place, unit, value and meaning of a figure."""
@@ -60,6 +63,15 @@ def shared_figures(found: Characteristics) -> Iterator[Told]:
         for lag in SHOWN_LAGS:
             alike = Reading(float(found.correlation[axis, lag]))
             yield "noise correlation", f"{name}, lag {lag}", "1", alike, "of neighbours' temporal noise"
+        power = np.cumsum(density_of(found.correlation[axis]))
+        half = Reading(float(np.interp(0.5 * power[-1], power, FREQUENCIES)))
+        yield (
+            "noise spectrum",
+            f"along {name}",
+            "1/px",
+            half,
+            "frequency below which half of the noise's power lies",
+        )
     yield "frame jitter", "all", "mm", Reading(found.jitter_m / MM), "deviation of whole frames' displacement"
     for capture in found.captures:
         drift = Reading(capture.drift_m / MM)
@@ -119,10 +131,10 @@ def write_page(
     write_table(folder, OWN_FIGURES, OWN_FIGURES.frame(rows))
     curves = [row for source, one in sources.items() for row in _curves(source, one)]
     write_table(folder, OWN_CURVES, OWN_CURVES.frame(curves))
-    drawn = svg("captures", (8.6, 12.4), title, lambda canvas: _draw(canvas, found, curves))
+    drawn = svg("captures", (8.6, 15.5), title, lambda canvas: _draw(canvas, found, curves))
     said = (
-        "Simulated are frames of the camera's file before the same surfaces, taken as planes; they are analysed as the "
-        "captures are. A ratio of 1 says that the file repeats the camera."
+        "Simulated are frames of the camera's file before the same surfaces, whose smooth shape is the captures'; they "
+        "are analysed as the captures are. A ratio of 1 says that the file repeats the camera."
     )
     body = [figure({"captures": drawn}, "captures", CAPTION), heading("Measured and simulated"), paragraph(said)]
     body += [OWN_FIGURES.grid(rows, heads=heads).html(), *command_of(command)]
@@ -142,9 +154,11 @@ def _curves(source: str, found: Characteristics) -> Iterator[dict[str, Any]]:
         for diagram, x in ((RANGE, cell.range_m), (ANGLE, cell.angle_deg), (AMPLITUDE, cell.amplitude)):
             if np.isfinite(x):
                 yield point(diagram, cell.capture, x, cell.sigma_m / MM)
-    for diagram, both in ((NEIGHBOURS, found.correlation), (PATTERN, found.pattern_correlation)):
-        for axis, along in zip("xy", [] if both is None else both.tolist(), strict=False):
-            yield from (point(diagram, axis, lag, value) for lag, value in enumerate(along))
+    pairs = ((NEIGHBOURS, SPECTRUM, found.correlation), (PATTERN, OF_PATTERN, found.pattern_correlation))
+    for diagram, spectrum, both in pairs:
+        for axis, along in zip("xy", [] if both is None else both, strict=False):
+            yield from (point(diagram, axis, *each) for each in enumerate(along.tolist()))
+            yield from (point(spectrum, axis, *each) for each in zip(FREQUENCIES, density_of(along), strict=True))
     for capture in found.captures:
         yield from (point(FRAMES, capture.name, k, off / MM) for k, off in enumerate(capture.offsets_m.tolist()))
     drops = found.dropouts
@@ -153,8 +167,15 @@ def _curves(source: str, found: Characteristics) -> Iterator[dict[str, Any]]:
             yield point(DROPPED, "all", level, share)
 
 
+def density_of(correlation: np.ndarray) -> np.ndarray:
+    """Return the spectral density at `FREQUENCIES` along one axis, relative to white noise of the same variance, from
+    the correlation (lags,), faded by Parzen's window (Blackman and Tukey)."""
+    faded = correlation * parzen(2 * len(correlation) - 1)[len(correlation) - 1 :]
+    return np.asarray(2 * np.cos(2 * np.pi * np.outer(FREQUENCIES, np.arange(len(faded)))) @ faded - faded[0])
+
+
 def _draw(canvas: Figure, found: Characteristics, curves: list[dict[str, Any]]) -> None:
-    axes, first = canvas.subplots(4, 2).ravel(), found.captures[0]
+    axes, first = canvas.subplots(5, 2).ravel(), found.captures[0]
     labels = np.full(first.stretch.shape, np.nan)
     for number, (_, mask) in enumerate(first.planes):
         labels[mask] = number
@@ -168,7 +189,7 @@ def _draw(canvas: Figure, found: Characteristics, curves: list[dict[str, Any]]) 
             if points and not (diagram == FRAMES and source != MEASURED):
                 axis.plot(*zip(*points, strict=True), marker, color=colour, markersize=4, label=source)
         x, y = diagram.split(" against ")[::-1]
-        axis.set(xlabel=x, ylabel=y)
+        axis.set(xlabel=x, ylabel=y, yscale="log" if diagram in (SPECTRUM, OF_PATTERN) else "linear")
         if not own:
             axis.text(0.5, 0.5, "not told by the captures", transform=axis.transAxes, ha="center", color=GREY)
     axes[1].legend(fontsize=8)

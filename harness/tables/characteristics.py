@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from harness.tables.schema import Column, Estimate, Table
 
-LEAST = {"mm": 0.01, "px": 0.05, "1": 0.05}
+LEAST = {"mm": 0.01, "px": 0.05, "1": 0.05, "1/px": 0.01}
 """Measured values below these, by unit, are as good as none: a ratio to them says nothing."""
 
 
@@ -62,8 +62,8 @@ OWN_CURVES = Table(
         Column("diagram", note="what y is, and against what"),
         Column("source", note="measured, simulated or known camera"),
         Column("series", note="capture, or direction"),
-        Column("x", note="m, degrees, amplitude, pixels or number of the frame, by the diagram"),
-        Column("y", note="mm, share or correlation, by the diagram"),
+        Column("x", note="m, degrees, amplitude, pixels, cycles per pixel or number of the frame, by the diagram"),
+        Column("y", note="mm, share, correlation or density, by the diagram"),
     ),
     formats=("csv",),
 )

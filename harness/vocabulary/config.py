@@ -18,6 +18,13 @@ class Config(BaseModel):
         # Strict mode takes no list for a tuple, and YAML and JSON have nothing but lists.
         return {key: _as_tuple(value) for key, value in data.items()} if isinstance(data, dict) else data
 
+    def model_copy(self, **how: Any) -> Self:
+        """Copy as pydantic does, without values that the original has cached."""
+        copied = super().model_copy(**how)
+        for name in copied.__dict__.keys() - type(self).model_fields.keys():
+            del copied.__dict__[name]
+        return copied
+
     @classmethod
     def from_data(cls, data: Any) -> Self:
         """Validate plain data. Raises pydantic.ValidationError, whose ``loc`` are the data's paths."""

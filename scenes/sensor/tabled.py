@@ -35,7 +35,7 @@ class DepthNoise:
         level *= table["per_octave"]
         level += np.float32(1.5) - table["first"] * table["per_octave"]
         # entry 0 is no return; no light, which is NaN or minus infinity, falls there
-        place = np.fmax(np.fmin(level, np.float32(len(self.seen) - 1), out=level), 0.0, out=level).astype(np.int32)
+        place = np.fmin(np.fmax(level, 0.0, out=level), np.float32(len(self.seen) - 1), out=level).astype(np.int32)
         noise = filtered(rng.standard_normal(self.shape, dtype=np.float32), table["rows"], table["columns"])
         seen = rng.random(self.shape, dtype=np.float32) < self.seen.take(place)
         seen &= (range_m > table["nearest_m"]) & (range_m < table["farthest_m"])

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import count
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from scipy import ndimage
@@ -102,7 +102,7 @@ def light_of(view: NoiseFreeView, effects: EffectsConfig) -> tuple[np.ndarray, n
 
 
 KEPT_PATTERNS = 4  # whole sensors' patterns that a process keeps, for further views of the same unit
-_patterns_mm: dict[tuple[str, str, int], np.ndarray] = {}
+_patterns_mm: dict[tuple[Any, ...], np.ndarray] = {}
 
 
 class UnitModel(ABC, Generic[Camera]):
@@ -125,7 +125,8 @@ class UnitModel(ABC, Generic[Camera]):
             error = error + deviation * camera.unit.offset_mm.value * MM
         if not config.effects.fixed_pattern:
             return error
-        key = camera.name, canonical_json(config.numbers), config.unit_seed
+        numbers = canonical_json([config.numbers, camera.fixed_pattern.to_data()])
+        key = camera.name, numbers, config.unit_seed, lens  # several files may bear one name
         if key not in _patterns_mm:
             while len(_patterns_mm) >= KEPT_PATTERNS:
                 del _patterns_mm[next(iter(_patterns_mm))]
