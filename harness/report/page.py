@@ -71,7 +71,7 @@ def limits_figure(compared: pd.DataFrame, layout: Layout, frames: Sequence[int])
             axes.set_xticks(layout.column_values, [f"{value:g}" for value in layout.column_values])
             axes.set(ylim=(0, top), ylabel="smallest diameter found (mm)", xlabel=layout.column_name)
             axes.set_title(many(n, "frame"))
-        columns = int(13 * width_in / (8 + max(map(len, layout.rows))))  # some 13 letters an inch
+        columns = int(15 * width_in / (6 + max(map(len, layout.rows))))  # some 15 letters an inch
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=max(columns, 1))
 
     width_in = 1 + 3.2 * len(frames)

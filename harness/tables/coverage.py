@@ -20,7 +20,7 @@ COVERAGE = Table(
         Column("area_m2", note="its area"),
         Column("a90_mm", note="size found 90 % of the time in the best pose; inf: none inspected; empty: not judged"),
         Column("pose", note="number of that pose"),
-        Column("noise_mm", note="deviation of the detector's residual there in that pose; inf: not judged"),
+        Column("noise_mm", note="the detector's unit of score in that pose; inf: not judged"),
         Column("angle_deg", note="angle of incidence in that pose"),
         Column("range_m", note="distance from the camera in that pose"),
     ),
