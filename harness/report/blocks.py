@@ -115,8 +115,8 @@ def closing(provenance: Mapping[str, Any], experiment_yaml_text: str, left_out: 
     missing = f"{many(sum(map(len, said.values())), 'part')} of the experiment failed: not in any number above."
     parts = [heading("Failures"), paragraph(missing if said else "No trial failed.")]
     for why, parts_of in said.items():
-        others = f" and {len(parts_of) - NAMED} others" if len(parts_of) > NAMED else ""
-        parts.append(tag("p", f"{', '.join(parts_of[:NAMED])}{others}: {why}", kind="fail"))
+        more = f" and {len(parts_of) - NAMED} others" if len(parts_of) > NAMED else ""
+        parts.append(tag("p", f"{', '.join(parts_of[:NAMED])}{more}: {why}", kind="fail"))
     parts += [paragraph(left_out)] if left_out else []
     seconds = dict(provenance.get("seconds", {}))
     rows = [(stage, f"{float(value):.1f}") for stage, value in seconds.items()]
