@@ -1,9 +1,10 @@
-"""``python -m harness.clean cache``: remove stored renders. Asks before it removes anything."""
+"""``python -m harness.clean``: remove stored renders, or folders of results. Asks before it removes anything."""
 
 from __future__ import annotations
 
 import argparse
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 from harness.vocabulary.errors import UserError
@@ -13,9 +14,14 @@ from harness.vocabulary.program import program
 
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("what", choices=("cache",), help="renders; each is rendered again when it is needed")
-    add("--limit", metavar="SIZE", help="the longest unused go until the rest fits, such as 5GB")
-    add("--all", action="store_true", help="all of them")
+    add(
+        "what", choices=("cache", "results"), help="renders, each of which is rendered again when it is needed; results"
+    )
+    add(
+        "name", nargs="?", default="", metavar="NAME[/DIGEST]", help="of results, as python -m harness.ls results shows"
+    )
+    add("--limit", metavar="SIZE", help="of renders: the longest unused go until the rest fits, such as 5GB")
+    add("--all", action="store_true", help="of renders: all of them")
     add("--out", type=Path, default=Path("results"), metavar="DIR", help="where results are (default: results)")
     add("--dry-run", action="store_true", help="say what would be removed; remove nothing")
     add("--yes", action="store_true", help="do not ask")
@@ -23,37 +29,63 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Remove stored renders. Only what tofpod wrote below --out is removed, links are never followed, and what a "
-    "running sweep uses is left alone. A folder of results is removed like any other folder.",
-    epilog="example: python -m harness.clean cache --limit 5GB",
+    "Remove stored renders or results. Only what tofpod wrote below --out is removed, links are never "
+    "followed, and what a running sweep uses is left alone.",
+    epilog="examples: python -m harness.clean cache --limit 5GB; "
+    "python -m harness.clean results averaging/69346a82f4194e03 --dry-run",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0, 1 where something could not be removed or the answer was no, 2 on a mistake of the user."""
-    from harness.listing import bytes_of, cache_removal, refuse_links
+    from harness.listing import bytes_of, cache_removal, chosen_results, refuse_links, removable, remove_empty
     from harness.tables.text import many
-    from scenes.render.cache import alone, removed
+    from scenes.render.cache import removed
 
+    of_results = options.what == "results"
     limit = None if options.limit is None else bytes_of(options.limit)
-    if (limit is None) != options.all:
-        raise UserError("which renders are to go?", legal="--limit SIZE, or --all")
-    folder = options.out / ".cache" / "renders"
-    if not folder.is_dir():
-        print(f"{folder}: there is no cache")
-        return 0
-    refuse_links(folder, folder.parent)
+    if of_results:
+        folders = chosen_results(options.out, options.name)
+        print("\n".join(map(str, folders)))
+    else:
+        folders = [options.out / ".cache" / "renders"]
+        if (limit is None) != options.all:
+            raise UserError("which renders are to go?", legal="--limit SIZE, or --all")
+        if not folders[0].is_dir():
+            print(f"{folders[0]}: there is no cache")
+            return 0
+        refuse_links(folders[0], folders[0].parent)
     if not options.dry_run:
-        with alone(folder):  # a sweep that runs is told before anything is asked
+        with _held(folders, of_results):  # a sweep that runs is told before anything is asked
             pass
-    wanted = cache_removal(folder, limit)
-    size = size_text(sum(file.size_bytes for file in wanted))
-    if not _agreed(options, f"{many(len(wanted), 'stored render')}, {size}", len(wanted)):
+    wanted = [each for one in folders for each in (removable(one) if of_results else cache_removal(one, limit))]
+    what = (
+        f"{len(wanted)} files in {many(len(folders), 'folder')}" if of_results else many(len(wanted), "stored render")
+    )
+    if not _agreed(options, f"{what}, {size_text(sum(file.size_bytes for file in wanted))}", len(wanted)):
         return 0 if options.dry_run or not wanted else 1
-    with alone(folder):  # not while the question waits for its answer: that would block every sweep
+    with _held(folders, of_results):  # not while the question waits for its answer: that would block every sweep
         gone = removed(wanted)
+    for folder in folders if of_results else ():
+        remove_empty(folder)
+        if folder.exists():
+            print(f"{folder}: is kept, as there are files in it that are not tofpod's", file=sys.stderr)
     print(f"removed {many(len(gone), 'file')}, {size_text(sum(file.size_bytes for file in gone))}")
     if kept := len(wanted) - len(gone):
         print(f"{many(kept, 'file')} could not be removed", file=sys.stderr)
     return 1 if kept else 0
+
+
+def _held(folders: list[Path], of_results: bool) -> ExitStack:
+    """Hold folders. Raises UserError where a sweep uses one, or where it cannot be written."""
+    from harness.engine.work import locked
+    from scenes.render.cache import alone
+
+    with ExitStack() as held:
+        for folder in folders:
+            try:
+                held.enter_context(locked(folder) if of_results else alone(folder))
+            except OSError as error:
+                raise UserError(f"{folder}: cannot be written ({error.strerror})", fix="ask whoever owns it") from error
+        return held.pop_all()
 
 
 def _agreed(options: argparse.Namespace, what: str, count: int) -> bool:

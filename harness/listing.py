@@ -1,4 +1,4 @@
-"""Entries that `harness.ls` lists and renders that `harness.clean` removes: tofpod's own, never through a link."""
+"""Entries that `harness.ls` lists and `harness.clean` removes: tofpod's own in ``--out``, never through a link."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from harness.tables.outputs import EXPERIMENT, LATEST, PROVENANCE
+from harness.tables.outputs import EXPERIMENT, JOURNAL, LATEST, LOCK_NAME, PROVENANCE, is_output
 from harness.tables.text import Grid, many
 from harness.vocabulary.declaration.yaml_source import read_yaml
 from harness.vocabulary.errors import UserError
@@ -351,6 +351,8 @@ def point_to(run: Path) -> None:
 
 # ---------------------------------------------------------------- removal
 
+UNFINISHED = re.compile(r"^\.(.+)\.\w{8}\.part(\.\w+)$")  # name of what a killed process was writing
+
 
 def refuse_links(*paths: Path) -> None:
     """Raise UserError where a path is a link."""
@@ -365,3 +367,45 @@ def cache_removal(folder: Path, limit_bytes: int | None) -> list[StoredFile]:
     if limit_bytes is None:
         return stored_renders(folder) + leftovers(folder, 0.0)
     return longest_unused(stored_renders(folder), limit_bytes, ()) + leftovers(folder)
+
+
+def chosen_results(out: Path, name: str) -> list[Path]:
+    """Return the folders of results named ``NAME`` or ``NAME/DIGEST``. Raises UserError where there are none."""
+    experiment, slash, digest = name.partition("/")
+    if not EXPERIMENT_NAME.fullmatch(experiment) or (slash and not DIGEST_NAME.fullmatch(digest)):
+        legal = "NAME or NAME/DIGEST, as python -m harness.ls results shows them"
+        raise UserError(f"{name!r} names no results", legal=legal)
+    parent = Path(out) / experiment
+    refuse_links(parent, parent / digest)
+    found = [path for path in folders_in(parent, DIGEST_NAME) if digest in ("", path.name)]
+    for folder in found or [parent / digest]:
+        # every sweep begins with its declaration, whose first line says whose it is
+        declared = folder / EXPERIMENT.name
+        if not declared.is_file() or not bounded_bytes(declared, TEXT_BYTES).startswith(b"# tofpod experiment "):
+            raise UserError(f"{folder}: is no folder of results", fix="python -m harness.ls results shows them")
+    return found
+
+
+def removable(folder: Path) -> list[StoredFile]:
+    """Return the files of a folder of results that tofpod wrote, locks last."""
+    from harness.engine.journal import SEGMENT_NAME
+
+    found = []
+    for path in sorted(files_below(folder), key=lambda path: LOCK_NAME.fullmatch(path.name) is not None):
+        above, name = path.parent.relative_to(folder), UNFINISHED.sub(r"\1\2", path.name)
+        ours = {
+            Path(): is_output(name, "results") or LOCK_NAME.fullmatch(name),
+            Path(JOURNAL): SEGMENT_NAME.fullmatch(name),
+        }.get(above, re.fullmatch(r"point-[0-9]{3,6}", str(above)) and is_output(name, "capture"))
+        if ours and not path.is_symlink():
+            found.append(StoredFile(path, path.lstat().st_size, path.lstat().st_mtime))
+    return found
+
+
+def remove_empty(folder: Path) -> None:
+    """Remove a folder of results where nothing is left in it, and ``latest`` where it pointed to it."""
+    for inner in (*(path for path, _, _ in os.walk(folder, topdown=False)), folder.parent):
+        if Path(inner) == folder.parent and not folder.exists() and latest_run(folder.parent) == folder.name:
+            (folder.parent / LATEST).unlink()
+        with contextlib.suppress(OSError):
+            os.rmdir(inner)

@@ -3,26 +3,20 @@
 from __future__ import annotations
 
 import re
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 import pyarrow.parquet as pq
 
-from harness.tables.outputs import JOURNAL, LOCK_NAME, FolderKind, outputs
+from harness.tables.outputs import JOURNAL, LOCK_NAME, is_output
 from harness.tables.study import STUDY_TABLES
 from harness.tables.trials import STORED, SUMMARISED
-
-
-def is_output(name: str, place: FolderKind) -> bool:
-    """Return whether a file of this name is what a program writes at this place."""
-    return any(one.place == place and fnmatchcase(name, one.name) for one in outputs())
 
 
 def assert_declared(folder: Path) -> None:
     """Every file of a folder of results, and every column of its tables that is no axis."""
     for path in folder.iterdir():
         known = path.name == JOURNAL or LOCK_NAME.fullmatch(path.name) or is_output(path.name, "results")
-        assert known, f"{path.name} is not declared, so results/README.md does not name it"
+        assert known, f"{path.name} is not declared, so harness.clean would leave it"
     for table in (*STORED, *SUMMARISED, *STUDY_TABLES):
         declared = {name for column in table.stored for name in column.names}
         for path in (folder / name for name in table.files if name.endswith(".parquet")):

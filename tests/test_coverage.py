@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from declared_results import is_output
 
 from harness.coverage import main
 from harness.engine import coverage as engine
@@ -19,7 +18,7 @@ from harness.evaluation.coverage import Damages, Patches, Seen, findable, in_tur
 from harness.evaluation.pod.hit_miss import fit_hit_miss
 from harness.experiment.load import load_experiment
 from harness.tables.coverage import COVERAGE_TABLES
-from harness.tables.outputs import COVERAGE_PAGE
+from harness.tables.outputs import COVERAGE_PAGE, is_output
 from harness.vocabulary.errors import UserError
 
 

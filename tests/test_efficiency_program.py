@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from declared_results import is_output
 
 from harness.efficiency import main
 from harness.engine import ideal
 from harness.tables.efficiency import EFFICIENCY_TABLES
-from harness.tables.outputs import EFFICIENCY_PAGE, EXPERIMENT, STUDY
+from harness.tables.outputs import EFFICIENCY_PAGE, EXPERIMENT, STUDY, is_output
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 import time
@@ -221,15 +220,19 @@ def test_a_latest_of_somebody_else_is_left_alone(tmp_path, capsys, kind):
     }[kind]()
     point_to(run)
     assert "is not tofpod's" in capsys.readouterr().err
-    assert os.path.lexists(theirs) and latest_run(run.parent) is None
+    assert clean.main(["results", "study", "--yes", "--out", str(tmp_path)]) == 0
+    assert os.path.lexists(theirs) and not run.exists()
 
 
-def test_latest_neither_counts_twice_nor_names_a_run_that_is_gone(tmp_path, capsys):
+def test_latest_neither_counts_twice_nor_outlives_its_run(tmp_path, capsys):
     first, second = (results(tmp_path, digit * 16, trials={"done": 1}, started=f"2026-11-2{digit}") for digit in "12")
     point_to(second)
     assert set(listed(capsys, tmp_path)) == {first.name, second.name}
-    shutil.rmtree(second)
-    assert set(listed(capsys, tmp_path)) == {first.name}
+    assert clean.main(["results", "study/latest", "--yes", "--out", str(tmp_path)]) == 2
+    assert clean.main(["results", f"study/{first.name}", "--yes", "--out", str(tmp_path)]) == 0
+    assert latest_run(second.parent) == second.name
+    assert clean.main(["results", "study", "--yes", "--out", str(tmp_path)]) == 0
+    assert not first.parent.exists()
 
 
 # ---------------------------------------------------------------- what is removed
@@ -291,6 +294,66 @@ def test_nothing_is_removed_unasked(cache, tmp_path, capsys, monkeypatch):
         assert clean.main(["cache", "--all", "--out", str(tmp_path)]) == code
         assert len(left_in(cache)) == count
     assert clean.main(["cache", "--out", str(tmp_path)]) == 2
+
+
+def test_results_go_and_what_is_not_tofpods_stays(tmp_path, capsys):
+    first = results(tmp_path, "0" * 16, records=2, trials={"done": 2})
+    for name in ("map-2-50.html", "limits.csv", "limits.parquet", "compare.json", "thresholds.csv", "claims.csv"):
+        (first / name).write_text("x")
+    second = results(tmp_path, "1" * 16, records=2, trials={"done": 2})
+    (second / "notes.md").write_text("mine")
+    (second / "journal" / "notes.md").write_text("mine")
+    (second / "outside").symlink_to(tmp_path.parent)
+    assert clean.main(["results", "study", "--dry-run", "--out", str(tmp_path)]) == 0
+    assert (first / "provenance.json").exists() and not (first / ".lock").exists()
+    assert clean.main(["results", "study", "--yes", "--out", str(tmp_path)]) == 0
+    assert not first.exists()
+    assert {str(path.relative_to(second)) for path in second.rglob("*")} == {
+        "notes.md",
+        "journal",
+        "journal/notes.md",
+        "outside",
+    }
+    assert "is kept" in capsys.readouterr().err and tmp_path.parent.is_dir()
+    (second / "notes.md").unlink()
+
+
+def test_a_folder_that_only_looks_like_results_is_left_alone(tmp_path, capsys):
+    stranger = tmp_path / "photos" / ("0" * 16)
+    stranger.mkdir(parents=True)
+    (stranger / "report.html").write_text("mine")
+    assert clean.main(["results", "photos", "--yes", "--out", str(tmp_path)]) == 2
+    assert "no folder of results" in capsys.readouterr().err
+    assert (stranger / "report.html").read_text() == "mine"
+
+
+def test_a_running_sweep_keeps_all_results_that_were_named(tmp_path, capsys):
+    first, second = (results(tmp_path, digit * 16, records=2) for digit in "01")
+    with locked(second):
+        assert clean.main(["results", "study", "--yes", "--out", str(tmp_path)]) == 2
+    assert "another sweep" in capsys.readouterr().err
+    assert all(len(Journal(one / "journal")) == 2 for one in (first, second))
+
+
+@pytest.mark.parametrize(
+    "name", ["..", "../study", "study/..", "/etc", ".cache", "study/", "study/0", "none", "", "study/" + "9" * 16]
+)
+def test_names_that_name_no_results(tmp_path, capsys, name):
+    results(tmp_path, "0" * 16, records=1)
+    assert clean.main(["results", name, "--yes", "--out", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.startswith("error: ")
+
+
+def test_results_that_are_links_are_refused(tmp_path, capsys):
+    there = results(tmp_path / "elsewhere", "0" * 16, records=1)
+    out = tmp_path / "out"
+    (out / "mine").mkdir(parents=True)
+    (out / "mine" / ("0" * 16)).symlink_to(there)
+    (out / "study").symlink_to(there.parent)
+    for name in ("study", f"study/{'0' * 16}", f"mine/{'0' * 16}"):
+        assert clean.main(["results", name, "--yes", "--out", str(out)]) == 2
+        assert "is a link" in capsys.readouterr().err
+    assert (there / "experiment.yaml").exists()
 
 
 # ---------------------------------------------------------------- words

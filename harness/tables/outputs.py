@@ -1,10 +1,11 @@
-"""Files that programs leave in a folder of results: `results/README.md` knows them from here."""
+"""Files that programs leave in a folder of results: `harness.clean` and `results/README.md` know them from here."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from typing import Literal
 
 FolderKind = Literal["results", "capture"]
@@ -70,3 +71,8 @@ def outputs() -> Iterator[Output]:
         for table in tables:
             for name in table.files:
                 yield Output(name, table.note, of="study" if table in STUDY_ONLY else of)
+
+
+def is_output(name: str, place: FolderKind) -> bool:
+    """Return whether a file of this name is what a program writes at this place."""
+    return any(one.place == place and fnmatchcase(name, one.name) for one in outputs())

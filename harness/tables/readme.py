@@ -19,9 +19,9 @@ Written by `python -m harness.tables.readme` from the declarations in `harness/t
 Sweeps write into `results/<experiment>/<digest>/`; the digest names everything that decides a number.
 `results/<experiment>/{LATEST}` is a link to the newest run that has a report (a text file with its name where the
 system makes no links). `python -m harness.ls results` lists all runs, the settings that tell them apart and the
-detection limits that they found. `{JOURNAL}/` holds finished trials, from which the same command resumes.
-`baselines/` holds what `harness.check` compares with. Noise-free renders are kept in `results/.cache/renders/`.
-All but the baselines can be deleted at any time."""
+detection limits that they found; `python -m harness.clean results` removes them. `{JOURNAL}/` holds finished trials,
+from which the same command resumes. `baselines/` holds what `harness.check` compares with. Noise-free renders are kept
+in `results/.cache/renders/`. All but the baselines can be deleted at any time."""
 TABLES = """
 # Tables
 
