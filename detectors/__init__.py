@@ -19,12 +19,10 @@ GROUP = "tofpod.detectors"
 """Entry points of this group name a class ``C`` with ``C.settings_type`` (a Config) and ``C(settings)`` a Detector."""
 
 BUILT_IN = {
-    "blind": "detectors.controls:BlindDetector",
     "fpfh_memory": "detectors.peers:FpfhMemoryDetector",
     "local": "detectors.local:LocalDetector",
     "m3c2": "detectors.peers:M3c2Detector",
     "matched": "detectors.matched:MatchedDetector",
-    "oracle": "detectors.controls:Oracle",
     "plane_ransac": "detectors.peers:PlaneRansacDetector",
     "thesis": "detectors.thesis:ThesisDetector",
 }

@@ -109,8 +109,7 @@ def _facts(kind: str, name: str) -> Row:
             version = load_detector(name, {}).version
         except UserError:  # not known without settings
             version = None
-        tests = "(tests the harness, finds no damage) " if getattr(loaded, "tests_the_harness", False) else ""
-        return {"version": version, "about": tests + (inspect.getdoc(loaded) or "").strip().partition("\n")[0]}
+        return {"version": version, "about": (inspect.getdoc(loaded) or "").strip().partition("\n")[0]}
     from scenes.sensor.camera import load_camera
 
     camera = load_camera(name)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from detectors import BUILT_IN
 from detectors.open3d_library import MissingLibrary
 from scenes.render.scene import load_mitsuba
 
@@ -47,6 +48,13 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
             make(home)
             (home / "made").touch()
     return home
+
+
+@pytest.fixture
+def control_detectors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The detectors ``oracle`` and ``blind``, which test the harness, by their names."""
+    monkeypatch.setitem(BUILT_IN, "oracle", "control_detectors:Oracle")
+    monkeypatch.setitem(BUILT_IN, "blind", "control_detectors:BlindDetector")
 
 
 @pytest.fixture

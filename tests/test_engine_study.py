@@ -233,6 +233,7 @@ def test_a_serial_and_a_resumed_study_give_the_same_record(finished, tmp_path, m
 ONE_FRAME = ("sweep={}", "capture.frames=1")
 
 
+@pytest.mark.usefixtures("control_detectors")
 def test_the_oracle_scores_one_everywhere(finished, tmp_path, monkeypatch):
     """Handed the truth it finds every damage once and nothing else: whatever is less is a fault of the harness."""
     oracle = "detector={name: oracle, settings: {}}"
@@ -251,6 +252,7 @@ def test_the_oracle_scores_one_everywhere(finished, tmp_path, monkeypatch):
     assert one.pixels.pro == 1.0
 
 
+@pytest.mark.usefixtures("control_detectors")
 def test_the_blind_detector_scores_what_chance_gives(finished, tmp_path, monkeypatch):
     """Its false calls per area are those of its own law at the threshold, its hits those of places laid anywhere: a
     damage is hit where one guess or more falls within the radius, 1 - exp(-rate pi r^2), and no limit is shown.

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from control_detectors import BlindDetector, Oracle, judged_area_m2
 from scipy import stats
 
 from detectors import load_detector
-from detectors.controls import BlindDetector, Oracle, judged_area_m2
 from detectors.interface import ToldTheTruth, TrueDamage
 from harness import testing as checks
 from harness.synthetic_clouds import DISTANCE_M, LENS, SHAPE, cylinder, plane, with_gaps, without
@@ -17,6 +17,8 @@ from harness.testing import CHECKS
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud
+
+pytestmark = pytest.mark.usefixtures("control_detectors")
 
 ALPHA = 0.001
 """Of every statistical test here, with fixed seeds."""

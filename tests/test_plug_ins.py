@@ -18,7 +18,7 @@ from scenes.sensor import camera as cameras
 from scenes.sensor.camera import CAMERA_FOLDER, camera_file, camera_names, load_camera
 from tests.plug_in_packages import offer
 
-OWN_DETECTORS = ("blind", "fpfh_memory", "local", "m3c2", "matched", "oracle", "plane_ransac", "thesis")
+OWN_DETECTORS = ("fpfh_memory", "local", "m3c2", "matched", "plane_ransac", "thesis")
 
 
 MINE = f"{__name__}:Mine"
@@ -216,7 +216,6 @@ def test_everything_is_listed_with_where_it_comes_from(acme_camera, capsys):
     }
     assert set(lines) == {*OWN_DETECTORS, *camera_names()}
     assert "tofpod 0.1.0" in lines["thesis"] and " 5 " in lines["thesis"]
-    assert [name for name, line in lines.items() if "tests the harness" in line] == ["blind", "oracle"]
     assert "acme-cameras 1.2" in lines["acme_tof"] and "512 x 424" in lines["acme_tof"]
     assert "0.5 to 4.5 m" in lines["acme_tof"] and "860 nm" in lines["acme_tof"]
 
@@ -229,7 +228,7 @@ def test_broken_ones_and_clashes_are_listed_as_such_and_the_program_succeeds(mon
     assert "ZeroDivisionError: no luck" in rows["raises"][0]["broken"]
     assert [row["package"] for row in rows["thesis"]] == ["tofpod", "acme"]
     assert all("2 detectors are called 'thesis'" in row["broken"] for row in rows["thesis"])
-    assert "broken" not in rows["oracle"][0]
+    assert "broken" not in rows["local"][0]
     assert main(["detectors"]) == 0
     assert "broken: detector 'bad'" in capsys.readouterr().out
 

@@ -104,8 +104,6 @@ KINDS = {
     "protrusion": "protrusions",
 }
 SIZES = {"diameter_mm": "in diameter", "length_mm": "long", "width_mm": "wide", "depth_mm": "deep"}
-TESTS_THE_HARNESS = ("oracle", "blind")
-"""Detectors whose limits say something of the harness only."""
 NEARLY = f"deviance is at most {NEAR_DEVIANCE:g} above the least"
 RISE = (0.05, 0.95)
 """POD between which the curve rises; sizes should reach past both, or the curve is known from one side."""
@@ -233,13 +231,11 @@ def _missing(limits: Sequence[SetUpLimit], facts: Mapping[str, Any]) -> tuple[st
     source, sweep = facts.get("source", {}), facts.get("sweep") or {}
     target = source.get("target", {})
     only = f": all are {KINDS[kind]}" if (kind := _one_kind(facts)) else ""
-    controls = any(limit.record.detector in TESTS_THE_HARNESS for limit in limits)
     one_unit = "camera" in source and "source.camera.unit_seed" not in sweep
     one_unit &= all(limit.record.units == 1 for limit in limits)
     judged = any(limit.boards for limit in limits)
     simulated, drawn = source.get("kind") == "simulated", target.get("name") == "drawn"
     rules = (
-        (controls, "A detector: the oracle is handed the truth and the blind one guesses, to test the harness."),
         (True, "An inspector, who can miss findings and doubt others: the POD is that of the program alone."),
         (drawn, f"Damage of another kind, that stands in rows or clusters, or several kinds on one board{only}."),
         (simulated, "Translucency, undeclared light and gloss, motion, dirt and wear."),

@@ -27,7 +27,7 @@ class Oracle:
     settings_type: ClassVar[type[Config]] = Config
     name = "oracle"
     version = 1
-    tests_the_harness = True
+    tests_the_harness = True  # missing returns are no findings of theirs
 
     def __init__(self, settings: Config, truth: tuple[TrueDamage, ...] | None = None) -> None:
         self.settings = settings
@@ -87,7 +87,7 @@ class BlindDetector:
     settings_type: ClassVar[type[BlindConfig]] = BlindConfig
     name = "blind"
     version = 1
-    tests_the_harness = True
+    tests_the_harness = True  # missing returns are no findings of theirs
 
     def __init__(self, settings: BlindConfig) -> None:
         self.settings = settings
