@@ -403,8 +403,10 @@ def removable(folder: Path) -> list[StoredFile]:
 
 def remove_empty(folder: Path) -> None:
     """Remove a folder of results where nothing is left in it, and ``latest`` where it pointed to it."""
-    for inner in (*(path for path, _, _ in os.walk(folder, topdown=False)), folder.parent):
-        if Path(inner) == folder.parent and not folder.exists() and latest_run(folder.parent) == folder.name:
-            (folder.parent / LATEST).unlink()
+    for inner, _, _ in os.walk(folder, topdown=False):
         with contextlib.suppress(OSError):
             os.rmdir(inner)
+    if not folder.exists() and latest_run(folder.parent) == folder.name:
+        (folder.parent / LATEST).unlink()
+    with contextlib.suppress(OSError):
+        folder.parent.rmdir()

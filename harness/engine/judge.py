@@ -165,7 +165,7 @@ def detector_of(name: str, settings_json: str, learned: str | None = None) -> De
 def detector_for(
     known: KnownCloud, name: str, settings_json: str, *, hole_free: bool, learned: str | None = None
 ) -> Detector:
-    """Return the detector that is to see a cloud. A built-in one that asks for the truth gets it; a plug-in never does."""
+    """Return the detector that is to see a cloud. A built-in one that asks for the truth gets it; no plug-in does."""
     detector = detector_of(name, settings_json, learned)
     if not (isinstance(detector, ToldTheTruth) and DETECTORS.offer(name).built_in):
         return detector
