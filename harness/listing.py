@@ -403,8 +403,8 @@ def removable(folder: Path) -> list[StoredFile]:
 
 def remove_empty(folder: Path) -> None:
     """Remove a folder of results where nothing is left in it, and ``latest`` where it pointed to it."""
-    for inner in (*(path for path, _, _ in os.walk(folder, topdown=False)), folder.parent):
-        if Path(inner) == folder.parent and not folder.exists() and latest_run(folder.parent) == folder.name:
+    for inner in (*(Path(path) for path, _, _ in os.walk(folder, topdown=False)), folder.parent):
+        if inner == folder.parent and not folder.exists() and latest_run(folder.parent) == folder.name:
             (folder.parent / LATEST).unlink()
         with contextlib.suppress(OSError):
-            os.rmdir(inner)
+            inner.rmdir()

@@ -149,13 +149,9 @@ def with_sizes_told(judged: Judged) -> Judged:
     if not cloud.organised:
         return judged
     outside = np.pad(~holes_filled(np.isfinite(judged.evidence.residual_m)), 1, constant_values=True)
-    cut, said = [], []
-    for finding, detection in zip(judged.findings, judged.detections, strict=True):
-        own = np.zeros(cloud.valid.size, bool)
-        own[detection.pixels] = True
-        if (grown(np.pad(own.reshape(cloud.valid.shape), 1), 1) & outside).any():
-            cut.append(str(finding.id))
-    if cut:
+    rim, said = grown(outside, 1)[1:-1, 1:-1].ravel(), []
+    both = zip(judged.findings, judged.detections, strict=True)
+    if cut := [str(finding.id) for finding, detection in both if rim[detection.pixels].any()]:
         said.append(f"findings that reach the rim of the judged area ({', '.join(cut)}) may be larger than their stated"
                     " sizes")  # fmt: skip
     open_ = [str(each.id) for each in judged.findings if each.kind == "no return" or each.depth_mm > OPEN_MM]
