@@ -143,16 +143,19 @@ def one_damage_once(
     shape: tuple[int, int], found: tuple[Detection, ...], missing: tuple[Detection, ...]
 ) -> tuple[Detection, ...]:
     """Return findings by depth and by missing returns (flat indices into a grid of ``shape``) as one list, strongest
-    first; where two of them are the same damage (`REACH_PX`, `APART`) the larger stands for it."""
-    kept, depth = list(missing), list(found)
+    first; of all that are one damage with a place without return (`REACH_PX`, `APART`) the largest stands for it."""
+    kept: list[Detection] = []
+    depth = list(found)
     for hole in missing:
         area = _filled(shape, hole.pixels)
         apart, _ = nearest_pixel(area)
-        same = [_is_same(apart, other.pixels) for other in depth]
-        if any(len(other.pixels) >= area.sum() for other, one in zip(depth, same, strict=True) if one):
-            kept.remove(hole)
+        same = [other for other in depth if _is_same(apart, other.pixels)]
+        largest = max(same, key=lambda each: len(each.pixels), default=None)
+        if largest is None or len(largest.pixels) < area.sum():
+            kept.append(hole)
         else:
-            depth = [other for other, one in zip(depth, same, strict=True) if not one]
+            same = [other for other in same if other is not largest]
+        depth = [other for other in depth if all(other is not one for one in same)]
     return tuple(sorted((*depth, *kept), key=lambda each: -each.score))
 
 

@@ -274,6 +274,21 @@ def test_a_finding_that_the_crop_cuts_is_told_first(
     assert said.startswith("warning: findings that reach the rim of the judged area (1)") == is_cut
 
 
+@pytest.mark.parametrize(("blur_px", "is_doubted"), [(1, False), (5, True)])
+def test_a_filter_that_hides_the_rim_of_a_hole_to_the_room_behind_is_told_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], blur_px: int, is_doubted: bool
+) -> None:
+    rng, (v, u) = np.random.default_rng(1), np.mgrid[:120, :160]
+    clean = np.where(np.hypot(u - 90, v - 50) < 8, 2500.0, 700.0)
+    white = rng.standard_normal((8, 120, 160))
+    noise = np.stack([blur_px * cv2.blur(each, (blur_px, blur_px)) for each in white])
+    np.save(tmp_path / "depth.npy", np.rint(clean + noise).astype(np.uint16))
+    (tmp_path / "lens.json").write_text('{"fx": 400, "fy": 400, "cx": 80, "cy": 60}')
+    assert detect.main([str(tmp_path / "depth.npy"), "--intrinsics", str(tmp_path / "lens.json")]) == 0
+    said = capsys.readouterr().out
+    assert ("show what lies far behind, or nothing (1), may be up to" in said.split("target 1")[0]) == is_doubted
+
+
 def test_settings_reach_the_detector(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     own = ["--detector", "thesis", "--set", "scale=highest_before"]
     assert detect.main([str(capture), *own, "--average", "median"]) == 0

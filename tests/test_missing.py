@@ -176,6 +176,11 @@ def test_a_hole_seen_by_depth_and_by_missing_returns_is_one_damage() -> None:
     specks = (depth_finding(disc(55, 45, 2), 8.0), depth_finding(disc(65, 45, 2), 7.0))
     kept = one_damage_once(SHAPE, (*specks, far), (nothing,))
     assert [(one.kind, one.score) for one in kept] == [("no return", 12.0), ("depth", 6.0)]
+    # a hole most of which is deep; a part of it and of its rim returned nothing, and a speck of the rim did
+    hole = disc(60, 45, 12)
+    gap = Detection(12.0, np.flatnonzero(hole & (U >= 62)), np.zeros(3), "no return")
+    found = (depth_finding(hole & (U < 62)), depth_finding(disc(67, 45, 4), 8.0), far)
+    assert [one.score for one in one_damage_once(SHAPE, found, (gap,))] == [9.0, 6.0]
 
 
 def test_a_hole_beside_a_place_without_return_is_damage_of_its_own() -> None:

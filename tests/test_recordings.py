@@ -116,7 +116,7 @@ def xyz_with_a_stated_grid(tmp: Path) -> Recording:
 
 
 def csv_with_names_and_commas(tmp: Path) -> Recording:
-    head = "intensity;X (m);Y (m);Z (m)\n"
+    head = "\N{BYTE ORDER MARK}intensity;X (m);Y (m);Z (m)\n"
     return open_capture(
         [plane.write_points(tmp / "c.csv", TRUE_M, head, ";", decimal=",", before="7")], lens=plane.LENS
     )
@@ -309,6 +309,8 @@ def test_every_kind_of_lens_file_gives_the_same_lens(
         ("500 0 300 0\n0 510 200 0\n0 0 1 0\n0 0 0 1 # of a scan\n", (0.0,) * 8),
         ("[[500.0, 0, 300], [0, 510, 200], [0, 0, 1]]", (0.0,) * 8),
         ("500 510 300 200", (0.0,) * 8),
+        ('{"intrinsic_matrix": [500, 0, 300, 0, 510, 200, 0, 0, 1]}', (0.0,) * 8),
+        ('{"K": [500, 0, 0, 0, 510, 0, 300, 200, 1]}', (0.0,) * 8),
         ('{"width": 640, "height": 576, "ppx": 300, "ppy": 200, "fx": 500, "fy": 510, "coeffs": [0, 0, 0, 0, 0],'
          ' "model": "distortion.inverse_brown_conrady"}', (0.0,) * 8),
         ('{"fl_x": 500, "fl_y": 510, "cx": 300, "cy": 200, "w": 640, "h": 576, "k1": 0.1, "k2": 0.2, "p1": 0.01,'

@@ -213,6 +213,15 @@ def test_a_lens_of_larger_images_of_the_same_shape_is_scaled_and_said(tmp_path: 
 # ---- images that are not the camera's own ----------------------------------------------------------------------------
 
 
+def test_a_lens_whose_middle_lies_at_the_rim_of_the_images_is_doubted(tmp_path: Path) -> None:
+    half = {"fx": plane.LENS.fx / 2, "fy": plane.LENS.fy / 2, "cx": plane.LENS.cx / 2, "cy": plane.LENS.cy / 2}
+    for lens, is_doubted in ((half, True), ({**half, "cx": plane.LENS.cx, "cy": plane.LENS.cy}, False)):
+        (tmp_path / "lens.json").write_text(json.dumps(lens))
+        np.save(tmp_path / "d.npy", plane.depth_mm())
+        said = open_capture([tmp_path / "d.npy"], intrinsics=tmp_path / "lens.json").warnings
+        assert any("principal point" in each for each in said) == is_doubted
+
+
 @pytest.mark.parametrize(("side", "finer", "least", "most"), ((1, 1, 1, 1), (5, 1, 5, 5), (5, 2, 9, 11), (3, 3, 8, 10)))
 def test_the_reach_of_noise_is_the_filter_times_the_upsampling(side: int, finer: int, least: int, most: int) -> None:
     rng, frames = np.random.default_rng(3), []

@@ -8,6 +8,7 @@ told by a lens with as many pixels, or a sensor's usual size on which x/z and y/
 
 from __future__ import annotations
 
+import codecs
 import io
 import re
 import struct
@@ -191,7 +192,7 @@ COLUMNS = {
 def _read_list(path: Path, lens: Lens | None) -> tuple[np.ndarray, tuple[int, int], np.ndarray | None, Any]:
     """Read one list of points. Raises UserError where it cannot be read as numbers."""
     with damage_told(f"{path}: cannot be read", LEGAL_LIST):
-        content = bounded_bytes(path, TABLE_BYTES)
+        content = bounded_bytes(path, TABLE_BYTES).removeprefix(codecs.BOM_UTF8)
     lines = content[:65536].decode("latin1").splitlines()[:HEAD_LINES]
     head = [bool(re.match(r"\s*(#|//|;|$)", line)) or _numbers(line) is None for line in lines]
     skipped = head.index(False) if False in head else len(lines)

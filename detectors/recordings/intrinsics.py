@@ -124,7 +124,9 @@ MATRICES = ("intrinsic_matrix", "camera_matrix", "cam_K", "K", "k")
 SIZES = (("width", "height"), ("image_width", "image_height"), ("width_px", "height_px"), ("w", "h"))
 COEFFICIENTS = ("distortion", "distortion_coefficients", "D", "d", "coeffs", "dist_coeffs")
 MODELS = ("distortion_model", "model", "camera_model")
-"""Keys by which programs name focal lengths and centre, the matrix (the first's by columns), size, and distortion."""
+"""Keys by which programs name focal lengths and centre, the matrix, size, and distortion."""
+FAR_OFF = 0.2
+"""Part of the image by which a principal point may lie off its middle before the lens is doubted."""
 NUMBER, MAX_MATRIX_TEXT = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", 2000
 NESTED = 3  # levels of mappings in a file in which a lens is looked for
 DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -192,12 +194,18 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
         what = f"focal length {fx:g}, {fy:g} or principal point {cx:g}, {cy:g} of no {width} x {height} image"
         fix = "multiply a normalised focal length by the image's width"
         raise UserError(f"{path}: {what}", legal="pixels, from the centre of the first one", fix=fix)
-    distortion = _distortion(path, data)
-    if (across, down) == (width, height):
-        return Lens(width, height, fx, fy, cx, cy, distortion)
-    warning = f"{path.name} is the lens of images of {across} x {down} pixels; it is scaled to {width} x {height},"
-    warning += " which is right unless the smaller image is cut out of the larger"
-    return OtherLens(width, height, fx, fy, cx, cy, distortion, warning=warning)
+    numbers = (width, height, fx, fy, cx, cy, _distortion(path, data))
+    if (across, down) != (width, height):
+        warning = f"{path.name} is the lens of images of {across} x {down} pixels; it is scaled to {width} x {height},"
+        warning += " which is right unless the smaller image is cut out of the larger"
+        return OtherLens(*numbers, warning=warning)
+    if max(abs((cx + 0.5) / width - 0.5), abs((cy + 0.5) / height - 0.5)) <= FAR_OFF:
+        return Lens(*numbers)
+    warning = (
+        f"{path.name} has its principal point at {cx:.5g}, {cy:.5g}, far from the middle of {width} x {height} pixels:"
+    )
+    warning += " unless the images are cut out of larger ones, it is the lens of another size, and all sizes are wrong"
+    return OtherLens(*numbers, warning=warning)
 
 
 def parsed_lens(path: Path) -> dict[str, Any]:
@@ -279,8 +287,8 @@ def _focal_and_centre(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
     key = _matrix_key(data)
     assert key is not None
     m = _numbers(path, key, data[key], 9)
-    # Open3D's matrix stands column by column, all others' row by row
-    return (m[0], m[4], m[6], m[7]) if key == MATRICES[0] else (m[0], m[4], m[2], m[5])
+    # the last row is 0 0 1: what stands elsewhere tells whether it is by rows, or by columns as Open3D's
+    return (m[0], m[4], m[6], m[7]) if m[6] or m[7] else (m[0], m[4], m[2], m[5])
 
 
 def _distortion(path: Path, data: dict[str, Any]) -> tuple[float, ...]:

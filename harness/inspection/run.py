@@ -71,6 +71,10 @@ def analysed(detector: Detector, cloud: Cloud) -> Evidence:
     return replace(evidence, warnings=(*evidence.warnings, doubt)) if doubt else evidence
 
 
+OPEN_MM, FILTER_PX = 75.0, 3.0
+"""Depth beyond which a hole shows what lies far behind it, and the least width of a filter that hides its rim."""
+
+
 def refuse_thresholds(arguments: argparse.Namespace) -> None:
     """Raise UserError where several arguments set the threshold, or where its value is none."""
     given = [f"--{name.replace('_', '-')}" for name in THRESHOLDS if getattr(arguments, name) is not None]
@@ -138,21 +142,24 @@ def with_faint_told(judged: Judged, threshold: float) -> Judged:
     return replace(judged, evidence=evidence)
 
 
-def with_cut_told(judged: Judged) -> Judged:
-    """Add a warning where findings reach the rim of what is judged: the rest of them was not seen."""
-    if not judged.cloud.organised:
+def with_sizes_told(judged: Judged) -> Judged:
+    """Add warnings where findings reach the rim of what is judged, as the rest of them was not seen, and where the room
+    behind shows through holes whose rim the camera's filter, as wide as the noise's reach, draws over them."""
+    cloud = judged.cloud
+    if not cloud.organised:
         return judged
     outside = np.pad(~holes_filled(np.isfinite(judged.evidence.residual_m)), 1, constant_values=True)
-    cut = []
-    for finding, detection in zip(judged.findings, judged.detections, strict=True):
-        own = np.zeros(judged.cloud.valid.size, bool)
-        own[detection.pixels] = True
-        if (grown(np.pad(own.reshape(judged.cloud.valid.shape), 1), 1) & outside).any():
-            cut.append(str(finding.id))
-    if not cut:
-        return judged
-    warning = f"findings that reach the rim of the judged area ({', '.join(cut)}) may be larger than their stated sizes"
-    return replace(judged, evidence=replace(judged.evidence, warnings=(*judged.evidence.warnings, warning)))
+    rim, said = grown(outside, 1)[1:-1, 1:-1].ravel(), []
+    both = zip(judged.findings, judged.detections, strict=True)
+    if cut := [str(finding.id) for finding, detection in both if rim[detection.pixels].any()]:
+        said.append(f"findings that reach the rim of the judged area ({', '.join(cut)}) may be larger than their stated"
+                    " sizes")  # fmt: skip
+    open_ = [str(each.id) for each in judged.findings if each.kind == "no return" or each.depth_mm > OPEN_MM]
+    if open_ and cloud.noise_reach_px >= FILTER_PX:
+        most_mm = cloud.noise_reach_px * float(np.nanmedian(np.abs(np.diff(cloud.points_m[..., 0], axis=1)))) / MM
+        said.append(f"holes that show what lies far behind, or nothing ({', '.join(open_)}), may be up to {most_mm:.2g}"
+                    " mm wider than stated: the camera's filter mixes their rim into them")  # fmt: skip
+    return replace(judged, evidence=replace(judged.evidence, warnings=(*judged.evidence.warnings, *said)))
 
 
 def _calls(expected: float) -> str:
@@ -228,7 +235,7 @@ def inspect(arguments: argparse.Namespace) -> int:
     evidence = replace(evidence, warnings=(*doubted, *evidence.warnings))
     threshold, origin, evidence = threshold_of(arguments, detector, cloud, evidence, silent_threshold)
     result = judged(detector, cloud, evidence, threshold)
-    result = with_cut_told(result if mapped else with_faint_told(result, threshold))
+    result = with_sizes_told(result if mapped else with_faint_told(result, threshold))
     seen = seen_on(gauge, result, f"{detector.name} {detector.version}", threshold) if gauge else None
     found = (mapped, registrations, detector, settings, result, threshold, origin, seen)
     run = Inspection(arguments, recordings, choices, config, *found)

@@ -87,14 +87,14 @@ def certified(found: Characteristics, poses: Sequence[np.ndarray] | None) -> Ite
     def row(quantity: str, conditions: str, value: str, manner: str) -> dict[str, str]:
         return {"quantity": quantity, "conditions": conditions, "value": value, "manner": manner}
 
-    for name, where, unit, reading, meaning in shared_figures(found):
+    for name, where, unit, value, meaning in shared_figures(found):
         if name.endswith("correlation") and not where.endswith(" lag 1"):
             continue  # the rest stands on the page
-        yield row(name, where, f"{round(reading.value, 3) + 0.0:.3g} {unit}".removesuffix(" 1"), meaning)
+        yield row(name, where, f"{round(value, 3) + 0.0:.3g} {unit}".removesuffix(" 1"), meaning)
     flat = all(capture.planes for capture in found.captures)
     errors = [] if poses is None or not flat else list(spacings_mm(found, poses))
-    value = f"{max(map(abs, errors)):.3g} mm at most" if errors else "not measured"
-    yield row("spacing error", f"{len(errors)} spacings", value, "of planes by --poses, in the manner of ISO 10360-13")
+    most = f"{max(map(abs, errors)):.3g} mm at most" if errors else "not measured"
+    yield row("spacing error", f"{len(errors)} spacings", most, "of planes by --poses, in the manner of ISO 10360-13")
     yield row("probing-form and size error", "", "not measured", "VDI/VDE 2634-2 asks for a calibrated sphere")
 
 

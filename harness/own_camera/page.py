@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.signal.windows import parzen
 
+from harness.evaluation.intervals import UNKNOWN
 from harness.own_camera.measure import Characteristics
 from harness.report.blocks import BLUE, GREY, ORANGE, command_of, figure, heading, page, paragraph, svg
-from harness.scorecard.bench import Reading
 from harness.tables.characteristics import OWN_CURVES, OWN_FIGURES, OwnFigure
 from harness.tables.schema import Estimate, write_table
 from harness.tables.text import show
@@ -36,7 +36,7 @@ CAPTION = (
     "three are alike; correlation of noise and of fixed pattern between neighbours along x and y, and their spectra, "
     "where white noise would be 1; displacement of whole frames; dropouts. The camera file's simulation is orange."
 )
-Told = tuple[str, str, str, Reading, str]
+Told = tuple[str, str, str, float, str]
 """Name, place, unit, value and meaning of a figure."""
 
 
@@ -44,7 +44,7 @@ def own_figures(found: Characteristics) -> Iterator[Told]:
     """Yield each figure; the same of every source, in the same order."""
     for one in found.surfaces:
         relief = "the surface's own shape and the lens' error included"
-        yield "temporal noise", one.where, "mm", one.temporal, "deviation of single pixels over frames, of z"
+        yield "temporal noise", one.where, "mm", one.temporal.value, "deviation of single pixels over frames, of z"
         forms = (
             ("plane-fit rms, one frame", one.frame_rms_mm, "spatial noise of points about their own plane"),
             ("plane-fit rms, average", one.average_rms_mm, "the same of the average of all frames"),
@@ -52,8 +52,8 @@ def own_figures(found: Characteristics) -> Iterator[Told]:
             ("flatness, 99.7 %", one.form997_mm, "width of 99.7 %, in the manner of VDI/VDE 2634-2"),
         )
         for name, value, meaning in forms:
-            yield name, one.where, "mm", Reading(value), f"{meaning}; {relief}"
-        yield "fill rate", one.where, "1", Reading(one.fill_rate), "share of pixels and frames with a return"
+            yield name, one.where, "mm", value, f"{meaning}; {relief}"
+        yield "fill rate", one.where, "1", one.fill_rate, "share of pixels and frames with a return"
     yield from shared_figures(found)
 
 
@@ -61,37 +61,29 @@ def shared_figures(found: Characteristics) -> Iterator[Told]:
     """Yield the figures that are of no single surface."""
     for axis, name in enumerate("xy"):
         for lag in SHOWN_LAGS:
-            alike = Reading(float(found.correlation[axis, lag]))
+            alike = float(found.correlation[axis, lag])
             yield "noise correlation", f"{name}, lag {lag}", "1", alike, "of neighbours' temporal noise"
         power = np.cumsum(density_of(found.correlation[axis]))
-        half = Reading(float(np.interp(0.5 * power[-1], power, FREQUENCIES)))
-        yield (
-            "noise spectrum",
-            f"along {name}",
-            "1/px",
-            half,
-            "frequency below which half of the noise's power lies",
-        )
-    yield "frame jitter", "all", "mm", Reading(found.jitter_m / MM), "deviation of whole frames' displacement"
+        half = float(np.interp(0.5 * power[-1], power, FREQUENCIES))
+        yield "noise spectrum", f"along {name}", "1/px", half, "frequency below which half of its power lies"
+    yield "frame jitter", "all", "mm", found.jitter_m / MM, "deviation of whole frames' displacement"
     for capture in found.captures:
-        drift = Reading(capture.drift_m / MM)
-        yield "drift", capture.name, "mm", drift, "change of the distance from first to last frame"
-    step = Reading(found.captures[0].step_m / MM)
-    yield "rounding step", "all", "mm", step, "of the stored distance along the axis"
-    share = Reading(len(found.jumps_m) / found.frames)
+        yield "drift", capture.name, "mm", capture.drift_m / MM, "change of the distance from first to last frame"
+    yield "rounding step", "all", "mm", found.captures[0].step_m / MM, "of the stored distance along the axis"
+    share = len(found.jumps_m) / found.frames
     yield "displaced frames", "all", "1", share, "share of frames that are displaced as a whole"
     if found.pattern is not None:
-        rms = Reading(found.pattern.field.rms_m / MM)
-        yield "fixed pattern", "all", "mm", rms, "error of range that all frames share, less a smooth fit"
+        rms_mm = found.pattern.field.rms_m / MM
+        yield "fixed pattern", "all", "mm", rms_mm, "error of range that all frames share, less a smooth fit"
     if found.pattern_correlation is not None:
         for axis, name in enumerate("xy"):
             for lag in SHOWN_PATTERN_LAGS:
-                alike = Reading(float(found.pattern_correlation[axis, lag]))
+                alike = float(found.pattern_correlation[axis, lag])
                 yield "pattern correlation", f"{name}, lag {lag}", "1", alike, "of neighbours' fixed pattern"
     if found.edge is not None:
         where = "steps of depth"
-        yield "gap at an edge", where, "px", Reading(found.edge.gap_px), "pixels without a return across an edge"
-        yield "flying pixels", where, "px", Reading(found.edge.flying_px), "pixels with a range on neither surface"
+        yield "gap at an edge", where, "px", found.edge.gap_px, "pixels without a return across an edge"
+        yield "flying pixels", where, "px", found.edge.flying_px, "pixels with a range on neither surface"
 
 
 def beside(found: Characteristics, twin: Characteristics, known: Characteristics | None) -> list[OwnFigure]:
@@ -99,14 +91,16 @@ def beside(found: Characteristics, twin: Characteristics, known: Characteristics
     every = (found, twin, known)
     places = [{one.where: (one.capture, one.number) for one in each.surfaces} if each else {} for each in every]
     values = [
-        {(row[0], place.get(row[1], row[1])): row[3].value for row in own_figures(each)} if each else {}
+        {(row[0], place.get(row[1], row[1])): row[3] for row in own_figures(each)} if each else {}
         for each, place in zip(every, places, strict=True)
     ]
+    ends = {("temporal noise", one.where): one.temporal.interval for one in found.surfaces}
     rows = []
     for name, where, unit, value, meaning in own_figures(found):
         key = name, places[0].get(where, where)
         simulated, of_known = (value_of.get(key, float("nan")) for value_of in values[1:])
-        measured = Estimate(value.value, value.interval.low, value.interval.high)
+        interval = ends.get((name, where), UNKNOWN)
+        measured = Estimate(value, interval.low, interval.high)
         rows.append(OwnFigure(name, where, unit, measured, simulated, of_known, meaning))
     return rows
 
