@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from textwrap import fill
 from typing import TYPE_CHECKING
 
 from markupsafe import Markup
@@ -28,7 +29,7 @@ def posterior_section(posterior: pd.DataFrame) -> list[Markup]:
             rows = axes[axes["axis"] == name]
             panel.bar(rows["value"], rows["posterior_share"], color=blocks.BLUE, label="posterior")
             panel.step(rows["value"], rows["prior_share"], where="mid", color=blocks.GREY, label="prior")
-            panel.set_title(name, fontsize=8)
+            panel.set_title(fill(name, 24), fontsize=8)
             panel.tick_params(axis="x", labelsize=8)
             panel.set(ylim=(0, 1))
         for panel in panels[len(names) :]:

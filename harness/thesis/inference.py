@@ -13,7 +13,7 @@ import numpy as np
 
 from harness.evaluation.maps import MANY
 from harness.thesis.claims import CAMERA, FEW, FOUND_WITH_FEW, FOUND_WITH_MANY, THESIS_HOLES
-from harness.vocabulary.path_names import names_of, value_text
+from harness.vocabulary.path_names import in_words, names_of, value_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -73,6 +73,6 @@ def borne_out_if(posterior: pd.DataFrame) -> str:
     said = "; ".join(asked) if asked else "nothing in particular holds: every value of every axis remains possible"
     return (
         f"The thesis' outcome is borne out if {said} (of {int((posterior['axis'] == SET_UP).sum())} set-ups; values "
-        f"that the outcome makes less than half as probable are left out). In the likeliest set-up, {best['value']}, "
-        f"the exact outcome has a probability of {best['likelihood']:.2g}."
+        f"that the outcome makes less than half as probable are left out). In the likeliest set-up, "
+        f"{in_words(best['value'])}, the exact outcome has a probability of {best['likelihood']:.2g}."
     )
