@@ -114,7 +114,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     made = []
     for placement in placements(scans, family, options.camera, options.targets, options.seed, cache):
         made.append(placement)
-        print(f"rendered {sum(len(one.implants) for one in made)} of {options.targets} damages", file=sys.stderr)
+        print(f"damages rendered: {sum(len(one.implants) for one in made)}, wanted: {options.targets}", file=sys.stderr)
     longest = max(len(scan.frames) for scan in scans)
     frames = sorted(set(options.frames or (1, longest)))
     tables, set_ups, warnings = judge_scans(scans, made, family, options.camera, judging, frames)

@@ -261,7 +261,7 @@ def judge_scans(
             cloud = placement.cloud(slices[at % len(slices)])
             known = placement.scan.known(cloud, placement.target)
             _add(rows, judging, known, threshold, {"frames": count, "board": placement.number, "role": "damaged"})
-            print(f"{count} frames: placement {at + 1} of {len(made)}", file=sys.stderr)
+            print(f"frames averaged {count}: placement {at + 1} of {len(made)}", file=sys.stderr)
     tables = ResultTables(
         **{name: pd.DataFrame(columns_of(some, {}) if some else {}) for name, some in rows.items()},
         probes=pd.DataFrame(), variants=pd.DataFrame(), noise=pd.DataFrame(), axes=pd.DataFrame(),
