@@ -1,10 +1,10 @@
 """A part before a camera, patch by patch: its noise there, how strong damage shows, and how often it is found.
 
 Noise at a place is the detector's unit of score on the undamaged part there, in metres: a constant where it has one
-scale for the whole part, else what it takes from round about. Less is needed where the undamaged part leans to the side
-of damage, by the unit's pattern or the surface's misfit. Strength is d' of the ideal observer at a noise of 1 m, from
-noise-free views with and without the damage. Both are learnt on boards of the family in random poses as wide as those
-asked for. Not modelled: an unknown surface in the strength, light of other parts, information in missing returns."""
+scale for the whole part, else what it takes from round about. Strength is d' of the ideal observer at a noise of 1 m,
+from noise-free views with and without the damage. Both are learnt on boards of the family in random poses as wide as
+those asked for. Not modelled: which way the undamaged part errs at a place (the unit's pattern, the surface's misfit),
+an unknown surface in the strength, light of other parts, information in missing returns."""
 
 from __future__ import annotations
 
@@ -38,8 +38,7 @@ from scenes.target.truth import Damage, face_of
 
 BOARDS, LOOKS = 40, 3  # Damaged boards on which strength and hits are learnt, and averages in which each is inspected
 STEEPEST_DEG = 60.0  # Tilt about either axis of these boards, at most
-DRAWS, AROUND_PX, NEAR_PX = 2, 31, 15  # Averages for noise; sides of squares for the unit of score; for what is nearer
-LEAST_LEFT = 0.2  # Share of the threshold that damage has to add, at least, whatever the undamaged board scores
+DRAWS, AROUND_PX, NEAR_PX = 2, 31, 15  # Averages for noise; sides of squares for the unit of score, for missing pixels
 MOST_PATCHES = 3000
 SAME_MM = 1e-6  # Sizes that differ by less are one: then the size of damage is its depth
 ON_FACE_M = 5 * MM  # A patch is seen where the view's own z agrees with its z by this, or by two pixels along the slope
@@ -85,10 +84,9 @@ def survey(experiment: Experiment, poses: Sequence[Pose], cache: Path, folder: P
                 raise UserError(f"{point.label or point.variant} has no threshold: {why}")
             task = point_task(point, outcome.thresholds[point.digest], group.learned.get(point.digest))
             boards = _each(_board_learnt, zip(group.then, wholes, strict=True), (task, group.seed), engine)
-            boards = [one for one in boards if one is not None]
-            damages, blind = _damages(boards, point, rows), np.full(len(patches.areas_m2), np.inf)
-            sense = -1 if any(damage.raised for _, some, _ in boards for damage, _, _ in some) else 1
-            seen = _each(_part_seen, ((view,) for view in views), (task, group.seed, patches, sense), engine)
+            damages = _damages([one for one in boards if one is not None], point, rows)
+            blind = np.full(len(patches.areas_m2), np.inf)
+            seen = _each(_part_seen, ((view,) for view in views), (task, group.seed, patches), engine)
             seen = [Seen(blind, np.ones(len(blind)), np.ones(len(blind))) if one is None else one for one in seen]
             surveys.append(Survey(point, task, patches, findable(damages), dict(zip(poses, seen, strict=True))))
     return surveys
@@ -178,27 +176,25 @@ def _damages(boards: Sequence[Any], point: Point, looks: Mapping[tuple[str, int,
     return Damages(word, size_mm, Seen(*seen), strength, found, inspections)
 
 
-def _residuals(batch: Batch, point: PointTask, seed: int, sense: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _residuals(batch: Batch, point: PointTask, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The detector's residuals (k, h, w) on averages of a hole-free board, where judged (k, h, w), and its unit of
-    score in metres (h, w): the residual over the score, rms about each pixel. It is smaller where the scores of the
-    undamaged board lean to the side of damage (``sense``: 1 behind the surface, -1 before it), as much as these are of
-    the threshold; larger where some averages are not judged, infinite where most are not."""
-    residuals, scores, threshold = [], [], point.threshold
-    assert threshold is not None
+    score in metres (h, w): the residual over the score, rms about each pixel; larger where some averages are not
+    judged, infinite where most are not."""
+    fields = []
     for repeat in range(DRAWS):
         task = TrialTask(batch.before(repeat), seed, "hole_free", repeat, (point,), None, batch.board)
         evidence = detector_of(point.detector, point.settings_json, point.learned).analyse(cloud_of(task, point))
-        residuals.append(evidence.residual_m)
-        scores.append(np.where(np.isfinite(evidence.score), evidence.score, np.nan))
-    known = np.isfinite(scores)
-    noise_m, score = np.where(known, residuals, 0.0), np.where(known, scores, 0.0)
-    lean = np.copysign(score, sense * noise_m).mean(axis=0)
-    square, of_score = (ndimage.uniform_filter((one**2).mean(axis=0), AROUND_PX) for one in (noise_m, score))
-    share, leaning = (ndimage.uniform_filter(one, NEAR_PX) for one in (known.mean(axis=0), lean))
+        judged = np.isfinite(evidence.score)
+        fields.append([np.where(judged, one, np.nan) for one in (evidence.residual_m, evidence.score)])
+    noise_m, score = np.moveaxis(np.array(fields), 1, 0)
+    known = np.isfinite(score)
+    noise_m = np.where(known, noise_m, 0.0)
+    each = (noise_m, np.where(known, score, 0.0))
+    square, of_score = (ndimage.uniform_filter((one**2).mean(axis=0), AROUND_PX) for one in each)
+    share = ndimage.uniform_filter(known.mean(axis=0), NEAR_PX)
     judged = (known.mean(axis=0) >= 0.5) & (square > 0) & (of_score > 0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        left = np.maximum(1 - leaning / share / threshold, LEAST_LEFT)
-        return noise_m, known, np.where(judged, np.sqrt(square / of_score / share) * left, np.inf)
+        return noise_m, known, np.where(judged, np.sqrt(square / of_score / share), np.inf)
 
 
 def _board_learnt(
@@ -206,8 +202,7 @@ def _board_learnt(
 ) -> tuple[int, list[tuple[Damage, np.ndarray, tuple[float, float, float]]], NoiseSums]:
     """A damaged board's number, its damages with signatures (cut-outs, metres) and how each is seen, and its noise."""
     set_up, intact = (load_set_up(one.set_ups[0]) for one in (batch, whole))
-    sense = -1 if any(damage.raised for damage in set_up.truth) else 1
-    noise_m, known, deviation_m = _residuals(whole, point, seed, sense)
+    noise_m, known, deviation_m = _residuals(whole, point, seed)
     change_m = np.nan_to_num(noise_free_z_m(set_up) - noise_free_z_m(intact))
     x_m, y_m = np.moveaxis(set_up.board_xy_m, -1, 0)
     found = []
@@ -222,10 +217,10 @@ def _board_learnt(
     return batch.board or 0, found, noise_sums(noise_m / deviation_m, known & np.isfinite(deviation_m))
 
 
-def _part_seen(view: Batch, point: PointTask, seed: int, patches: Patches, sense: int) -> Seen:
+def _part_seen(view: Batch, point: PointTask, seed: int, patches: Patches) -> Seen:
     """Return how the patches of an undamaged part are seen and judged."""
     set_up = load_set_up(view.set_ups[0])
-    _, _, deviation_m = _residuals(view, point, seed, sense)
+    _, _, deviation_m = _residuals(view, point, seed)
     there = transform_points(set_up.T_camera_board, patches.points_m)
     range_m = np.linalg.norm(there, axis=1)
     cosine = -(rotate_vectors(set_up.T_camera_board, patches.normals) * there).sum(axis=1) / range_m

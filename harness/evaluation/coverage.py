@@ -79,7 +79,8 @@ class Findable:
         """Return what was learnt, in a sentence."""
         return (
             f"Learnt from {self.damages} damages, whose strength scatters by {100 * self.scatter:.0f} % about what "
-            f"size, angle and distance say; found nine times in ten from a d' of {self.index:.3g} on."
+            f"size, angle and distance say; found nine times in ten from a d' of {self.index:.3g} on. The limit of a "
+            "single patch may be wrong by a third."
         )
 
     @property

@@ -17,12 +17,11 @@ from harness.tables.text import many, percent
 COLOURS = ("#fde725", "#a0da39", "#4ac16d", "#1fa187", "#277f8e", "#365c8d", "#46327e", "#b3261e", "#8a8f96")
 """Seven steps of viridis (van der Walt and Smith, 2015), light where small damage is found; red; grey."""
 METHOD = (
-    "Each patch has the detector's unit of score, less where the undamaged part leans to the side of damage (the "
-    "camera's pattern, misfit of the surface), an angle of incidence and a distance. A damage's strength there is d' "
-    "of the ideal observer over that; it was learnt, with the detector's hits, on boards of the family in random poses "
-    "at the experiment's own threshold. A patch is not judged where the detector judges nothing, where it is hidden or "
-    "out of view, and where it is steeper than all damage that was inspected. Of several poses the best counts, not "
-    "their sum."
+    "Each patch has the detector's unit of score, an angle of incidence and a distance. A damage's strength there is "
+    "d' of the ideal observer over that unit; it was learnt, with the detector's hits, on boards of the family in "
+    "random poses, at the experiment's own threshold. A patch is not judged where the detector judges nothing, where "
+    "it is hidden or out of view, and where it is steeper than all damage that was inspected. Of several poses the "
+    "best counts, not their sum."
 )
 
 
