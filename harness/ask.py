@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 STORED = "atlas.parquet"
 KINDS = {"hole": "through", "through-hole": "through", "blind-hole": "blind", "crack": "slot"}
+BEST = "matched"
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -34,6 +35,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--frames", type=int, metavar="N", help="frames averaged (default: the least and the most of the atlas)")
     add("--albedo", type=float, metavar="A", help="of the target (default: the least and the most of the atlas)")
     add("--camera", action="append", metavar="NAME", help="only this camera; may be repeated")
+    add("--detector", metavar="NAME", help=f"only this detector (default: {BEST}, else the first)")
     add("--atlas", type=Path, metavar="PATH", help="limits.parquet of a study, or its folder (default: the stored one)")
     add("--out", type=Path, metavar="DIR", help=f"write the whole atlas there: {ATLAS_PAGE.name}, a picture, atlas.csv")
 
@@ -160,7 +162,10 @@ def _chosen(options: argparse.Namespace, surfaces: Sequence[LimitSurface], kind:
     """Return the surfaces that a question is about. Raises UserError where a name is not in the atlas."""
     from harness.vocabulary.declaration.diagnose import nearest
 
-    for name, wanted in (("camera", options.camera or ()), ("kind", [kind])):
+    detectors = list(dict.fromkeys(surface.detector for surface in surfaces))
+    detector = options.detector or (BEST if BEST in detectors else detectors[0])
+    given = (("camera", options.camera or ()), ("kind", [kind]), ("detector", [detector]))
+    for name, wanted in given:
         there = dict.fromkeys(getattr(surface, name) for surface in surfaces)
         if unknown := [one for one in wanted if one not in there]:
             option = "--damage" if name == "kind" else f"--{name}"
@@ -171,7 +176,7 @@ def _chosen(options: argparse.Namespace, surfaces: Sequence[LimitSurface], kind:
             fix = "run a study of damage that is not in the atlas, such as tofpod sweep crack"
             raise UserError(said, legal=", ".join(legal), fix=fix if name == "kind" else None)
     cameras = options.camera or [surface.camera for surface in surfaces]
-    return [one for one in surfaces if one.kind == kind and one.camera in cameras]
+    return [one for one in surfaces if one.kind == kind and one.detector == detector and one.camera in cameras]
 
 
 def length_m(option: str, text: str) -> float:

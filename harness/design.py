@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from harness.evaluation.pod.curve import PodCurve
 
 LINKS = ("logit", "probit", "cloglog", "loglog")
-FILES = ("design.json", "design.html")
+FILES = ("design.json", "design.png", "design.html")
 TARGETS = (30, 40, 60, 120)
 MOST_STUDIES = 100_000  # Simulated studies are kept in memory
 LEAST, MOST = 10, 10_000  # Targets of a study: as many rows as python -m harness.pod asks for; nobody makes more
@@ -56,7 +56,7 @@ Guess = tuple["PodCurve", str, tuple[float, float], float | None]
 def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0 (also where no plan shows a limit), 2 on a mistake of the user, 130 after Ctrl-C."""
     from harness.evaluation.pod import design as plan
-    from harness.report.design import StudyDesign, design_data, design_html, design_parts
+    from harness.report.design import StudyDesign, design_data, design_html, design_parts, save_design_png
     from harness.tables.text import show
     from harness.vocabulary.files import write_json, write_text
     from harness.vocabulary.provenance import RESULTS_VERSION
@@ -73,10 +73,11 @@ def main(options: argparse.Namespace, command: str) -> int:
     design = StudyDesign(curve, origin, "mm" if options.unit is None else options.unit, sizes, *found)
     show(design_parts(design))
     if options.out is not None:
-        data, page = (options.out / name for name in FILES)
+        data, picture, page = (options.out / name for name in FILES)
         write_json(data, {"results_version": RESULTS_VERSION, **design_data(design), "command": command})
+        save_design_png(picture, design)
         write_text(page, design_html(design, command))
-        print(f"wrote {data}, {page.name}")
+        print(f"wrote {data}, {picture.name}, {page.name}")
     return 0
 
 

@@ -135,9 +135,11 @@ def test_every_question_on_the_terminal(capsys: pytest.CaptureFixture[str]) -> N
 def test_files_are_repeatable_and_whole(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for folder in ("a", "b"):
         assert main([*TOLD, *FEW, "--studies", "10", "--out", str(tmp_path / folder)]) == 0
-    assert "design.html" in capsys.readouterr().out
+    assert "design.png" in capsys.readouterr().out
     first, second = ([(tmp_path / folder / name).read_bytes() for name in FILES] for folder in ("a", "b"))
-    page, other = (one[1].decode() for one in (first, second))
+    assert first[1] == second[1]
+    assert first[1].startswith(b"\x89PNG")
+    page, other = (one[2].decode() for one in (first, second))
     assert page.replace(str(tmp_path / "a"), str(tmp_path / "b")) == other
     assert page.count("<details") == 2
     assert "Make 60 targets" in page and "http" not in page.replace("http://www.w3.org", "")
@@ -145,7 +147,7 @@ def test_files_are_repeatable_and_whole(tmp_path: Path, capsys: pytest.CaptureFi
     assert " ".join(f"{size:.4g}" for size in data["plans"][1]["sizes"]) in page
 
 
-def test_no_limit_at_all_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_limit_at_all_is_said_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A curve far wider than the sizes: most studies demonstrate nothing."""
     arguments = ["--a50", "6", "--a90", "40", "--sizes", "5", "8", "--studies", "10", "--targets", "60"]
     assert main([*arguments, "--out", str(tmp_path)]) == 0

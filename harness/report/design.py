@@ -1,11 +1,10 @@
-"""The plan of a study: one set of tables for terminal and page, and JSON's types."""
+"""The plan of a study: one set of tables for terminal and page, the figure, and JSON's types."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from textwrap import wrap
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,18 +12,24 @@ from harness.evaluation.intervals import SITES_PER_TARGET
 from harness.evaluation.pod import design as planned
 from harness.evaluation.pod.curve import PodCurve
 from harness.evaluation.pod.hit_miss import METHOD
-from harness.evaluation.pod.statement import LEAST_TARGETS
+from harness.evaluation.pod.statement import LEAST_TARGETS, POD
 from harness.report import blocks
-from harness.report.pod import sized
+from harness.report.pod import axis_text, plain
 from harness.tables.schema import Column, Table
 from harness.tables.text import Grid
 from harness.vocabulary.files import jsonable
 
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from matplotlib.figure import Figure
+
 MEDIANS = (
-    'Median of the simulated studies, and their 10 % and 90 % quantiles; "not reached" where so many demonstrate none. '
+    'Median of the simulated studies, and their 10 % and 90 % quantiles; "none" where so many demonstrate none. '
     "*: recommended."
 )
 WIDE = 110
+SIZE_IN = (11.5, 4.9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +58,14 @@ class StudyDesign:
 
 
 def design_html(design: StudyDesign, command: str) -> str:
-    """The page as text: answer, plans and sizes, hole-free area; it needs no network."""
-    body = [blocks.heading("What to expect"), plans_grid(design).html(), blocks.note(MEDIANS)]
-    body.append(blocks.subheading(f"Sizes to make{design.in_unit}"))
+    """The page as text: answer, figure, plans and sizes, hole-free area; it needs no network."""
+    caption = (
+        "Left: the a90/95 that simulated studies demonstrate, with the guess's own size, below which a "
+        "limit should not fall. Right: the guessed curve and the sizes of the recommended plan."
+    )
+    drawn = blocks.svg("design", SIZE_IN, answer(design), lambda canvas: _draw(canvas, design))
+    body = [blocks.heading("What to expect"), blocks.figure({"design": drawn}, "design", caption)]
+    body += [plans_grid(design).html(), blocks.note(MEDIANS), blocks.subheading(f"Sizes to make{design.in_unit}")]
     for plan in design.plans:
         chosen = plan is design.recommended
         name = f"{plan.targets} targets{' (recommended)' if chosen else ''}"
@@ -100,15 +110,18 @@ def guess_text(design: StudyDesign) -> str:
     return f"{sizes} ({guess.link}, {'ln size' if guess.log_size else 'size'}); {design.origin}"
 
 
-SIZED = partial(sized, unit="")
+def _size(value: float) -> str:
+    return f"{value:#.3g}".rstrip(".") if np.isfinite(value) else "none"
+
+
 PLANS = Table(
     "plans",
     "one row per number of targets",
     (
         Column("", "targets", lambda row: f"{'* ' * row[1]}{row[0].targets}"),
-        Column("", "limit", lambda row: row[0].bound, text=SIZED, tone=lambda row: "key" if row[1] else ""),
-        Column("", "10 %", lambda row: row[0].low, text=SIZED),
-        Column("", "90 %", lambda row: row[0].high, text=SIZED),
+        Column("", "limit", lambda row: row[0].bound, text=_size, tone=lambda row: "key" if row[1] else ""),
+        Column("", "10 %", lambda row: row[0].low, text=_size),
+        Column("", "90 %", lambda row: row[0].high, text=_size),
         Column("", "demonstrated", lambda row: f"{100 * row[0].demonstrated:.1f} %"),
     ),
     formats=(),
@@ -184,3 +197,42 @@ def design_data(design: StudyDesign) -> dict[str, Any]:
         "notes": notes(design),
     }
     return dict(jsonable(said))
+
+
+def save_design_png(path: Path, design: StudyDesign) -> None:
+    """The figure as a PNG at ``path``; the same bytes for the same design."""
+    blocks.save_png(path, SIZE_IN, lambda canvas: _draw(canvas, design))
+
+
+def _draw(canvas: Figure, design: StudyDesign) -> None:
+    """The limit to expect against the number of targets (median, 10-90 %), and the sizes on the guessed curve."""
+    (left, right), (low, high), plan = canvas.subplots(1, 2), design.range_of_sizes, design.recommended
+    places, true_size = np.arange(len(design.plans)), plan.true_size
+    # infinite where none is demonstrated
+    lows, bounds, ends = np.array([(one.low, one.bound, one.high) for one in design.plans]).T
+    top = max([1.5 * high, *(1.1 * bounds[np.isfinite(bounds)])])
+    left.vlines(places, np.minimum(lows, top), np.minimum(ends, top), color=blocks.BLUE, lw=2.2)
+    left.plot(places, np.minimum(bounds, 9 * top), "o", color=blocks.BLUE, ms=7, mec="white", label="median, 10–90 %")
+    for place, bound, end in zip(places, bounds, ends, strict=True):
+        said = "none" if not np.isfinite(bound) else "↑" if end > top else ""
+        left.text(place, top, said, ha="center", va="top", color=blocks.BLUE)
+    said = plain(f"the guess's a90: {design.text(true_size)}")
+    left.axhline(true_size, color=blocks.RED, lw=1.2, label=said)
+    if design.goal is not None:
+        said = plain(f"wanted: {design.text(design.goal)}")
+        left.axhline(design.goal, color=blocks.GREEN, lw=1.2, ls="--", label=said)
+    left.set(xlim=(-0.6, len(places) - 0.4), ylim=(0.95 * min(true_size, *lows), max(top, 1.02 * (design.goal or 0))))
+    left.set_xticks(places, [str(one.targets) for one in design.plans])
+    left.set(xlabel="targets", ylabel=axis_text("a90/95 to expect", design.unit))
+    left.set_title(f"{plan.studies} simulated studies each")
+    sizes = np.linspace(low, high, 241)[1:]
+    right.plot(sizes, design.guess.pod(sizes), color=blocks.INK, label=f"guessed POD, {design.guess.link}")
+    style: dict[str, Any] = {"ms": 9, "mew": 1.0, "color": blocks.BLUE, "clip_on": False}
+    right.plot(plan.sizes, np.full(plan.targets, -0.08), "|", label=f"{plan.targets} targets", **style)
+    for pod in (0.5, POD):
+        at = design.guess.size_at(pod)
+        right.plot([at, at], [0, pod], color=blocks.GREY, lw=0.9, ls=":")
+    right.set(ylim=(-0.16, 1.04), xlim=(low, high), yticks=np.linspace(0, 1, 6))
+    right.set(xlabel=axis_text("size", design.unit), ylabel="probability of detection", title="Sizes to make")
+    for axes in (left, right):
+        axes.legend(loc="upper left", bbox_to_anchor=(0, -0.16), ncols=1, borderaxespad=0)
