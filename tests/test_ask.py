@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from test_view3d import browsed
 
 from harness.ask import main
 from harness.evaluation.atlas import Outside, surfaces_of
@@ -125,6 +126,34 @@ def test_answer_page_and_data_say_the_same(stored: Path, capsys: pytest.CaptureF
     beside = data[(data["damage"] == "through-hole") & (data["frames"] == 10)]
     assert np.allclose(chosen["a90"], beside["a90_mm"], rtol=1e-3) and len(page) < 2e6
     assert "http" not in re.sub(r"http://www.w3.org/2000/svg", "", page)
+
+
+SLIDE = """<script>
+const controls = [...document.querySelectorAll("select, input[type=range]")].filter(one => one.offsetParent);
+const reached = controls.filter(one => (one.focus(), document.activeElement === one && one.closest("label")));
+const said = [`${reached.length} of ${controls.length}`];
+for (const value of [200, 0]) {
+  at("size").value = value;
+  at("size").dispatchEvent(new Event("input"));
+  said.push(document.querySelector(".answer").textContent, at("rows").textContent);
+}
+said.push(document.querySelectorAll("#chart polyline").length, document.documentElement.scrollWidth <= innerWidth);
+document.body.dataset.said = said.join("|");
+</script></body>"""
+
+
+def test_a_browser_answers_as_the_sliders_move(stored: Path):
+    """Every control has a label and takes the keyboard's focus; the page fits its window."""
+    assert main(["--size", "7mm", "--distance", "1m", "--atlas", str(stored), "--out", str(stored / "out")]) == 0
+    page = stored / "out" / "moved.html"
+    page.write_text((stored / "out" / "atlas.html").read_text().replace("</body>", SLIDE))
+    found = re.search(r'data-said="([^"]+)"', browsed(page))
+    assert found is not None
+    reached, large, large_row, small, small_row, lines, fits = found[1].split("|")
+    assert reached == "5 of 5"  # of one albedo there is no choice
+    assert large.startswith("Through-hole, 40 mm") and large.endswith("by Azure Kinect DK, NFOV unbinned.")
+    assert small.endswith("by no camera of the atlas.")
+    assert "yes" in large_row and "no" in small_row and (lines, fits) == ("3", "true")
 
 
 def test_both_ends_of_the_albedo_are_answered_unless_one_is_asked_for(
