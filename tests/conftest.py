@@ -19,6 +19,27 @@ def pytest_configure() -> None:
     load_mitsuba()
 
 
+LONGEST = (
+    *("engine_cluster", "engine", "detect_program", "detect_views", "engine_learning", "study_page", "pod_program"),
+    *(
+        "compare",
+        "experiment_files",
+        "third_party_package",
+        "gauge",
+        "engine_maps",
+        "claim_views",
+        "reference",
+        "peers",
+    ),
+)
+"""Files of tests of 20 processor seconds and more: processes that begin with these end at about the same time."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Let the longest files come first (pytest-xdist hands files out in this order)."""
+    items.sort(key=lambda item: item.path.stem.removeprefix("test_") not in LONGEST)
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_pyfunc_call() -> Generator[None, object, object]:
     """A test that needs Open3D skips, and says which package is missing, where the system lacks a library of it."""
