@@ -74,11 +74,13 @@ def test_the_program_says_where_the_camera_is_blind(
 ) -> None:
     monkeypatch.setattr(engine, "BOARDS", 5)
     monkeypatch.setattr(engine, "DRAWS", 2)
+    monkeypatch.setattr("harness.coverage.TILTS_DEG", (0.0,))  # no other pose to suggest
     (tmp_path / ".cache").symlink_to(study_out / ".cache")  # holds most of the views
     tiny, one = str(study_out.parent / "tiny.yaml"), ["--set", "sweep={}", "--serial", "--results", str(tmp_path)]
-    assert main([tiny, *one, "--size", "8mm"]) == 0
+    assert main([tiny, *one, "--size", "8mm", "--suggest", "1"]) == 0
     told, folder = capsys.readouterr().out, tmp_path / "coverage" / "tiny"
     assert told.startswith("Damage with a diameter of 8 mm is found nine times in ten on ")
+    assert "warning: 0 of 1 pose suggested" in told
     patches, poses = (pd.read_parquet(folder / table.files[1]) for table in COVERAGE_TABLES[:2])
     assert patches["area_m2"].sum() == pytest.approx(0.3048 * 0.2032)
     # the rim is cropped away, and what is in the middle is not
