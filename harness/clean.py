@@ -14,12 +14,10 @@ from harness.vocabulary.program import program
 
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add(
-        "what", choices=("cache", "results"), help="renders, each of which is rendered again when it is needed; results"
-    )
-    add(
-        "name", nargs="?", default="", metavar="NAME[/DIGEST]", help="of results, as python -m harness.ls results shows"
-    )
+    what = "cache: stored renders, which are made again when they are needed; results: folders of results"
+    add("what", choices=("cache", "results"), help=what)
+    which = "which results, as python -m harness.ls results names them"
+    add("name", nargs="?", default="", metavar="NAME[/DIGEST]", help=which)
     add("--limit", metavar="SIZE", help="of renders: the longest unused go until the rest fits, such as 5GB")
     add("--all", action="store_true", help="of renders: all of them")
     add("--out", type=Path, default=Path("results"), metavar="DIR", help="where results are (default: results)")
@@ -42,6 +40,10 @@ def main(options: argparse.Namespace, command: str) -> int:
 
     of_results = options.what == "results"
     limit = None if options.limit is None else bytes_of(options.limit)
+    if of_results and (limit is not None or options.all):
+        raise UserError("--limit and --all are for the cache", legal="clean results NAME[/DIGEST]")
+    if options.name and not of_results:
+        raise UserError(f"the cache has no part called {options.name!r}", legal="clean cache --limit SIZE, or --all")
     if of_results:
         folders = chosen_results(options.out, options.name)
         print("\n".join(map(str, folders)))

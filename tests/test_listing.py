@@ -344,6 +344,15 @@ def test_names_that_name_no_results(tmp_path, capsys, name):
     assert capsys.readouterr().err.startswith("error: ")
 
 
+@pytest.mark.parametrize(
+    "arguments", [["results", "study", "--all"], ["results", "study", "--limit", "1GB"], ["cache", "study", "--all"]]
+)
+def test_options_of_the_other_kind_are_refused(tmp_path, capsys, arguments):
+    kept = results(tmp_path, "0" * 16, records=1)
+    assert clean.main([*arguments, "--yes", "--out", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.startswith("error: ") and kept.exists()
+
+
 def test_results_that_are_links_are_refused(tmp_path, capsys):
     there = results(tmp_path / "elsewhere", "0" * 16, records=1)
     out = tmp_path / "out"

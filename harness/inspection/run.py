@@ -152,13 +152,12 @@ def with_sizes_told(judged: Judged) -> Judged:
     rim, said = grown(outside, 1)[1:-1, 1:-1].ravel(), []
     both = zip(judged.findings, judged.detections, strict=True)
     if cut := [str(finding.id) for finding, detection in both if rim[detection.pixels].any()]:
-        said.append(f"findings that reach the rim of the judged area ({', '.join(cut)}) may be larger than their stated"
-                    " sizes")  # fmt: skip
+        said.append(f"findings that reach the rim of the judged area ({', '.join(cut)}) may be larger than stated")
     open_ = [str(each.id) for each in judged.findings if each.kind == "no return" or each.depth_mm > OPEN_MM]
     if open_ and cloud.noise_reach_px >= FILTER_PX:
         most_mm = cloud.noise_reach_px * float(np.nanmedian(np.abs(np.diff(cloud.points_m[..., 0], axis=1)))) / MM
-        said.append(f"holes that show what lies far behind, or nothing ({', '.join(open_)}), may be up to {most_mm:.2g}"
-                    " mm wider than stated: the camera's filter mixes their rim into them")  # fmt: skip
+        far = f"holes that show what lies far behind, or nothing ({', '.join(open_)}), may be up to {most_mm:.2g} mm"
+        said.append(f"{far} wider than stated: the camera's filter mixes their rim into them")
     return replace(judged, evidence=replace(judged.evidence, warnings=(*judged.evidence.warnings, *said)))
 
 
