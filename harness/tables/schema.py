@@ -214,7 +214,8 @@ def write_table(folder: Path, table: Table, frame: pd.DataFrame, about: Mapping[
             (Path(folder) / name).unlink(missing_ok=True)
             continue
         if ending == "csv":
-            write_text(Path(folder) / name, frame.to_csv(index=False, float_format=table.digits, lineterminator="\n"))
+            with atomic_path(Path(folder) / name) as path:
+                frame.to_csv(path, index=False, float_format=table.digits, lineterminator="\n")
             continue
         import pyarrow as pa
         import pyarrow.parquet as pq
