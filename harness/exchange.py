@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import Frame, FrameSource, Lens, Reason, Region, invert, slopes_of
+from harness.vocabulary.geometry import Frame, FrameSource, Lens, Reason, Region, invert
 
 START_NS = 1_000_000_000 * 10**9  # time of the first frame, in 2001: 0 means "the latest" to ROS' tf
 PAUSE_NS = 10**9  # time between the last frame of a view and the first of the next, in which the camera is carried on
@@ -192,7 +192,7 @@ def write_bag(folder: Path, view: ExportedView, is_mcap: bool) -> None:
                     (POINTS_TOPIC, "sensor_msgs/msg/PointCloud2", False),
                 )
             }
-            slopes = slopes_of(view.lens, view.lens.whole)
+            slopes = view.lens.region_slopes(view.lens.whole)
             write(POSE_TOPIC, view.start_ns, _pose_message(types.types, view))
             for stamp_ns, frame in view.exposures():
                 header = _header(types.types, frame_name(view), stamp_ns)

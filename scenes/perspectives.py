@@ -18,11 +18,14 @@ from scenes.target.checks import NEAREST_M
 from scenes.target.custom import PoseConfig, TargetConfig
 from scenes.target.truth import OUTLINE_STEPS, face_grid_m, face_of
 
+CHECKED_STEPS = 16  # places along each side of a face at which its range is checked: studies check it in 64 poses
+
 
 def check_in_view(config: TargetConfig, optics: Optics) -> None:
     """Raise UserError where all of the face, or all damage, is out of the camera's field of view, or all of the face
     out of its range. A face partly out of view or range is legal; damage out of view is no target."""
-    face, places = _face_before_lens(config), np.array([damage.centre_m for damage in config.damages]).reshape(-1, 2)
+    face = _face_before_lens(config, CHECKED_STEPS)
+    places = np.array([damage.centre_m for damage in config.damages]).reshape(-1, 2)
     centres = transform_points(config.pose.T_camera_board, face_of(config.board).point(*places.T))
     if not len(centres) or not optics.lens.images(centres).any():  # where damage is in view, a part of the face is
         seen_region(config, optics)
@@ -40,7 +43,7 @@ def check_in_view(config: TargetConfig, optics: Optics) -> None:
 def seen_region(config: TargetConfig, optics: Optics) -> Region:
     """Return the pixels on which the face lies: all of the sensor's where a part of the face is out of view. Raises
     UserError where all of it is, or where it reaches behind the lens."""
-    lens, face = optics.lens, _face_before_lens(config).reshape(-1, 3)
+    lens, face = optics.lens, _face_before_lens(config, OUTLINE_STEPS).reshape(-1, 3)
     in_view = lens.images(face)
     if not in_view.any():
         fix = "move the target towards the axis (offset) or turn it to the camera (tilt)"
@@ -52,9 +55,9 @@ def seen_region(config: TargetConfig, optics: Optics) -> Region:
     return Region(int(low[1]), int(high[1]), int(low[0]), int(high[0]))
 
 
-def _face_before_lens(config: TargetConfig) -> np.ndarray:
+def _face_before_lens(config: TargetConfig, steps: int) -> np.ndarray:
     """(n, n, 3): the face in the camera's frame. Raises UserError where it reaches behind the lens."""
-    face = transform_points(config.pose.T_camera_board, face_grid_m(config.board, steps=OUTLINE_STEPS))
+    face = transform_points(config.pose.T_camera_board, face_grid_m(config.board, steps=steps))
     nearest_m = float(face[..., 2].min())
     if nearest_m <= NEAREST_M:
         legal = f"all of the face at least {NEAREST_M:g} m in front of the camera"

@@ -24,7 +24,7 @@ from detectors.recordings.messages import DEPTH_NUMBERS, encoding_of, frame_of_m
 from detectors.recordings.recording import NO_GRID, Asked, Recording, damage_told
 from harness.vocabulary.declaration.yaml_source import MAX_BYTES, read_yaml
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import Frame, Lens, slopes_of
+from harness.vocabulary.geometry import Frame, Lens
 
 if TYPE_CHECKING:
     from rosbags.rosbag1 import Reader as Ros1Reader
@@ -314,7 +314,7 @@ def _off_ray_px(lens: Lens, frame: Frame) -> float:
     """Return the distance of a frame's worst point from its pixel's ray."""
     assert frame.xy_m is not None
     valid = np.isfinite(frame.z_m)
-    slopes = slopes_of(lens, lens.whole)[valid]
+    slopes = lens.region_slopes(lens.whole)[valid]
     off = np.abs(frame.xy_m[valid] / frame.z_m[valid][:, None].astype(np.float64) - slopes) * (lens.fx, lens.fy)
     worst = float(off.max()) if valid.any() else float("inf")
     return worst if np.isfinite(worst) else float("inf")

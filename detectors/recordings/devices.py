@@ -31,7 +31,7 @@ from detectors.recordings.intrinsics import (
 from detectors.recordings.recording import Asked, Recording, damage_told
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import FRAME_PIXELS, TEXT_BYTES, bounded_bytes, refuse_bytes, refuse_pixels, strict_json
-from harness.vocabulary.geometry import Frame, Lens, slopes_of, transform_points
+from harness.vocabulary.geometry import Frame, Lens, transform_points
 
 TITLES = ("DEPTH", "IR", "COLOR")
 LEGAL_MKV = "a recording of k4arecorder with its DEPTH track"
@@ -73,7 +73,7 @@ def open_mkv(path: Path, asked: Asked) -> Recording:
 
 def _frames(path: Path, scale_m: float, lens: Lens, colour: ColourCamera | None) -> Iterator[Frame]:
     """Yield a frame a depth picture. Raises UserError where the file is truncated or cannot be decoded."""
-    slopes = slopes_of(lens, lens.whole)
+    slopes = lens.region_slopes(lens.whole)
     for number, pictures in enumerate(_captures(path, with_colour=colour is not None)):
         infrared = pictures.get("IR")
         amplitude = infrared.astype(np.float32) if infrared is not None else None

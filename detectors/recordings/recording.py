@@ -15,7 +15,7 @@ import numpy as np
 from detectors.recordings.distances import refuse_far_aside, refuse_implausible, rounding_step_m
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import limited_memory
-from harness.vocabulary.geometry import Frame, Lens, Reason, Region, slopes_of
+from harness.vocabulary.geometry import Frame, Lens, Reason, Region
 
 ROUND_TRIP_PX = 0.1
 """A pixel whose ray does not come back to it within this has no direction that the lens model can give."""
@@ -136,8 +136,8 @@ class Recording:
 
 @lru_cache(maxsize=2)
 def _returning_slopes(lens: Lens, region: Region) -> np.ndarray:
-    """Return `slopes_of` with NaN where the ray does not come back to its pixel."""
-    slopes = slopes_of(lens, region)
+    """Return the slopes of a region with NaN where the ray does not come back to its pixel."""
+    slopes = lens.region_slopes(region)
     if not any(lens.distortion):
         return slopes
     rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)

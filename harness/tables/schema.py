@@ -27,7 +27,7 @@ import numpy as np
 
 from harness.tables import text
 from harness.tables.text import Cell, Grid, Tone
-from harness.vocabulary.files import atomic_path, jsonable, write_text
+from harness.vocabulary.files import atomic_path, jsonable
 from harness.vocabulary.seeds import canonical_json
 
 if TYPE_CHECKING:
