@@ -13,30 +13,54 @@ from harness.vocabulary.program import program
 
 @program(lambda parser: None, "Compile the inner loops once.")
 def main(options: argparse.Namespace, command: str) -> int:
-    """Drive the loops of single views through small captures (those of maps compile when first used). Returns 0."""
-    from detectors import load_detector
+    """Drive the loops of single views through small captures (those of maps compile when first used), in two processes.
+    Returns 0."""
+    from harness.engine.processes import PROCESSES
+
+    began = time.perf_counter()
+    print("compiling the cameras, averages, surfaces and crops, in two processes ..", flush=True)
+    with PROCESSES.Pool(2) as pool:
+        for done in [pool.apply_async(part) for part in (analyse, draw_frames)]:
+            done.get()
+    print(f"inner loops compiled in {time.perf_counter() - began:.0f} s")
+    return 0
+
+
+def draw_frames() -> None:
+    """Draw a frame by every camera, and average frames in every way."""
     from detectors.average import AverageConfig, prefix_averages
-    from harness.engine.trial import FEWEST_FRAMES, averages_of
     from harness.vocabulary.geometry import Region
     from scenes.closed_form import plane_view
     from scenes.sensor.camera import CameraConfig, camera_names, load_camera
     from scenes.sensor.source import SimulatedUnit
 
-    began = time.perf_counter()
-    print("compiling the cameras and averages ..", flush=True)
     for name in camera_names():
         camera = load_camera(name)
         row, column = int(camera.nominal_lens.cy), int(camera.nominal_lens.cx)
         view = plane_view(camera, Region(row - 20, row + 20, column - 30, column + 30), 0.7, 0.6, 0.05, 0.02)
-        list(SimulatedUnit(camera, CameraConfig(name=name), view).capture(1, 1).frames())
+        capture = SimulatedUnit(camera, CameraConfig(name=name), view).capture(6, 1)
+        if name == "azure_kinect_nfov":
+            for method in ("mean", "median", "clipped"):
+                prefix_averages(capture, [1, 6], AverageConfig.from_data({"method": method}))
+        else:
+            next(iter(capture.frames()))
+
+
+def analyse() -> None:
+    """Draw an average at once, and look for damage on every kind of surface."""
+    from detectors import load_detector
+    from detectors.average import AverageConfig
+    from harness.engine.trial import FEWEST_FRAMES, averages_of
+    from harness.vocabulary.geometry import Region
+    from scenes.closed_form import plane_view
+    from scenes.sensor.camera import CameraConfig, load_camera
+    from scenes.sensor.source import SimulatedUnit
+
     camera = load_camera("azure_kinect_nfov")
     view = plane_view(camera, Region(300, 340, 300, 360), 0.7, 0.6, 0.05, 0.02)
     view.phasor[:, 18:24, 28:34] *= 1j
     capture = SimulatedUnit(camera, CameraConfig(edge_gate=False), view).capture(FEWEST_FRAMES, 1)
-    for method in ("mean", "median", "clipped"):
-        cloud = prefix_averages(capture, [1, 6], AverageConfig.from_data({"method": method}))[6]
-    averages_of(capture, [FEWEST_FRAMES], AverageConfig(), exact=False)
-    print("compiling surfaces, the model of a hole and crops ..", flush=True)
+    cloud = averages_of(capture, [FEWEST_FRAMES], AverageConfig(), exact=False)[FEWEST_FRAMES]
     surfaces = [{"method": method} for method in ("lar", "bisquare", "least_squares", "lts")]
     surfaces += [{"shape": shape} for shape in ("auto", "free_form")]
     for settings in ({"crop": {"kind": "auto"}}, *({"crop": {"kind": "none"}, "surface": each} for each in surfaces)):
@@ -45,8 +69,6 @@ def main(options: argparse.Namespace, command: str) -> int:
             evidence = detector.analyse(cloud)
             for detection in detector.find(cloud, evidence, detector.quiet_threshold(cloud, evidence) / 2):
                 detector.measure(cloud, evidence, detection)
-    print(f"inner loops compiled in {time.perf_counter() - began:.0f} s")
-    return 0
 
 
 if __name__ == "__main__":

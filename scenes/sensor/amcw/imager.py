@@ -11,7 +11,7 @@ this. What a unit's tables of lens, emitter and phase offsets leave is the fixed
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -70,14 +70,15 @@ def scattered(image: np.ndarray, facts: ScatterFacts) -> np.ndarray:
     return (1 - share) * sharp + share * spread(image, facts.stray_px.value) if share > 0 else sharp
 
 
-@lru_cache(maxsize=4)
-def pixel_spans(lens: Lens) -> np.ndarray:
-    """Return (h, w) of the whole sensor: the area of slopes that a pixel spans, relative to one on the axis."""
-    v, u = np.mgrid[: lens.height, : lens.width].astype(float)
-    along_u = lens.slopes(u + 0.5, v) - lens.slopes(u - 0.5, v)
-    along_v = lens.slopes(u, v + 0.5) - lens.slopes(u, v - 0.5)
-    area = np.abs(along_u[..., 0] * along_v[..., 1] - along_u[..., 1] * along_v[..., 0])
-    return np.asarray(area * lens.fx * lens.fy)
+def pixel_spans(lens: Lens, slopes: np.ndarray) -> np.ndarray:
+    """Return (h, w): the area of slopes that pixels span at ``slopes`` (h, w, 2), relative to one on the axis."""
+    half = np.array([0.5 / lens.fx, 0.5 / lens.fy])  # of a pixel, as a slope
+
+    def seen(aside: np.ndarray) -> np.ndarray:
+        return lens.project(np.concatenate([slopes + aside, np.ones((*slopes.shape[:2], 1))], axis=-1))
+
+    along_x, along_y = (seen(aside) - seen(-aside) for aside in np.diag(half))
+    return np.asarray(1 / np.abs(along_x[..., 0] * along_y[..., 1] - along_x[..., 1] * along_y[..., 0]))
 
 
 class AmcwImager(UnitModel[AmcwCamera]):
@@ -105,8 +106,7 @@ class AmcwImager(UnitModel[AmcwCamera]):
     def gathered(self) -> np.ndarray:
         """(h, w): light that a pixel gathers from a surface of given radiance, relative to one on the axis: |d slopes /
         d pixel| cos^4. Not modelled: mechanical vignetting, and the growth of the pupil with angle."""
-        lens = self.camera.nominal_lens
-        return pixel_spans(lens)[self.region.within(lens.whole)] / (1 + (self.slopes**2).sum(axis=-1)) ** 2
+        return pixel_spans(self.camera.nominal_lens, self.slopes) / (1 + (self.slopes**2).sum(axis=-1)) ** 2
 
     def pattern_mm(self, rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
         """Draw smooth and pixel-wise errors of range, as before the filter."""
