@@ -47,9 +47,10 @@ class Calibration:
         self._quiet: dict[str, dict[str, tuple[float, float]]] = {}
 
     def add(self, key: str, runs: Sequence[Mapping[str, Any]]) -> None:
-        """Add the rows ``runs`` of one trial."""
+        """Add the group's rows among the ``runs`` of one trial."""
+        own = {point.digest for point in self._group.points}
         for run in runs:
-            if run["quiet_threshold"] is not None:
+            if run["quiet_threshold"] is not None and run["point"] in own:
                 area_m2 = run.get("inspected_m2", np.nan)
                 self._quiet.setdefault(run["point"], {})[key] = (run["quiet_threshold"], area_m2)
 
@@ -256,6 +257,9 @@ class _Run:
         self._shard, self._retry_failed = shard, retry
         self._renders = {job.path: job for job in plan.renders}
         self._calibrations = [Calibration(group) for group in plan.groups]
+        self._set_by: dict[int, list[Calibration]] = {}  # by the identity of the group whose trials set them
+        for group, calibration in zip(plan.groups, self._calibrations, strict=True):
+            self._set_by.setdefault(id(group.leader or group), []).append(calibration)
         # by group, thresholds that agree with those in use, at which other shards have judged
         self._others: list[list[dict[str, float]]] = [[] for _ in plan.groups]
         self._died: Counter[str] = Counter()  # deaths of the process of a render or of a calibrating trial
@@ -405,7 +409,8 @@ class _Run:
         if entry.state == "done":
             self.outcome.finished.append(trial.key)
             if trial.part.sets_threshold and entry.record is not None:
-                self._calibrations[trial.part.group].add(trial.key, entry.record["runs"])
+                for calibration in self._set_by[id(self._groups[trial.part.group])]:
+                    calibration.add(trial.key, entry.record["runs"])
             return
         self.outcome.trials.failed += 1
         failure = _failure(trial.key, entry)
