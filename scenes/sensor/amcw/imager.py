@@ -73,9 +73,9 @@ def scattered(image: np.ndarray, facts: ScatterFacts) -> np.ndarray:
 @lru_cache(maxsize=4)
 def pixel_spans(lens: Lens) -> np.ndarray:
     """Return (h, w) of the whole sensor: the area of slopes that a pixel spans, relative to one on the axis."""
-    v, u = np.mgrid[: lens.height, : lens.width].astype(float)
-    along_u = lens.slopes(u + 0.5, v) - lens.slopes(u - 0.5, v)
-    along_v = lens.slopes(u, v + 0.5) - lens.slopes(u, v - 0.5)
+    u, v = np.arange(lens.width + 1), np.arange(lens.height + 1)[:, None]
+    along_u = np.diff(lens.slopes(u - 0.5, v[:-1]), axis=1)
+    along_v = np.diff(lens.slopes(u[:-1], v - 0.5), axis=0)
     area = np.abs(along_u[..., 0] * along_v[..., 1] - along_u[..., 1] * along_v[..., 0])
     return np.asarray(area * lens.fx * lens.fy)
 
