@@ -213,31 +213,25 @@ def plan_of(experiment: Experiment, cache: Path, folder: Path | None = None) -> 
     by_frames: dict[str, list[Point]] = {}
     for point in experiment.points:
         by_frames.setdefault(point.frames_key, []).append(point)
-    alike: dict[object, list[Group]] = {}
+    alike: dict[str, list[Group]] = {}
     for points in by_frames.values():
         group = _group(tuple(points), cache, folder or cache)
         alike.setdefault(_before_thresholds(group), []).append(group)
-    leaders = [
-        replace(one, also=tuple(point for group in rest for point in group.points)) for one, *rest in alike.values()
-    ]
-    led = (
-        replace(group, learning=(), first=(), leader=leader)
-        for leader, (_, *rest) in zip(leaders, alike.values(), strict=True)
-        for group in rest
-    )
-    made = {group.points[0].frames_key: group for group in (*leaders, *led)}
-    return SweepPlan(tuple(made[key] for key in by_frames))
+    groups: list[Group] = []
+    for first, *rest in alike.values():
+        leader = replace(first, also=tuple(point for group in rest for point in group.points))
+        groups += [leader, *(replace(group, learning=(), first=(), leader=leader) for group in rest)]
+    return SweepPlan(tuple(groups))
 
 
-def _before_thresholds(group: Group) -> object:
-    """Return a value that is equal for groups of a study with the same trials before thresholds."""
+def _before_thresholds(group: Group) -> str:
+    """Return a text that is equal for groups of a study with the same trials before thresholds."""
     batches = (*group.learning, *group.first)
-    if any(batch.board is None for batch in group.first) or not batches:
+    if not batches or batches[-1].board is None:
         return group.points[0].frames_key
-    asked = (replace(point_task(point, None, None), digest="", variant="") for point in group.points)
-    calibrated = (point.config.threshold for point in group.points)
-    cameras = ([ref.camera for ref in batch.before(batch.board or 0)] for batch in batches)
-    return repr([group.seed, group.poses, *asked, *calibrated, *(batch.paths for batch in batches), *cameras])
+    asked = [replace(point_task(point, None, None), digest="", variant="") for point in group.points]
+    seen = [(batch.paths, [ref.camera for ref in batch.before(0)]) for batch in batches]
+    return repr([group.seed, group.poses, asked, [point.config.threshold for point in group.points], seen])
 
 
 def _group(points: tuple[Point, ...], cache: Path, folder: Path) -> Group:

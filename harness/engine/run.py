@@ -36,21 +36,22 @@ AGREES = 1e-3
 """Relative difference of equal thresholds: under a tenth of the standard error that one from twenty boards has."""
 
 
-class Calibration:
-    """Collects the findings of a group's hole-free trials, in any order; the thresholds do not depend on it."""
+Quiet = dict[str, dict[str, tuple[float, float]]]  # quiet threshold and judged area in m2, by point, then by trial
 
-    def __init__(self, group: Group) -> None:
-        self._group = group
+
+class Calibration:
+    """Collects the findings of a group's hole-free trials, in any order; the thresholds do not depend on it. ``quiet``:
+    those of all groups, as one may run the trials of others."""
+
+    def __init__(self, group: Group, quiet: Quiet) -> None:
+        self._group, self._quiet = group, quiet
         self.unlearned: set[str] = set()
         """Points whose detector should have learned and did not: they have no threshold, not even a given one."""
-        # quiet threshold and judged area in m2, by point, then by trial
-        self._quiet: dict[str, dict[str, tuple[float, float]]] = {}
 
     def add(self, key: str, runs: Sequence[Mapping[str, Any]]) -> None:
-        """Add the group's rows among the ``runs`` of one trial."""
-        own = {point.digest for point in self._group.points}
+        """Add the rows ``runs`` of one trial."""
         for run in runs:
-            if run["quiet_threshold"] is not None and run["point"] in own:
+            if run["quiet_threshold"] is not None:
                 area_m2 = run.get("inspected_m2", np.nan)
                 self._quiet.setdefault(run["point"], {})[key] = (run["quiet_threshold"], area_m2)
 
@@ -95,7 +96,7 @@ class Calibration:
 
     def _prefix(self) -> str:
         """The beginning of the keys of thresholds that rest on the trials that were added; empty without any."""
-        keys = sorted({key for trials in self._quiet.values() for key in trials})
+        keys = sorted({key for point in self._group.points for key in self._quiet.get(point.digest, ())})
         return f"{THRESHOLDS}{digest(keys)}-" if keys else ""
 
 
@@ -256,10 +257,8 @@ class _Run:
         self._groups, self._journal, self._engine, self._report = plan.groups, journal, engine, report
         self._shard, self._retry_failed = shard, retry
         self._renders = {job.path: job for job in plan.renders}
-        self._calibrations = [Calibration(group) for group in plan.groups]
-        self._set_by: dict[int, list[Calibration]] = {}  # by the identity of the group whose trials set them
-        for group, calibration in zip(plan.groups, self._calibrations, strict=True):
-            self._set_by.setdefault(id(group.leader or group), []).append(calibration)
+        quiet: Quiet = {}
+        self._calibrations = [Calibration(group, quiet) for group in plan.groups]
         # by group, thresholds that agree with those in use, at which other shards have judged
         self._others: list[list[dict[str, float]]] = [[] for _ in plan.groups]
         self._died: Counter[str] = Counter()  # deaths of the process of a render or of a calibrating trial
@@ -409,8 +408,7 @@ class _Run:
         if entry.state == "done":
             self.outcome.finished.append(trial.key)
             if trial.part.sets_threshold and entry.record is not None:
-                for calibration in self._set_by[id(self._groups[trial.part.group])]:
-                    calibration.add(trial.key, entry.record["runs"])
+                self._calibrations[trial.part.group].add(trial.key, entry.record["runs"])
             return
         self.outcome.trials.failed += 1
         failure = _failure(trial.key, entry)
