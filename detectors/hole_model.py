@@ -37,7 +37,6 @@ MOST_MISFIT = 1.5
 WALL_PRIOR = (0.5, 12.0**-0.5)
 """Mean and standard deviation of the tube's length over the depth before the image is seen: uniform from 0 to 1."""
 
-NOT_OFFSET = [0, 1, 2, 3, 5]  # of what is fitted
 _THETA = np.linspace(-np.pi / 2, np.pi / 2, STRIPS + 1)
 EDGES = np.sin(_THETA)  # edges (s + 1,) of strips across a unit disc, narrow where the chord changes fast
 HALF_CHORDS = np.diff(_THETA / 2 + np.sin(2 * _THETA) / 4) / np.diff(EDGES)  # mean half-chords (s,) of these strips
@@ -208,15 +207,13 @@ def _descent(
     # keeps a wild trial step finite: no disc is larger than ten patches
     low = -10.0 * w, -10.0 * h, -20.0
     high = 10.0 * w, 10.0 * h, math.log(10.0 * (h + w) * math.sqrt(patch.metric_m2.max()))
-
     places = np.flatnonzero(patch.used)
 
     def seen(holes: np.ndarray) -> np.ndarray:
         return pictures(patch, holes).reshape(len(holes), -1).take(places, axis=1)
 
     def left_by(q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-        """Return the hole (5,) of the parameters, its picture (n,), what it leaves of the data (n,), whitened, and of
-        the prior."""
+        """Return the hole (5,), its picture (n,), what it leaves of the data (n,), whitened, and of the prior."""
         u, v, log_radius = (min(max(at, least), most) for at, least, most in zip(q.tolist(), low, high, strict=False))
         radius = math.exp(log_radius)
         hole = np.array([u, v, radius, q[3] / radius**2, math.sin(0.5 * math.pi * q[5]) ** 2])
@@ -227,7 +224,7 @@ def _descent(
         depth = hole[3] if hole[3] != 0.0 else STEP
         steps = STEP * np.array([1.0, 1.0, hole[2], depth, -1.0 if hole[4] >= 0.5 else 1.0])
         slopes = np.ones((6, len(data)))  # the offset, the fifth, moves all pixels alike
-        slopes[NOT_OFFSET] = (seen(hole + np.diag(steps)) - image) / steps[:, None]
+        slopes[[0, 1, 2, 3, 5]] = (seen(hole + np.diag(steps)) - image) / steps[:, None]
         return _whitened(factor, slopes)
 
     hole, image, left, prior = left_by(q)

@@ -32,11 +32,9 @@ from harness.vocabulary.seeds import canonical_json, digest
 from scenes.render.cache import read_view
 
 NOTHING = 0.1  # share of a board's face that is judged, up to which a camera that allows no threshold sees nothing
+Quiet = dict[str, dict[str, tuple[float, float]]]  # quiet threshold and judged area in m2, by point, then by trial
 AGREES = 1e-3
 """Relative difference of equal thresholds: under a tenth of the standard error that one from twenty boards has."""
-
-
-Quiet = dict[str, dict[str, tuple[float, float]]]  # quiet threshold and judged area in m2, by point, then by trial
 
 
 class Calibration:
