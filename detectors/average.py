@@ -4,7 +4,7 @@ by the first `REFERENCE_FRAMES`: a source whose first frames are mostly bad, or 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import islice
+from itertools import chain, islice
 from typing import Literal
 
 import numba
@@ -85,15 +85,12 @@ def _averages(source: FrameSource, wanted: list[int] | None, config: AverageConf
         clouds[n] = FrameSums(source, held[:n], config).cloud()
     if held:
         sums = FrameSums(source, held, config)
-        if wanted and offered in wanted:
-            clouds[offered] = sums.cloud()
-        for frame in frames:
-            sums.take(frame)
-            offered += 1
+        for offered, frame in enumerate(chain([None], frames), start=len(held)):
+            if frame is not None:
+                sums.take(frame)
             if wanted and offered in wanted:
                 clouds[offered] = sums.cloud()
-        if wanted is None:
-            clouds[offered] = sums.cloud()
+        clouds |= {} if wanted else {offered: sums.cloud()}
     elif wanted is None:
         raise UserError(f"{source.name}: no frames to average", fix="check the path")
     if wanted and offered < wanted[-1]:

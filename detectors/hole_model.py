@@ -205,27 +205,30 @@ def _descent(
     whether the descent from ``q`` (6,) has converged. ``weight``: of the prior."""
     h, w = patch.used.shape
     # keeps a wild trial step finite: no disc is larger than ten patches
-    low = np.array([-10.0 * w, -10.0 * h, -20.0])
-    high = np.array([10.0 * w, 10.0 * h, math.log(10.0 * (h + w) * math.sqrt(patch.metric_m2.max()))])
+    low = -10.0 * w, -10.0 * h, -20.0
+    high = 10.0 * w, 10.0 * h, math.log(10.0 * (h + w) * math.sqrt(patch.metric_m2.max()))
+    places = np.flatnonzero(patch.used)
 
-    def left_by(q: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return the hole (5,) of the parameters, what it leaves of the data (n,), whitened, and of the prior."""
-        u, v, log_radius = np.clip(q[:3], low, high).tolist()
+    def seen(holes: np.ndarray) -> np.ndarray:
+        return pictures(patch, holes).reshape(len(holes), -1).take(places, axis=1)
+
+    def left_by(q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+        """Return the hole (5,), its picture (n,), what it leaves of the data (n,), whitened, and of the prior."""
+        u, v, log_radius = (min(max(at, least), most) for at, least, most in zip(q.tolist(), low, high, strict=False))
         radius = math.exp(log_radius)
         hole = np.array([u, v, radius, q[3] / radius**2, math.sin(0.5 * math.pi * q[5]) ** 2])
-        left = pictures(patch, hole[None])[0][patch.used] + q[4] - data
-        return hole, _whitened(factor, left), weight * (hole[4] - WALL_PRIOR[0])
+        (image,) = seen(hole[None])
+        return hole, image, _whitened(factor, image + (q[4] - data)), weight * (hole[4] - WALL_PRIOR[0])
 
-    def slopes_of(hole: np.ndarray) -> np.ndarray:
+    def slopes_of(hole: np.ndarray, image: np.ndarray) -> np.ndarray:
         depth = hole[3] if hole[3] != 0.0 else STEP
         steps = STEP * np.array([1.0, 1.0, hole[2], depth, -1.0 if hole[4] >= 0.5 else 1.0])
-        images = pictures(patch, hole + np.vstack([np.diag(steps), np.zeros(5)]))[:, patch.used]
-        slopes = (images[:5] - images[5]) / steps[:, None]
-        # the offset moves all pixels alike
-        return _whitened(factor, np.insert(slopes, 4, 1.0, axis=0))
+        slopes = np.ones((6, len(data)))  # the offset, the fifth, moves all pixels alike
+        slopes[[0, 1, 2, 3, 5]] = (seen(hole + np.diag(steps)) - image) / steps[:, None]
+        return _whitened(factor, slopes)
 
-    hole, left, prior = left_by(q)
-    square, damping, by, converged = left @ left + prior**2, DAMPING, slopes_of(hole), False
+    hole, image, left, prior = left_by(q)
+    square, damping, by, converged = left @ left + prior**2, DAMPING, slopes_of(hole, image), False
     for _ in range(MOST_STEPS):
         # derivatives by q from those by the hole's numbers
         chain = np.eye(6)
@@ -234,14 +237,14 @@ def _descent(
         information, pull = chain.T @ (by @ by.T) @ chain, chain.T @ (by @ left)
         information[5, 5] += (weight * chain[5, 5]) ** 2
         pull[5] += weight * chain[5, 5] * prior
-        np.fill_diagonal(information, np.maximum(information.diagonal() * (1.0 + damping), SMALLEST))
+        information.flat[::7] = np.maximum(information.diagonal() * (1.0 + damping), SMALLEST)
         step = np.linalg.solve(information, -pull)
-        new_hole, new_left, new_prior = left_by(q + step)
+        new_hole, image, new_left, new_prior = left_by(q + step)
         new_square, enough = new_left @ new_left + new_prior**2, TOLERANCE * square + SMALLEST
         converged = bool(-(step @ pull) < enough or 0.0 <= square - new_square < enough)
         if new_square < square:
             q, hole, left, prior, square = q + step, new_hole, new_left, new_prior, new_square
-            by = slopes_of(hole)
+            by = slopes_of(hole, image)
             damping *= 0.1
         else:
             damping *= 10.0

@@ -55,12 +55,16 @@ CORE = 0.5
 """A finding's size is taken of the pixels with this share of its score or more."""
 
 
-class LocalConfig(Config):
-    """``surface``: chosen by evidence where neither shape nor degree is given. ``hole_model``: measures sizes."""
+class FilterConfig(Config):
+    """``hole_model``: measures sizes."""
 
     crop: CropConfig = Field(default_factory=AutoCrop)
     surface: SurfaceConfig = Field(default_factory=SurfaceConfig)
     hole_model: HoleModelConfig = Field(default_factory=HoleModelConfig)
+
+
+class LocalConfig(FilterConfig):
+    """``surface``: chosen by evidence where neither shape nor degree is given. ``hole_model``: measures sizes."""
 
     @model_validator(mode="before")
     @classmethod
@@ -91,11 +95,11 @@ class LocalPicture(NamedTuple):
 class LocalDetector:
     """Filters of several widths against their surroundings, on the scale of the local noise; findings are peaks."""
 
-    settings_type: ClassVar[type[LocalConfig]] = LocalConfig
+    settings_type: ClassVar[type[FilterConfig]] = LocalConfig
     name = "local"
     version = 2
 
-    def __init__(self, settings: LocalConfig) -> None:
+    def __init__(self, settings: FilterConfig) -> None:
         self.settings = settings
 
     def picture(self, cloud: Cloud, pixels: int = 1) -> LocalPicture:

@@ -25,13 +25,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import cv2
 import numba
 import numpy as np
 import scipy.fft
-from pydantic import model_validator
 from scipy import special
 
 from detectors import whitening
@@ -41,7 +40,7 @@ from detectors.local import (
     LEAST_WINDOW,
     LEVEL_SIGMAS,
     SADDLE,
-    LocalConfig,
+    FilterConfig,
     LocalDetector,
     LocalEvidence,
     LocalPicture,
@@ -92,13 +91,8 @@ TAIL_PX, TAIL_SHARE, TAIL_SIGMAS = 1.5, 0.0005, 3.29
 a Gaussian has it. Wider means are near Gaussian, and too few of them are independent."""
 
 
-class MatchedConfig(LocalConfig):
-    """The settings of `local`, but ``surface`` is the thesis' polynomial unless ``shape: auto`` is asked for."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _chosen_shape(cls, data: Any) -> Any:
-        return data
+class MatchedConfig(FilterConfig):
+    """``surface``: the thesis' polynomial unless ``shape: auto`` is asked for. ``hole_model``: measures sizes."""
 
 
 class MatchedDetector(LocalDetector):
@@ -108,7 +102,7 @@ class MatchedDetector(LocalDetector):
     name = "matched"
     version = 7
 
-    def __init__(self, settings: LocalConfig, covariance: np.ndarray | None = None) -> None:
+    def __init__(self, settings: FilterConfig, covariance: np.ndarray | None = None) -> None:
         """``covariance``: the noise's, in squared deviations, that `calibrate` has learned."""
         super().__init__(settings)
         self._covariance = covariance

@@ -309,10 +309,7 @@ def coreset(features: np.ndarray, size: int) -> np.ndarray:
 
 def nearest(features: np.ndarray, memory: np.ndarray) -> np.ndarray:
     """Return the distance (n,) of each feature (n, k) from the nearest in the memory (m, k)."""
-    found = np.empty(len(features))
-    sizes = (memory**2).sum(axis=1)
-    with threadpoolctl.threadpool_limits(1, user_api="blas"):
-        for start in range(0, len(features), CHUNK):
-            some = features[start : start + CHUNK]
-            found[start : start + CHUNK] = (some**2).sum(axis=1) + (sizes - 2.0 * some @ memory.T).min(axis=1)
-    return np.sqrt(np.maximum(found, 0.0))
+    from scipy.spatial.distance import cdist
+
+    parts = np.split(features, range(CHUNK, len(features), CHUNK))
+    return np.concatenate([cdist(some, memory).min(axis=1) for some in parts])

@@ -131,9 +131,9 @@ def unit_normals(surface_m: np.ndarray) -> np.ndarray:
     """Return the normals (h, w, 3) of a surface's points (h, w, 3), by central differences; 0 where it has no area."""
     if min(surface_m.shape[:2]) < 2:
         return np.zeros(surface_m.shape)
-    down, right = np.gradient(surface_m, axis=(0, 1))
-    normals = np.cross(right, down)
-    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=-1), 1e-15)[..., None])
+    (dx, dy, dz), (ax, ay, az) = (np.gradient(np.moveaxis(surface_m, 2, 0).copy(), axis=axis) for axis in (1, 2))
+    normals = np.stack([ay * dz - az * dy, az * dx - ax * dz, ax * dy - ay * dx], axis=-1)
+    return np.asarray(normals / np.maximum(np.sqrt(np.einsum("ijk,ijk->ij", normals, normals)), 1e-15)[..., None])
 
 
 def turns(normals: np.ndarray, half: int, least_cosine: float) -> np.ndarray:

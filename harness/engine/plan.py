@@ -6,6 +6,7 @@ import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from itertools import cycle
 from pathlib import Path
 from typing import NamedTuple
 
@@ -84,7 +85,10 @@ class Batch:
 class Group:
     """Points that share their frames: one set-up, one seed. On the batch ``learning`` detectors that can do so learn;
     the batches ``first`` are hole-free and set the points' thresholds; ``then`` those judged by them. ``poses``: the
-    declaration of the views, where there are several. ``folder``: the place of files of what was learned."""
+    declaration of the views, where there are several. ``folder``: the place of files of what was learned.
+
+    Groups of a study that differ only in the damage have the same trials before thresholds: the first of them runs
+    these for the points ``also`` of the others, in the same order as its own, whose ``leader`` it is."""
 
     points: tuple[Point, ...]
     learning: tuple[Batch, ...]
@@ -93,6 +97,8 @@ class Group:
     seed: int
     folder: Path
     poses: AnyViews | None = None
+    also: tuple[Point, ...] = ()
+    leader: Group | None = None
 
     @property
     def batches(self) -> tuple[Batch, ...]:
@@ -108,8 +114,12 @@ class Group:
     @cached_property
     def learned(self) -> dict[str, str]:
         """Files, by point digest, of what detectors learn: each has the name of its trial in the journal."""
+        if self.leader is not None:
+            return self.leader.learned
         trials = (trial for batch in self.learning for trial in self.trials(batch, None))
-        return {task.points[0].digest: str(self.folder / f"{key}.npz") for key, task in trials}
+        files = {task.points[0].digest: str(self.folder / f"{key}.npz") for key, task in trials}
+        pairs = zip(self.also, cycle(self.points), strict=False)
+        return files | {point.digest: files[own.digest] for point, own in pairs if own.digest in files}
 
     @property
     def damaged(self) -> Batch:
@@ -147,9 +157,10 @@ class Group:
                 task = TrialTask(batch.set_ups, self.seed, batch.role, 0, learner, self.poses)
                 yield self._key(batch, task), task
             return
-        given = {point.digest: (thresholds or {}).get(point.digest, point.config.threshold.k) for point in self.points}
-        unjudged = thresholds is None or batch in self.first
-        points = [point for point in self.points if unjudged or given[point.digest] is not None]
+        sets_threshold = batch in self.first
+        every, unjudged = (*self.points, *(self.also if sets_threshold else ())), thresholds is None or sets_threshold
+        given = {point.digest: (thresholds or {}).get(point.digest, point.config.threshold.k) for point in every}
+        points = [point for point in every if unjudged or given[point.digest] is not None]
         points = [point for point in points if point.digest not in without]
         learned = self.learned
         asked = {one.digest: point_task(one, given[one.digest], learned.get(one.digest)) for one in points}
@@ -202,7 +213,25 @@ def plan_of(experiment: Experiment, cache: Path, folder: Path | None = None) -> 
     by_frames: dict[str, list[Point]] = {}
     for point in experiment.points:
         by_frames.setdefault(point.frames_key, []).append(point)
-    return SweepPlan(tuple(_group(tuple(points), cache, folder or cache) for points in by_frames.values()))
+    alike: dict[str, list[Group]] = {}
+    for points in by_frames.values():
+        group = _group(tuple(points), cache, folder or cache)
+        alike.setdefault(_before_thresholds(group), []).append(group)
+    groups: list[Group] = []
+    for first, *rest in alike.values():
+        leader = replace(first, also=tuple(point for group in rest for point in group.points))
+        groups += [leader, *(replace(group, learning=(), first=(), leader=leader) for group in rest)]
+    return SweepPlan(tuple(groups))
+
+
+def _before_thresholds(group: Group) -> str:
+    """Return a text that is equal for groups of a study with the same trials before thresholds."""
+    batches = (*group.learning, *group.first)
+    if not batches or batches[-1].board is None:
+        return group.points[0].frames_key
+    asked = [replace(point_task(point, None, None), digest="", variant="") for point in group.points]
+    seen = [(batch.paths, [ref.camera for ref in batch.before(0)]) for batch in batches]
+    return repr([group.seed, group.poses, asked, [point.config.threshold for point in group.points], seen])
 
 
 def _group(points: tuple[Point, ...], cache: Path, folder: Path) -> Group:
@@ -284,7 +313,6 @@ def parts_of(plan: SweepPlan, shard: Shard) -> tuple[list[list[PlanPart]], list[
         return [PlanPart(number, batch, sets_threshold, each) for each in slices]
 
     mine, before = shard.part(sum(group.most_repeats(batch) for group in plan.groups for batch in group.then)), 0
-    first: list[list[PlanPart]] = []
     then: list[list[PlanPart]] = []
     for number, group in enumerate(plan.groups):
         judged = []
@@ -293,6 +321,9 @@ def parts_of(plan: SweepPlan, shard: Shard) -> tuple[list[list[PlanPart]], list[
             judged += cut(number, batch, range(max(mine.start - before, 0), min(mine.stop - before, count)), False)
             before += count
         then.append(judged)
-        calibrating = (*group.learning, *group.first) if judged else ()
+    wanted = {id(group.leader or group) for group, judged in zip(plan.groups, then, strict=True) if judged}
+    first: list[list[PlanPart]] = []
+    for number, group in enumerate(plan.groups):
+        calibrating = (*group.learning, *group.first) if id(group) in wanted else ()
         first.append([part for one in calibrating for part in cut(number, one, range(group.most_repeats(one)), True)])
     return first, then

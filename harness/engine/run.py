@@ -32,19 +32,19 @@ from harness.vocabulary.seeds import canonical_json, digest
 from scenes.render.cache import read_view
 
 NOTHING = 0.1  # share of a board's face that is judged, up to which a camera that allows no threshold sees nothing
+Quiet = dict[str, dict[str, tuple[float, float]]]  # quiet threshold and judged area in m2, by point, then by trial
 AGREES = 1e-3
 """Relative difference of equal thresholds: under a tenth of the standard error that one from twenty boards has."""
 
 
 class Calibration:
-    """Collects the findings of a group's hole-free trials, in any order; the thresholds do not depend on it."""
+    """Collects the findings of a group's hole-free trials, in any order; the thresholds do not depend on it. ``quiet``:
+    those of all groups, as one may run the trials of others."""
 
-    def __init__(self, group: Group) -> None:
-        self._group = group
+    def __init__(self, group: Group, quiet: Quiet) -> None:
+        self._group, self._quiet = group, quiet
         self.unlearned: set[str] = set()
         """Points whose detector should have learned and did not: they have no threshold, not even a given one."""
-        # quiet threshold and judged area in m2, by point, then by trial
-        self._quiet: dict[str, dict[str, tuple[float, float]]] = {}
 
     def add(self, key: str, runs: Sequence[Mapping[str, Any]]) -> None:
         """Add the rows ``runs`` of one trial."""
@@ -94,7 +94,7 @@ class Calibration:
 
     def _prefix(self) -> str:
         """The beginning of the keys of thresholds that rest on the trials that were added; empty without any."""
-        keys = sorted({key for trials in self._quiet.values() for key in trials})
+        keys = sorted({key for point in self._group.points for key in self._quiet.get(point.digest, ())})
         return f"{THRESHOLDS}{digest(keys)}-" if keys else ""
 
 
@@ -255,7 +255,8 @@ class _Run:
         self._groups, self._journal, self._engine, self._report = plan.groups, journal, engine, report
         self._shard, self._retry_failed = shard, retry
         self._renders = {job.path: job for job in plan.renders}
-        self._calibrations = [Calibration(group) for group in plan.groups]
+        quiet: Quiet = {}
+        self._calibrations = [Calibration(group, quiet) for group in plan.groups]
         # by group, thresholds that agree with those in use, at which other shards have judged
         self._others: list[list[dict[str, float]]] = [[] for _ in plan.groups]
         self._died: Counter[str] = Counter()  # deaths of the process of a render or of a calibrating trial
