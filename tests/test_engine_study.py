@@ -252,6 +252,7 @@ def test_the_oracle_scores_one_everywhere(finished, tmp_path, monkeypatch):
     assert one.pixels.pro == 1.0
 
 
+@pytest.mark.slow  # a Monte Carlo of 48 boards
 @pytest.mark.usefixtures("control_detectors")
 def test_the_blind_detector_scores_what_chance_gives(finished, tmp_path, monkeypatch):
     """Its false calls per area are those of its own law at the threshold, its hits those of places laid anywhere: a

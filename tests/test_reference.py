@@ -70,7 +70,7 @@ def stood(turn_deg: tuple[float, float, float], quarter: int = 0) -> np.ndarray:
     ("turn_deg", "quarter"),
     [
         ((-5, 3, 6), 1),
-        ((12, 10, -8), 0),
+        pytest.param((12, 10, -8), 0, marks=pytest.mark.slow),
         pytest.param((4, -6, 3), 0, marks=pytest.mark.slow),
         pytest.param((5, 8, 2), 2, marks=pytest.mark.slow),
     ],
@@ -89,7 +89,7 @@ def test_a_part_is_found_where_it_lies(tmp_path: Path, turn_deg: tuple[float, fl
     assert np.nanmedian(np.abs(level(points) - points[:, 2])) == pytest.approx(0.6745 * 0.5 * MM, rel=0.15)
 
 
-@pytest.mark.parametrize("detector", ["local", "thesis", "m3c2"])
+@pytest.mark.parametrize("detector", ["local", pytest.param("thesis", marks=pytest.mark.slow), "m3c2"])
 def test_only_damage_differs_from_the_mesh(tmp_path: Path, detector: str) -> None:
     path, T = casting(tmp_path / "casting.stl"), stood((6, -8, 3))
     cloud = seen(path, T, 0.5, dent_mm=3.0)

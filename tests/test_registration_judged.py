@@ -121,7 +121,11 @@ def fine_pair(bend_mm: float, seed: int = 0):
     return reference, board_view(POSES[1], guess, noise_m=NOISE_M, lens=FINE, seed=2 * seed + 1, smooth_m=smooth)
 
 
-@pytest.mark.parametrize("config", BY_MARKS, ids=lambda config: config.method)
+@pytest.mark.parametrize(
+    "config",
+    [pytest.param(one, marks=[pytest.mark.slow] if one.method == "cpd" else []) for one in BY_MARKS],
+    ids=lambda config: config.method,
+)
 def test_views_that_differ_by_their_own_smooth_errors_are_merged_with_a_note(config):
     exact, bent = fine_pair(0.0), fine_pair(1.2)
     found, plain = (register(prepared(pair), config)[1] for pair in (bent, exact))

@@ -325,6 +325,7 @@ def test_cache_key_changes_with_what_matters_only():
     assert render_key(SMALL, CAMERA.model_copy(update={"engine": engine}).optics, QUICK) == base
 
 
+@pytest.mark.slow  # a process that loads both, to see what this machine's libraries do
 def test_open3d_before_mitsuba_is_told_apart_from_a_missing_llvm():
     code = "import open3d\nfrom scenes.render.scene import load_mitsuba\nload_mitsuba()\n"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
