@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -58,9 +58,7 @@ class Bag:
     def messages(self, topic: str) -> Iterator[tuple[str, Any]]:
         """Yield (name, message) of a topic in the order of their times within each file, one held at a time. Raises
         UserError where a file is damaged or a message is larger than `MAX_MESSAGE_BYTES`."""
-        from rosbags.typesys import Stores, get_typestore
-
-        types = get_typestore(Stores.ROS1_NOETIC if self._is_ros1 else Stores.ROS2_JAZZY)
+        types = _types(self._is_ros1)
         decode = types.deserialize_ros1 if self._is_ros1 else types.deserialize_cdr
         with self._opened() as reader:
             wanted = [connection for connection in reader.connections if connection.topic == topic]
@@ -96,6 +94,14 @@ class Bag:
             reader.open()
         with closing(reader):
             yield reader
+
+
+@lru_cache
+def _types(is_ros1: bool) -> Any:
+    """Return types of messages, kept: the code that reads one is made when it is first met."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
 
 
 def is_bag(path: Path) -> bool:
