@@ -49,6 +49,14 @@ WHALE = Animal("whale", 30.0, axes={"room.kind": "sea", "room.size": 7}, parent=
 GHOST = Animal("ghost", np.nan)
 
 
+@pytest.mark.parametrize(
+    ("share", "said"),
+    [(0.123, "12 %"), (1.234, "123 %"), (Estimate(1.2, 0.9, 1.55), "120 % (90 to 155 %)"), (np.nan, "–")],
+)
+def test_shares_are_percentages(share: float | Estimate, said: str) -> None:
+    assert Column("found_share", "found").cell({"found_share": share}).text == said
+
+
 def test_one_declaration_gives_rows_for_all_renderings() -> None:
     (row,) = ANIMALS.data([WHALE])
     assert row == {

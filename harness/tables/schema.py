@@ -58,8 +58,9 @@ class Estimate:
 def _share(share: float | Estimate) -> str:
     """``0.12 % (0.05 to 0.2 %)``."""
     one = share if isinstance(share, Estimate) else Estimate(share)
-    ends = f" ({100 * one.low:.2g} to {100 * one.high:.2g} %)" if np.isfinite(one.low) else ""
-    return text.UNKNOWN_TEXT if np.isnan(one.value) else f"{100 * one.value:.2g} %{ends}"
+    value, low, high = (f"{100 * x:.{2 if x < 0.995 else 3}g}" for x in (one.value, one.low, one.high))
+    ends = f" ({low} to {high} %)" if np.isfinite(one.low) else ""
+    return text.UNKNOWN_TEXT if np.isnan(one.value) else f"{value} %{ends}"
 
 
 FORMATS: dict[str, Callable[[Any], str]] = {
