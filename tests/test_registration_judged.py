@@ -35,6 +35,7 @@ BY_MARKS: list[AnyRegistration] = [
     CpdRegistration(),
     PlainRegistration(method="joint"),
 ]
+SLOW_CPD = pytest.param(CpdRegistration(), marks=pytest.mark.slow)  # test_registration_cpd has its own
 
 
 def prepared(made) -> list[PreparedView]:
@@ -46,7 +47,7 @@ def changed(view: PreparedView, **cloud) -> PreparedView:
     return PreparedView(replace(view.view, cloud=replace(view.view.cloud, **cloud)), view.inside, view.marks)
 
 
-@pytest.mark.parametrize("config", [*BY_MARKS, IcpRegistration()], ids=lambda config: config.method)
+@pytest.mark.parametrize("config", [*BY_MARKS[::2], IcpRegistration(), SLOW_CPD], ids=lambda config: config.method)
 def test_good_views_are_registered_and_nothing_is_said(config):
     made = views(POSES, guess_error=usual_error(), noise_m=NOISE_M)
     reference, *found = register(prepared(made), config)
@@ -121,11 +122,7 @@ def fine_pair(bend_mm: float, seed: int = 0):
     return reference, board_view(POSES[1], guess, noise_m=NOISE_M, lens=FINE, seed=2 * seed + 1, smooth_m=smooth)
 
 
-@pytest.mark.parametrize(
-    "config",
-    [pytest.param(one, marks=[pytest.mark.slow] if one.method == "cpd" else []) for one in BY_MARKS],
-    ids=lambda config: config.method,
-)
+@pytest.mark.parametrize("config", [*BY_MARKS[::2], SLOW_CPD], ids=lambda config: config.method)
 def test_views_that_differ_by_their_own_smooth_errors_are_merged_with_a_note(config):
     exact, bent = fine_pair(0.0), fine_pair(1.2)
     found, plain = (register(prepared(pair), config)[1] for pair in (bent, exact))

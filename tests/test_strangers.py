@@ -70,7 +70,7 @@ ANSWERED = (
     ("quarter_mm", 0), ("undamaged", 0), ("passer_by", 0), ("resolutions", 0), ("corrugated", 20),
     ("heavy_tails", 21),
 )  # fmt: skip
-QUICK = ("before_wall", "no_return", "pipe_outside")
+QUICK = ("before_wall", "pipe_outside")
 """A board before a wall, missing returns, a curved part."""
 
 
