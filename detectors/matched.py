@@ -245,7 +245,7 @@ def _scored(
             share = cv2.blur(there, worth.sides, borderType=cv2.BORDER_CONSTANT)
             # what light and flying pixels leave along outlines looks like a slot
             enough = (share > LEAST_SEEN) & (there > 0) & (inner if template.slot else True)
-            shares[key] = np.where(enough, np.maximum(share, LEAST_SEEN) ** -0.5, np.float32(0.0))
+            shares[key] = enough / np.sqrt(np.maximum(share, np.float32(LEAST_SEEN)))
         score = whitening.response(spectrum_of, templates[number], there.shape, not any(template.halves))
         cv2.multiply(score, shares[key], dst=score, scale=worth.energy**-0.5)
         deviations = np.ones(N_ZONES)

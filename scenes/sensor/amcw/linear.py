@@ -148,9 +148,9 @@ def linearised(
 @numba.njit(**FAST)
 def _linearise(pixels, light, window, shape, wild, lost, out, moved):  # type: ignore[no-untyped-def]
     """`linearised` for one frequency: all without their first axis."""
-    k, space, none = window.space.size, window.space.ravel(), np.empty(0, np.int64)
-    at, weight, between = np.empty(k, np.int64), np.empty(k), np.empty(k, np.complex128)
-    room = Near(space, at, between, weight, np.empty_like(between), np.empty_like(between), none, none, 0.0)
+    k, space = window.space.size, window.space.ravel()
+    (at, kept, others), weight, between = np.empty((3, k), np.int64), np.empty(k), np.empty(k, np.complex128)
+    room = Near(space, at, between, weight, np.empty_like(between), np.empty_like(between), kept, others, 0.0)
     for row in range(pixels.size):
         i = pixels[row]
         near, sure, rule_known = _look_around(i, light, window, shape, wild, lost, room)
@@ -179,7 +179,7 @@ def _look_around(i, light, window, shape, wild, lost, near):  # type: ignore[no-
     is_bright = light.amplitude[i] - reach > window.dim
     rule_known = is_bright or light.bright[i] + reach < window.dim
     sure = not wild[i] and (rule_known or not window.drop_dim)
-    c = window.concentration if is_bright else 0.0
+    c, kept, others = window.concentration if is_bright else 0.0, 0, 0
     for q in range(side * side):
         near.at[q] = -1
         v, u = y + q // side - half, x + q % side - half
@@ -198,9 +198,10 @@ def _look_around(i, light, window, shape, wild, lost, near):  # type: ignore[no-
         near.at[q] = j
         near.between[q] = between
         near.weight[q] = near.space[q] * (np.exp(c * (between.real - 1.0)) if j != i else 1.0)
-    kept, others = np.flatnonzero(near.at >= 0), np.flatnonzero((near.at >= 0) & (near.at != i))
+        near.kept[kept], near.others[others] = q, q
+        kept, others = kept + 1, others + (j != i)
     room = near.space, near.at, near.between, near.weight, near.slopes, near.bends
-    return Near(*room, kept, others, c), sure, rule_known
+    return Near(*room, near.kept[:kept], near.others[:others], c), sure, rule_known
 
 
 @numba.njit(**FAST)
