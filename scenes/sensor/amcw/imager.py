@@ -14,6 +14,7 @@ from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from scipy import ndimage
 
@@ -72,13 +73,11 @@ def scattered(image: np.ndarray, facts: ScatterFacts) -> np.ndarray:
 
 def pixel_spans(lens: Lens, slopes: np.ndarray) -> np.ndarray:
     """Return (h, w): the area of slopes that pixels span at ``slopes`` (h, w, 2), relative to one on the axis."""
-    half = np.array([0.5 / lens.fx, 0.5 / lens.fy])  # of a pixel, as a slope
-
-    def seen(aside: np.ndarray) -> np.ndarray:
-        return lens.project(np.concatenate([slopes + aside, np.ones((*slopes.shape[:2], 1))], axis=-1))
-
-    along_x, along_y = (seen(aside) - seen(-aside) for aside in np.diag(half))
-    return np.asarray(1 / np.abs(along_x[..., 0] * along_y[..., 1] - along_x[..., 1] * along_y[..., 0]))
+    places = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1).reshape(-1, 3)
+    _, by_motion = cv2.projectPoints(places, np.zeros(3), np.zeros(3), lens.matrix, np.array(lens.distortion))
+    # derivatives of u and v by the place's x and y: after the three of the turn stand those of the shift
+    (ux, uy), (vx, vy) = np.moveaxis(by_motion.reshape(*slopes.shape[:2], 2, -1)[..., 3:5], (2, 3), (0, 1))
+    return np.asarray(lens.fx * lens.fy / np.abs(ux * vy - uy * vx))
 
 
 class AmcwImager(UnitModel[AmcwCamera]):
