@@ -194,14 +194,14 @@ def _listed(wanted: np.ndarray, side: int, flying: bool) -> Listed:
     # numbers of the pixels row by row, -1 elsewhere
     in_range, in_halo = (np.where(m, np.cumsum(m).reshape(m.shape) - 1, -1).astype(np.int32) for m in (ranges, halo))
     range_, wanted_ = np.flatnonzero(ranges), np.flatnonzero(wanted)
-    window, near = windows_of(in_halo, side, -1)[range_], windows_of(in_range, 3, -1)[wanted_]
+    window, near = windows_of(in_halo, side, -1, range_), windows_of(in_range, 3, -1, wanted_)
     return Listed(np.flatnonzero(halo), range_, in_range.ravel()[wanted_], window, near)
 
 
-def windows_of(image: np.ndarray, side: int, beyond: float) -> np.ndarray:
-    """Return (h w, side^2): the windows of an image (h, w), row by row, with ``beyond`` outside the border."""
-    padded = np.pad(image, side // 2, constant_values=beyond)
-    return np.lib.stride_tricks.sliding_window_view(padded, (side, side)).reshape(-1, side * side)
+def windows_of(image: np.ndarray, side: int, beyond: float, pixels: np.ndarray) -> np.ndarray:
+    """Return (m, side^2): an image's (h, w) windows about flat ``pixels`` (m,), with ``beyond`` outside the border."""
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(image, side // 2, constant_values=beyond), (side, side))
+    return windows[np.divmod(pixels, image.shape[1])].reshape(-1, side * side)
 
 
 def at_once(imager: AmcwImager, exposure: AmcwExposure, asked: np.ndarray) -> AtOnce | None:
@@ -276,7 +276,7 @@ def _linear(
     kind[at], row[at] = UNEVEN, np.arange(len(at))
     pulls = metres[:, :, None] * moved[:, kept]
     by_each = np.copysign(np.sqrt((pulls**2).sum(axis=0)), pulls.sum(axis=0)) * by_path[at, None] / step_m
-    by_each /= windows_of(noise.reshape(imager.region.shape), side, 1.0)[at]
+    by_each /= windows_of(noise.reshape(imager.region.shape), side, 1.0, at)
     taps = space[side // 2] / np.sqrt(space[side // 2, side // 2])
     base = np.round(z)
     own, off, steps, others, rest_of = (values.astype(f4) for values in (noise, z - base, by_path, each, more))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from scipy import ndimage
 
@@ -127,8 +128,8 @@ def _may_fly(
     slack_m, z_m = np.nan_to_num(slack_m), np.nan_to_num(z_m)
     measured = known & ~unmeasured
     low, high = np.where(measured, z_m - slack_m, np.inf), np.where(measured, z_m + slack_m, -np.inf)
-    nearest = ndimage.minimum_filter(low, 3, mode="constant", cval=np.inf)
-    farthest = ndimage.maximum_filter(high, 3, mode="constant", cval=-np.inf)
+    square = np.ones((3, 3), np.uint8)
+    nearest, farthest = np.asarray(cv2.erode(low, square)), np.asarray(cv2.dilate(high, square))
     wild = (~known & ~unmeasured).astype(int)
     count = ndimage.convolve(wild, np.ones((3, 3), int), mode="constant")
     before, behind = z_m + slack_m - nearest > gate.near_m, farthest - z_m + slack_m > gate.far_m
@@ -167,10 +168,11 @@ def even_pixels(
     half = size // 2
     unlike = unsure | (light.amplitude * (1 - DEVIATIONS * light.swell) <= window.dim).any(axis=0)
     unlike |= (light.turn > MOST_NOISE).any(axis=0)
-    even = ~ndimage.binary_dilation(unlike.reshape(shape), np.ones((size, size), bool), border_value=1)
+    square = np.ones((size, size), np.uint8)
+    even = np.asarray(cv2.dilate(unlike.reshape(shape).astype(np.uint8), square)) == 0
     even[:half], even[-half:], even[:, :half], even[:, -half:] = False, False, False, False
     for f, plane in enumerate(window.concentration * light.turn.reshape(-1, *shape) ** 2):
-        even &= ndimage.maximum_filter(plane, size) - ndimage.minimum_filter(plane, size) < MOST_UNLIKE
+        even &= np.asarray(cv2.dilate(plane, square)) - np.asarray(cv2.erode(plane, square)) < MOST_UNLIKE
         even &= edge[f].reshape(shape) < MOST_EDGE
     return even.ravel()
 
@@ -192,36 +194,40 @@ def fill_even(
         """Values (f, n) summed over each window with weights ``space``, which are a product of rows and columns."""
         middle = space.shape[0] // 2
         planes, across = values.reshape(-1, *shape), space[middle] / np.sqrt(space[middle, middle])
-        for axis in (1, 2):
-            planes = ndimage.correlate1d(planes, across, axis=axis, mode="constant")
-        return np.asarray(planes.reshape(values.shape)[:, even])
+        border = cv2.BORDER_CONSTANT
+        return taken(np.stack([cv2.sepFilter2D(plane, -1, across, across, borderType=border) for plane in planes]))
 
-    own = light.turn[:, even]
+    def taken(values: np.ndarray) -> np.ndarray:
+        return values.reshape(len(values), -1).take(at, axis=1)
+
+    at = np.flatnonzero(even)
     carried = light.amplitude if window.by_amplitude else np.ones(light.amplitude.shape)
     of_neighbours, of_rest = _shares_of(window)
+    own, edge, own_carried = taken(light.turn), taken(edge), taken(carried)
     weights = summed(carried, window.space)
     share = np.interp(own, NOISES, of_neighbours)
     squares = summed((carried * light.turn) ** 2, window.space**2)
     spreads = summed((light.amplitude * light.swell) ** 2, window.space**2)
     middle = window.space.ravel()[window.space.size // 2]
     each = share / weights
-    mine = middle * carried[:, even] / weights
+    mine = middle * own_carried / weights
     rest = np.interp(own, NOISES, of_rest) * own**2
     centre = np.sqrt((1 - share * (1 - mine)) ** 2 * own**2 + rest)
-    variance = each**2 * (squares - (middle * carried[:, even] * own) ** 2) + centre**2
-    alone = filtered[:, 0, even] + 1j * filtered[:, 1, even]
+    variance = each**2 * (squares - (middle * own_carried * own) ** 2) + centre**2
+    re, im, size = (taken(filtered[:, k]) for k in range(3))
+    alone = re + 1j * im
     # noise brings the mean nearer to the centre's own phase, as it does the shares
-    mean = light.phasor[:, even] * (1 - share) + alone * (share / np.abs(alone))
-    out.phasor[:, even] = mean / np.abs(mean)
+    mean = taken(light.phasor) * (1 - share) + alone * (share / np.abs(alone))
+    out.phasor[:, at] = mean / np.abs(mean)
     # noise across a mean phasor makes it longer
-    out.amplitude[:, even] = filtered[:, 2, even] * (1 + 0.5 * variance if window.by_amplitude else 1.0)
-    out.turned[:, even] = np.sqrt(variance)
-    out.spread[:, even] = np.sqrt(spreads) / window.space.sum()
-    out.left_out[:, even] = rest / variance
+    out.amplitude[:, at] = size * (1 + 0.5 * variance if window.by_amplitude else 1.0)
+    out.turned[:, at] = np.sqrt(variance)
+    out.spread[:, at] = np.sqrt(spreads) / window.space.sum()
+    out.left_out[:, at] = rest / variance
     kept = window.space.size - 1
-    out.edge[:, even] = edge[:, even] + 0.5 * kept * (1 - np.exp(-(own**2)))
+    out.edge[:, at] = edge + 0.5 * kept * (1 - np.exp(-(own**2)))
     quadratic = (kept * 6 / 16 + kept**2 / 8) * own**4
-    out.edge_spread[:, even] = np.sqrt(quadratic + (1 + kept) * edge[:, even] * own**2)
-    out.edge_least[:, even] = 0.0
-    out.edge_loose[:, even] = np.sqrt(kept / 8)
+    out.edge_spread[:, at] = np.sqrt(quadratic + (1 + kept) * edge * own**2)
+    out.edge_least[:, at] = 0.0
+    out.edge_loose[:, at] = np.sqrt(kept / 8)
     return each, centre

@@ -204,7 +204,7 @@ class AmcwImager(UnitModel[AmcwCamera]):
     def _near(self) -> np.ndarray:
         """(n, 9) int32: each pixel's neighbours and itself, -1 beyond the region's border."""
         h, w = self.region.shape
-        return np.ascontiguousarray(windows_of(np.arange(h * w, dtype=np.int32).reshape(h, w), 3, -1))
+        return np.ascontiguousarray(windows_of(np.arange(h * w, dtype=np.int32).reshape(h, w), 3, -1, np.arange(h * w)))
 
     @cached_property
     def filter_settings(self) -> kernels.FilterSettings:
