@@ -90,6 +90,7 @@ PLANS = {
     "many repeats": (TINY, ["repeats=259", "threshold={calibrate: {repeats: 257}}"]),
     "a study": (STUDY, []),
     "a study of two distances": (STUDY, ["sweep={source.target.distance_m: [0.6, 0.7]}"]),
+    "a study of two ranges of damage": (STUDY, ["sweep={source.target.damage.diameter_mm: [[2.0, 8.0], [4.0, 9.0]]}"]),
 }
 
 
@@ -254,8 +255,10 @@ def test_shards_whose_thresholds_differ_by_more_are_judged_anew(plan, tmp_path):
     into = shards_of_unlike_machines(plan, tmp_path, 1.01)
     joined = go(plan, into, Pretended())
     judged = [parts_of(plan, Shard(number, 2))[1] for number in (1, 2)]
-    groups = zip(plan.groups, *judged, strict=True)
-    both = [group for group, first, second in groups if first and second and group.first]
+    # groups that share their trials before thresholds also share them between shards
+    leaders = [group.leader or group for group in plan.groups]
+    shards = [[id(leader) for leader, parts in zip(leaders, each, strict=True) if parts] for each in judged]
+    both = [group for group in leaders if all(id(group) in each for each in shards) and group.first]
     calibrates = any(point.config.threshold.calibrate is not None for group in both for point in group.points)
     assert (joined.trials.done > 0) == calibrates
     assert joined.failures == [] and joined.trials.over == trial_count(plan)

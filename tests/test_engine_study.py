@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -85,6 +86,28 @@ def test_boards_differ_by_purpose_and_number_and_hole_free_ones_show_no_damage(t
         shown, target = batch.renders[0].target, batch.set_ups[0].target
         assert len(target.damages) == 5
         assert shown == (target if batch.role == "damaged" else target.hole_free())
+
+
+KINDS = [
+    {"kind": "through", "per_board": 5, "diameter_mm": [2.0, 8.0]},
+    {"kind": "through", "per_board": 3, "diameter_mm": [4.0, 9.0]},
+]
+
+
+def test_groups_that_differ_in_damage_share_their_trials_before_thresholds(tmp_path):
+    by_damage = f"sweep={{source.target.damage: {json.dumps(KINDS)}, capture.frames: [1, 2]}}"
+    first, second = plan_of(load_experiment(written(tmp_path), [by_damage]), tmp_path).groups
+    assert second.leader is first and second.first == () and len(first.first) == 5
+    for batch in first.first:
+        ((_, task),) = first.trials(batch, {})
+        assert [one.digest for one in task.points] == [point.digest for point in (*first.points, *second.points)]
+    for group in (first, second):
+        tasks = [task for batch in group.then for _, task in group.trials(batch, AT_5)]
+        assert len(tasks) == 7
+        assert {one.digest for task in tasks for one in task.points} == {point.digest for point in group.points}
+    for apart in ("source.camera.unit_seed: [1, 2]", "source.target.distance_m: [0.6, 0.7]"):
+        groups = plan_of(load_experiment(written(tmp_path), [f"sweep={{{apart}}}"]), tmp_path).groups
+        assert [group.leader for group in groups] == [None, None]
 
 
 # ---- thresholds ------------------------------------------------------------------------------------------------------
