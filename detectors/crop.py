@@ -23,6 +23,7 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud
 
 DOUBTFUL_BELOW = 0.8  # probability of a comparison below which the choice is called doubtful
+CROWD = 4  # other surfaces that are half as large or larger, as in a heap of stones, from which on it is doubtful too
 CENTRE_SPREAD = 0.25
 """Deviation of the weight that pixels have, as a share of the picture's sides: people aim at the target."""
 LYING_WEIGHT, STANDING_WEIGHT = 0.10, 0.02
@@ -217,6 +218,8 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
     close = [(place, why) for place, probability, why in against if probability < DOUBTFUL_BELOW]
     doubts = [f"{why} (--target {place} takes the other)" for place, why in close]
     doubts = [f"it is doubtful which surface is the target: {'; '.join(doubts)}"] if doubts else []
+    if (alike := sum(2 * each.share >= candidates[0].share for each in candidates[1:])) >= CROWD:
+        doubts.append(f"{alike} other surfaces are half as large as target 1 or larger: the scene may hold no target")
     further = [str(n) for n, each in enumerate(candidates[1:], 2) if candidates[0].continues(each, surfaces.contact_m)]
     if further:
         also = "targets {} lie" if len(further) > 1 else "target {} lies"

@@ -143,6 +143,16 @@ def test_two_boards_side_by_side_are_a_doubt() -> None:
         assert judged("two_boards", seed, "phone")[1]
 
 
+@pytest.mark.parametrize(("squares", "is_told"), [(4, False), (5, True)])
+def test_a_crowd_of_like_surfaces_may_hold_no_target(squares: int, is_told: bool) -> None:
+    """Squares side by side, each 20 cm farther than the one before, so that the first is preferred to all others."""
+    z_m = np.full((150, 200), np.nan)
+    for number in range(squares):
+        z_m[60:92, 4 + 40 * number : 36 + 40 * number] = 0.5 + 0.2 * number
+    doubts = choice_of(cloud_of(z_m), AutoCrop()).warnings
+    assert any("may hold no target" in doubt for doubt in doubts) == is_told
+
+
 def test_a_board_close_before_a_wall_is_taken_with_or_without_a_doubt() -> None:
     """Seen from the front it may as well be a thing that lies on the wall."""
     for seed, camera in ((1, "phone"), (2, "l515"), (3, "azure wfov binned")):
