@@ -118,9 +118,6 @@ def main(options: argparse.Namespace, command: str) -> int:
     provenance |= {"digest": experiment.digest, "seed": experiment.config.seed}
     write_tables(folder, {table: table.frame(each) for table, each in rows.items()}, provenance)
     warnings, said = warnings_of(one.found, one.seen), answer(one.found, patches, limits_mm, wanted, len(poses))
-    if further:  # measured on the pipe alone (docs/damage.md)
-        told = "limits learnt over so many tilts may be a third too large: judge them by a study in the poses chosen"
-        warnings.insert(0, told)
     if (added := len(poses) - len(given)) < options.suggest:
         told = f"{added} of {many(options.suggest, 'pose')} suggested: no other pose adds to what is covered"
         warnings.insert(0, told)
@@ -135,7 +132,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     first = f"Simulated, for {unit}, {detector}. {one.found.said}"
     write_text(folder / COVERAGE_PAGE.name, coverage_html(name, said, first, scene, poses, goals, warnings, command))
     grids = [table.grid(rows[table], terminal=True) for table in (GOALS, POSES) if rows[table]]
-    show([said, first, *(f"warning: {text}" for text in warnings), *grids])
+    show([*(f"warning: {text}" for text in warnings), said, first, *grids])
     print(f"page: {folder / COVERAGE_PAGE.name}")
     return 0
 

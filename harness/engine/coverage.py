@@ -1,17 +1,14 @@
-"""A part before a camera, patch by patch: its noise there, how strong damage shows, and how often it is found.
+"""A part before a camera, patch by patch: its noise there, how strongly damage shows, and how often it is found.
 
-Noise at a place is the detector's unit of score on the undamaged part there, in metres: a constant where it has one
-scale for the whole part, else what it takes from round about. Strength is d' of the ideal observer at a noise of 1 m,
-from noise-free views with and without the damage. Both are learnt on boards of the family in random poses as wide as
-those asked for. Not modelled: which way the undamaged part errs at a place (the unit's pattern, the surface's misfit),
-an unknown surface in the strength, light of other parts, information in missing returns."""
+Noise at a place is the detector's unit of score there, in metres: a constant where it has one scale for the whole part,
+else what it takes from round about. How strongly damage shows, and how surely, is learnt from the detector's own scores
+on boards of the family in random poses as wide as those asked for. Not modelled: which way the undamaged part errs at
+a place (the unit's pattern, the surface's misfit), light of other parts, sizes in missing returns."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
-from operator import add
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +16,6 @@ import numpy as np
 from scipy import ndimage
 
 from harness.engine.estimate import progress_display
-from harness.engine.ideal import REACH_PX, noise_free_z_m
 from harness.engine.journal import Journal
 from harness.engine.judge import detector_of
 from harness.engine.plan import Batch, Group, SweepPlan, batch_of, plan_of, point_task
@@ -27,8 +23,7 @@ from harness.engine.run import carried_out, render_missing, run_plan
 from harness.engine.setup import load_set_up
 from harness.engine.trial import PointTask, TrialTask, cloud_of
 from harness.engine.work import Job, JobEngine
-from harness.evaluation.coverage import Damages, Findable, Patches, Seen, findable
-from harness.evaluation.study.ideal import LONGEST_LAG_PX, NoiseSums, noise_sums, responses
+from harness.evaluation.coverage import Findable, Inspections, Patches, Seen, findable
 from harness.experiment.schema import Experiment, ExperimentConfig, Point, SimulatedSource
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, rotate_vectors, transform_points
@@ -36,7 +31,7 @@ from scenes.target.custom import BoardConfig, PoseConfig
 from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.truth import Damage, face_of
 
-BOARDS, LOOKS = 40, 3  # Damaged boards on which strength and hits are learnt, and averages in which each is inspected
+BOARDS, LOOKS = 40, 3  # Damaged boards to learn from, and averages in which each is inspected
 STEEPEST_DEG = 60.0  # Tilt about either axis of these boards, at most
 DRAWS, AROUND_PX, NEAR_PX = 2, 31, 15  # Averages for noise; sides of squares for the unit of score, for missing pixels
 MOST_PATCHES = 3000
@@ -61,13 +56,14 @@ def survey(experiment: Experiment, poses: Sequence[Pose], cache: Path, folder: P
     """Return a survey for each set-up. Views and trials that are in ``cache`` and ``folder`` are not made again. Raises
     UserError where a point has no threshold, and as `declared` and `findable` do."""
     plan = SweepPlan(tuple(_widened(group, poses) for group in plan_of(experiment, cache, folder).groups))
-    journal, rows = Journal(folder / "journal"), dict[tuple[str, int, int, str], list[bool]]()
+    journal, scores = Journal(folder / "journal"), dict[tuple[str, int, int, str], list[float]]()
     with progress_display() as report:
         outcome = run_plan(plan, journal, engine, report)
     for entry in map(journal.read, outcome.finished):
         for row in (entry.record or {}).get("holes", ()) if entry else ():
             place = (row["variant"], row["frames"], row["board"], row["hole"])
-            rows.setdefault(place, []).append(bool(row["detected"] or row["no_return"]))
+            missed = np.inf if row["no_return"] else np.nan
+            scores.setdefault(place, []).append(row["score"] if row["detected"] else missed)
     surveys = []
     for group in plan.groups:
         source, family = declared(group.points[0].config)
@@ -83,12 +79,13 @@ def survey(experiment: Experiment, poses: Sequence[Pose], cache: Path, folder: P
                 why = next((one.in_short for one in outcome.failures), "no hole-free run ended")
                 raise UserError(f"{point.label or point.variant} has no threshold: {why}")
             task = point_task(point, outcome.thresholds[point.digest], group.learned.get(point.digest))
-            boards = _each(_board_learnt, zip(group.then, wholes, strict=True), (task, group.seed), engine)
-            damages = _damages([one for one in boards if one is not None], point, rows)
+            boards = _each(_board_seen, zip(group.then, wholes, strict=True), (task, group.seed), engine)
+            some = _inspections([one for one in boards if one is not None], point, scores)
+            found = findable(some, outcome.thresholds[point.digest])
             blind = np.full(len(patches.areas_m2), np.inf)
             seen = _each(_part_seen, ((view,) for view in views), (task, group.seed, patches), engine)
             seen = [Seen(blind, np.ones(len(blind)), np.ones(len(blind))) if one is None else one for one in seen]
-            surveys.append(Survey(point, task, patches, findable(damages), dict(zip(poses, seen, strict=True))))
+            surveys.append(Survey(point, task, patches, found, dict(zip(poses, seen, strict=True))))
     return surveys
 
 
@@ -160,67 +157,57 @@ def _each(
     return [ends[job.name].value for job in jobs]
 
 
-def _damages(boards: Sequence[Any], point: Point, looks: Mapping[tuple[str, int, int, str], Sequence[bool]]) -> Damages:
-    """The damages of boards (`_board_learnt`) that were inspected, their strengths by the noise of all boards."""
-    if not boards:
-        raise UserError(f"{point.label or point.variant}: no damaged board was judged", fix="check the detector's crop")
-    sums, facts = reduce(add, (noise for _, _, noise in boards)), []
-    for number, damages, _ in boards:
-        for damage, signal_m, seen in damages:
-            hits = looks.get((point.variant, point.config.capture.frames, number, str(damage.id)), ())
-            square = responses(signal_m, sums)[LONGEST_LAG_PX, LONGEST_LAG_PX] if signal_m.any() else 0.0
+def _inspections(
+    boards: Sequence[Any], point: Point, scores: Mapping[tuple[str, int, int, str], Sequence[float]]
+) -> Inspections:
+    """All inspections of the damages of boards (`_board_seen`)."""
+    facts = list[tuple[float, ...]]()
+    for number, damages in boards:
+        for damage, seen in damages:
+            place, own = (point.variant, point.config.capture.frames, number, str(damage.id)), len(facts)
             sizes_mm = (damage.diameter_m / MM, damage.depth_m / MM)
-            facts.append((*sizes_mm, *seen, max(float(square), 0.0) ** 0.5, sum(hits), len(hits)))
-    plan_mm, depth_mm, *seen, strength, found, inspections = np.array(facts).T
-    word, size_mm = ("depth", depth_mm) if np.ptp(plan_mm) < SAME_MM < np.ptp(depth_mm) else (damage.size_of, plan_mm)
-    return Damages(word, size_mm, Seen(*seen), strength, found, inspections)
+            facts += [(own, *sizes_mm, *seen, score) for score in scores.get(place, ())]
+    if not facts:
+        raise UserError(f"{point.label or point.variant}: no damaged board was judged", fix="check the detector's crop")
+    of, plan_mm, depth_mm, *seen, score = np.array(facts).T
+    size_of = boards[0][1][0][0].size_of
+    word, size_mm = ("depth", depth_mm) if np.ptp(plan_mm) < SAME_MM < np.ptp(depth_mm) else (size_of, plan_mm)
+    return Inspections(word, of, size_mm, Seen(*seen), score)
 
 
-def _residuals(batch: Batch, point: PointTask, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The detector's residuals (k, h, w) on averages of a hole-free board, where judged (k, h, w), and its unit of
-    score in metres (h, w): the residual over the score, rms about each pixel; larger where some averages are not
-    judged, infinite where most are not."""
+def _unit_m(batch: Batch, point: PointTask, seed: int) -> np.ndarray:
+    """The detector's unit of score (h, w) on a hole-free board, metres: residual over score, rms about each pixel;
+    larger where some pixels or averages are not judged, infinite where most are not."""
     fields = []
     for repeat in range(DRAWS):
         task = TrialTask(batch.before(repeat), seed, "hole_free", repeat, (point,), None, batch.board)
         evidence = detector_of(point.detector, point.settings_json, point.learned).analyse(cloud_of(task, point))
-        judged = np.isfinite(evidence.score)
-        fields.append([np.where(judged, one, np.nan) for one in (evidence.residual_m, evidence.score)])
-    noise_m, score = np.moveaxis(np.array(fields), 1, 0)
-    known = np.isfinite(score)
-    noise_m = np.where(known, noise_m, 0.0)
-    each = (noise_m, np.where(known, score, 0.0))
-    square, of_score = (ndimage.uniform_filter((one**2).mean(axis=0), AROUND_PX) for one in each)
-    share = ndimage.uniform_filter(known.mean(axis=0), NEAR_PX)
-    judged = (known.mean(axis=0) >= 0.5) & (square > 0) & (of_score > 0)
+        known = np.isfinite(evidence.score)
+        fields.append([known, *(np.where(known, one**2, 0.0) for one in (evidence.residual_m, evidence.score))])
+    known, *squares = np.mean(fields, axis=0)
+    square, of_score = (ndimage.uniform_filter(one, AROUND_PX) for one in squares)
+    judged = (known >= 0.5) & (square > 0) & (of_score > 0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return noise_m, known, np.where(judged, np.sqrt(square / of_score / share), np.inf)
+        return np.where(judged, np.sqrt(square / of_score / ndimage.uniform_filter(known, NEAR_PX)), np.inf)
 
 
-def _board_learnt(
+def _board_seen(
     batch: Batch, whole: Batch, point: PointTask, seed: int
-) -> tuple[int, list[tuple[Damage, np.ndarray, tuple[float, float, float]]], NoiseSums]:
-    """A damaged board's number, its damages with signatures (cut-outs, metres) and how each is seen, and its noise."""
-    set_up, intact = (load_set_up(one.set_ups[0]) for one in (batch, whole))
-    noise_m, known, deviation_m = _residuals(whole, point, seed)
-    change_m = np.nan_to_num(noise_free_z_m(set_up) - noise_free_z_m(intact))
-    x_m, y_m = np.moveaxis(set_up.board_xy_m, -1, 0)
-    found = []
+) -> tuple[int, list[tuple[Damage, tuple[float, float, float]]]]:
+    """A damaged board's number, and its damages with how each is seen (`Seen`) on the board that lacks them."""
+    set_up, unit_m, found = load_set_up(batch.set_ups[0]), _unit_m(whole, point, seed), []
     for damage in set_up.truth:
-        near = damage.within(x_m, y_m, REACH_PX * max(set_up.pitch_mm) * MM)
-        rows, columns = np.nonzero(near)
-        signal_m = np.where(near, change_m, 0.0)[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
         range_m = float(np.linalg.norm(damage.centre_camera_m))
         cosine = float(-damage.axis_camera @ damage.centre_camera_m) / range_m
-        about_m = float(np.median(deviation_m.ravel()[set_up.outlines[damage.id]]))
-        found.append((damage, signal_m, (about_m, cosine, range_m)))
-    return batch.board or 0, found, noise_sums(noise_m / deviation_m, known & np.isfinite(deviation_m))
+        about_m = float(np.median(unit_m.ravel()[set_up.outlines[damage.id]]))
+        found.append((damage, (about_m, cosine, range_m)))
+    return batch.board or 0, found
 
 
 def _part_seen(view: Batch, point: PointTask, seed: int, patches: Patches) -> Seen:
     """Return how the patches of an undamaged part are seen and judged."""
     set_up = load_set_up(view.set_ups[0])
-    _, _, deviation_m = _residuals(view, point, seed)
+    deviation_m = _unit_m(view, point, seed)
     there = transform_points(set_up.T_camera_board, patches.points_m)
     range_m = np.linalg.norm(there, axis=1)
     cosine = -(rotate_vectors(set_up.T_camera_board, patches.normals) * there).sum(axis=1) / range_m

@@ -1,8 +1,10 @@
 """The smallest damage found nine times in ten at each patch of a part, and the poses that cover most of it.
 
-The logarithm of a damage's strength (d' of the ideal observer at a noise of 1 m) is a quadratic of the logarithms of
-its size and of the cosine of the angle of incidence, and linear in that of the range. Over the noise at a place it is
-d'. A patch's limit is the smallest size with the d' from which the detector finds damage nine times in ten."""
+The detector's score of damage, times its unit of score there, is the damage's signal, in metres. Its logarithm is
+linear in those of size and range and quadratic in the cosine of the angle of incidence, with a normal scatter that is
+proportional to a power of that cosine: obliquely seen damage is found less surely. Damage is found where its score
+exceeds the threshold, so the law gives POD at every size and place: MIL-HDBK-1823A's signal against size (appendix G),
+with the place beside the size. Not modelled: what else makes places of equal angle, range and unit of score differ."""
 
 from __future__ import annotations
 
@@ -10,17 +12,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import special
 
-from harness.evaluation.pod.hit_miss import fit_hit_miss
+from harness.evaluation.pod.ahat import CensoredFit, fit_censored
 from harness.evaluation.pod.statement import POD
 from harness.vocabulary.errors import UserError
 
-SIZES = 400
-"""Sizes between the smallest and the largest inspected, in equal ratios, at which a patch is asked."""
 BEYOND_DEG = 3.0
 """Angle by which a patch may be steeper than every damage that was inspected."""
+FAR = 1.5
+"""Score over the threshold beyond which it counts only that it is beyond: the law is to hold near the threshold."""
+GROWTHS = np.linspace(0.0, 4.0, 17)
+"""Powers of 1 / cosine with which the scatter may grow."""
 LOOSE = 2.0
-"""d' found nine times in ten over that found half the time, beyond which hits do not follow d' (noise makes 1.28)."""
+"""Size found nine times in ten over that found half of the time, from which on limits are called rough."""
 FEWEST = 20
 """Damages without which nothing is learnt."""
 
@@ -48,28 +53,30 @@ class Seen:
 
 
 @dataclass(frozen=True, eq=False)
-class Damages:
-    """Damages that a detector inspected, (n,) each: ``size_mm`` of what ``size_of`` names, how they are ``seen``, their
-    ``strength`` in 1/m, and in how many of the ``inspections`` they were found, ``hits``."""
+class Inspections:
+    """Inspections of damage, (n,) each: the ``damage``'s number, its ``size_mm`` of what ``size_of`` names, how it is
+    ``seen``, and its ``score``: the lowest threshold at which it is found no more, NaN where it was missed at the
+    threshold in use, infinite where it was found by missing returns alone."""
 
     size_of: str
+    damage: np.ndarray
     size_mm: np.ndarray
     seen: Seen
-    strength: np.ndarray
-    hits: np.ndarray
-    inspections: np.ndarray
+    score: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class Findable:
-    """Law by which damage shows and is found. ``index``, ``index_50``: d' found nine times in ten, half the time;
-    ``scatter``: rms of ln strength about the quadratic of ``coefficients``; ``steepest``: least cosine inspected."""
+    """Law of the signal: ``coefficients`` of `_design`; ``scatter`` of its logarithm where it is seen frontally, which
+    grows with 1 / cosine to the power ``growth``; at the median angle ``ratio`` of the sizes found nine times in ten
+    and half of the time. ``steepest``: least cosine inspected. ``damages``: number learnt from."""
 
     size_of: str
     coefficients: np.ndarray
     scatter: float
-    index: float
-    index_50: float
+    growth: float
+    ratio: float
+    threshold: float
     sizes_mm: tuple[float, float]
     steepest: float
     damages: int
@@ -78,64 +85,70 @@ class Findable:
     def said(self) -> str:
         """Return what was learnt, in a sentence."""
         return (
-            f"Learnt from {self.damages} damages, whose strength scatters by {100 * self.scatter:.0f} % about what "
-            f"size, angle and distance say; found nine times in ten from a d' of {self.index:.3g} on. The limit of a "
-            "single patch may be wrong by a third."
+            f"Learnt from {self.damages} damages: the detector's signal is proportional to the {self.size_of} to the "
+            f"power {self.coefficients[1]:.2g}, and scatters by {100 * self.scatter:.0f} % where the face is seen "
+            f"frontally, by {100 * self.scatter * 2**self.growth:.0f} % at 60°. The limit of a single patch may be "
+            "wrong by a third."
         )
 
     @property
     def doubt(self) -> str:
-        """Return why the limits are rough; empty where hits follow the predicted d' about as well as noise allows."""
-        if self.index <= LOOSE * self.index_50:
+        """Return why the limits are rough; empty where size, angle and distance decide well what is found."""
+        if self.ratio <= LOOSE:
             return ""
         return (
-            "what is found depends on more than the predicted signal: damage is found half the time from a d' of "
-            f"{self.index_50:.3g} on, but nine times in ten from {self.index:.3g} on only (noise alone makes 1.3 times "
-            "as much). Limits are rough and may be far too large: run a study in these poses before you rely on them"
+            "what is found depends on more than size, angle and distance: the size found nine times in ten is "
+            f"{self.ratio:.2g} times that found half of the time. Limits are rough and may be far too large: run a "
+            "study in these poses before you rely on them"
         )
 
     def limits_mm(self, seen: Seen) -> np.ndarray:
-        """Return a90 (n,) of places: the size from which on all up to the largest inspected are found, infinite where
-        there is none; NaN where nothing is judged, and where the angle is steeper than all inspected."""
-        sizes_mm = np.geomspace(*self.sizes_mm, SIZES)
-        places = (np.maximum(seen.cosine, self.steepest)[:, None], seen.range_m[:, None])
-        log = _features(*np.broadcast_arrays(sizes_mm, *places)) @ self.coefficients
-        found = log - np.log(seen.deviation_m)[:, None] >= np.log(self.index)
-        found = np.logical_and.accumulate(found[:, ::-1], axis=1)[:, ::-1]
+        """Return a90 (n,) of places, at least the smallest size inspected; infinite where it is above the largest; NaN
+        where nothing is judged, and where the angle is steeper than all inspected."""
+        cosine = np.maximum(seen.cosine, self.steepest)
+        others = _design(np.ones(len(cosine)), cosine, seen.range_m) @ self.coefficients
+        needed = np.log(self.threshold * seen.deviation_m) + special.ndtri(POD) * self.scatter / cosine**self.growth
+        limits_mm = np.maximum(np.exp((needed - others) / self.coefficients[1]), self.sizes_mm[0])
+        limits_mm = np.where(limits_mm > self.sizes_mm[1], np.inf, limits_mm)
         beyond = np.cos(min(np.arccos(self.steepest) + np.deg2rad(BEYOND_DEG), np.pi / 2))
-        limits_mm = np.where(found.any(axis=1), sizes_mm[found.argmax(axis=1)], np.inf)
         return np.where(np.isfinite(seen.deviation_m) & (seen.cosine >= beyond), limits_mm, np.nan)
 
 
-def _features(size_mm: np.ndarray, cosine: np.ndarray, range_m: np.ndarray) -> np.ndarray:
-    """(..., 7): what the logarithm of strength is linear in."""
-    a, c, r = (np.log(each) for each in (size_mm, cosine, range_m))
-    return np.stack([np.ones_like(a), a, a**2, c, c**2, a * c, r], axis=-1)
+def _design(size_mm: np.ndarray, cosine: np.ndarray, range_m: np.ndarray) -> np.ndarray:
+    """(n, 5): what the logarithm of the signal is linear in."""
+    return np.column_stack([np.ones(len(size_mm)), np.log(size_mm), cosine, cosine**2, np.log(range_m)])
 
 
-def findable(damages: Damages) -> Findable:
-    """Learn from the damages that were judged and show anything. Raises UserError where that is not enough."""
-    judged = np.isfinite(damages.seen.deviation_m) & (damages.strength > 0)
-    if judged.sum() < FEWEST:
-        said = f"only {judged.sum()} of {len(judged)} damages were judged and show in the distances"
-        raise UserError(f"{said}: no limit can be learnt", fix="check the detector's crop, and the sizes of the damage")
-    size_mm, strength, cosine = damages.size_mm[judged], np.log(damages.strength[judged]), damages.seen.cosine[judged]
-    noise, features = np.log(damages.seen.deviation_m[judged]), _features(size_mm, cosine, damages.seen.range_m[judged])
-    hits, inspections = (each[judged].astype(int) for each in (damages.hits, damages.inspections))
-    each = np.repeat(np.arange(len(hits)), inspections)
-    hit = np.concatenate([np.arange(n) < k for n, k in zip(inspections, hits, strict=True)])
-    weights, needed, half = np.ones(len(hits)), np.nan, np.nan
-    for _ in range(2):
-        root = np.sqrt(weights)
-        coefficients = np.linalg.lstsq(features * root[:, None], strength * root, rcond=None)[0]
-        fitted = features @ coefficients
-        scatter = float(np.sqrt((weights * (strength - fitted) ** 2).sum() / weights.sum()))
-        index = np.exp(fitted - noise)
-        fit = fit_hit_miss(index[each], hit, link="probit", log_size=True, inspections=each)
-        needed, half = fit.curve.size_at(POD), fit.curve.size_at(0.5)
-        weights = 1 / (1 + np.log(index / needed) ** 2)  # damages found now and then decide the limit
+def findable(some: Inspections, threshold: float) -> Findable:
+    """Learn from the inspections of damage where the detector judges. Raises UserError where these do not suffice."""
+    judged = np.isfinite(some.seen.deviation_m) & (some.seen.cosine > 0)
+    damages, of = len(np.unique(some.damage[judged])), len(np.unique(some.damage))
+    if damages < FEWEST:
+        fix = "check the detector's crop, and the sizes of the damage"
+        raise UserError(f"only {damages} of {of} damages were judged: no limit can be learnt", fix=fix)
+    size_mm, cosine, score = some.size_mm[judged], some.seen.cosine[judged], some.score[judged]
+    design = _design(size_mm, cosine, some.seen.range_m[judged])
+    below, found = np.isnan(score), np.sort(score[score > threshold])
+    far = max(FAR * threshold, *found[np.isfinite(found)][:FEWEST])
+    above = score > far
+    signal = np.log(np.minimum(np.where(below, threshold, score), far) * some.seen.deviation_m[judged])
+
+    def fitted(growth: float) -> tuple[float, CensoredFit]:
+        """The log-likelihood with a scatter proportional to cosine^-growth, and the fit of rows divided by that."""
+        weight = cosine**growth
+        fit = fit_censored(design * weight[:, None], signal * weight, below, above)
+        return fit.log_likelihood + float(np.log(weight[~(below | above)]).sum()), fit
+
+    fits = [fitted(growth) for growth in GROWTHS]
+    best = int(np.nanargmax([value for value, _ in fits]))
+    growth, (coefficients, scatter, _, _) = float(GROWTHS[best]), fits[best][1]
+    if coefficients[1] <= 0:
+        said = f"what is found does not follow the {some.size_of} of the damage: no limit can be learnt"
+        raise UserError(said, fix="ask for fewer or less tilted poses, or run a study in the pose wanted")
+    ratio = np.exp(special.ndtri(POD) * scatter / np.median(cosine) ** growth / coefficients[1])
     sizes_mm = (float(size_mm.min()), float(size_mm.max()))
-    return Findable(damages.size_of, coefficients, scatter, needed, half, sizes_mm, float(cosine.min()), len(hits))
+    law = (coefficients, scatter, growth, float(ratio), threshold)
+    return Findable(some.size_of, *law, sizes_mm, float(cosine.min()), damages)
 
 
 def in_turn(patches: Patches, found: Sequence[np.ndarray], given: int, further: int) -> list[tuple[int, float, float]]:

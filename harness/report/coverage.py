@@ -17,11 +17,10 @@ from harness.tables.text import many, percent
 COLOURS = ("#fde725", "#a0da39", "#4ac16d", "#1fa187", "#277f8e", "#365c8d", "#46327e", "#b3261e", "#8a8f96")
 """Seven steps of viridis (van der Walt and Smith, 2015), light where small damage is found; red; grey."""
 METHOD = (
-    "Each patch has the detector's unit of score, an angle of incidence and a distance. A damage's strength there is "
-    "d' of the ideal observer over that unit; it was learnt, with the detector's hits, on boards of the family in "
-    "random poses, at the experiment's own threshold. A patch is not judged where the detector judges nothing, where "
-    "it is hidden or out of view, and where it is steeper than all damage that was inspected. Of several poses the "
-    "best counts, not their sum."
+    "Each patch has the detector's unit of score, an angle of incidence and a distance. How damage scores by its size "
+    "and by these three, and how much that scatters, was learnt on boards of the family in random poses, at the "
+    "experiment's own threshold. A patch is not judged where the detector judges nothing, where it is hidden or out of "
+    "view, and where it is steeper than all damage that was inspected. Of several poses the best counts, not their sum."
 )
 
 
@@ -51,8 +50,7 @@ def answer(found: Findable, patches: Patches, limits_mm: np.ndarray, size_mm: fl
 
 def warnings_of(found: Findable, seen: Mapping[Any, Seen]) -> list[str]:
     """Return what makes the figures unreliable, in sentences."""
-    said = ["damage of one size shows with very different strength: limits are rough"] if found.scatter > 0.5 else []
-    said += [found.doubt] if found.doubt else []
+    said = [found.doubt] if found.doubt else []
     if unseen := sum(bool(np.isinf(each.deviation_m).all()) for each in seen.values()):
         said.append(f"the detector judges nothing in {unseen} of the {len(seen)} poses looked at")
     return said
