@@ -54,16 +54,14 @@ def logs_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return (other, nearer, signed - hazard) if link == "cloglog" else (nearer, other, signed - hazard)
 
 
-def slopes_of_link(
-    link: str, predictor: np.ndarray, logs: tuple[np.ndarray, ...] | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """f / F, f / (1 - F) and d ln f / dt at t = predictor, each of its shape. ``logs``: `logs_of_link`, if known."""
+def slopes_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """f / F, f / (1 - F) and d ln f / dt at t = predictor, each of its shape."""
     t = np.clip(predictor, -LARGEST_PREDICTOR, LARGEST_PREDICTOR)
     if link == "logit":  # the commonest, and the ratios are the shares themselves
         hit, miss = special.expit(t), special.expit(-t)
         return miss, hit, miss - hit
-    log_hit, log_miss, log_density = logs or logs_of_link(link, t)
-    bend = {"probit": -t, "cloglog": 1.0 + log_miss, "loglog": -1.0 - log_hit}[link]
+    log_hit, log_miss, log_density = logs_of_link(link, t)
+    bend = {"probit": lambda: -t, "cloglog": lambda: 1.0 - np.exp(t), "loglog": lambda: np.exp(-t) - 1.0}[link]()
     return np.exp(log_density - log_hit), np.exp(log_density - log_miss), bend
 
 
@@ -132,23 +130,22 @@ class HitsAndMisses:
         """(n,) sizes: the design's second column."""
         return np.asarray(self.design[:, 1])
 
-    def value(self, b: np.ndarray, logs: tuple[np.ndarray, ...] | None = None) -> np.ndarray:
-        """(Penalised) log-likelihood (...) at coefficients (..., p); of several studies (d,) at (d, p). ``logs``: the
-        `logs_of_link` there, if known."""
-        found, missed, density = logs or logs_of_link(self.link, b @ self.design.T + self.offset)
+    def value(self, b: np.ndarray) -> np.ndarray:
+        """(Penalised) log-likelihood (...) at coefficients (..., p); of several studies (d,) at (d, p)."""
+        found, missed, density = logs = logs_of_link(self.link, b @ self.design.T + self.offset)
         value = (self.hits * found + self.misses * missed).sum(axis=-1)
         if self.penalty is not None:
-            weight = (self.hits + self.misses) * np.exp(2.0 * density - found - missed)
+            weight = (self.hits + self.misses) * np.exp(2.0 * density - logs[0] - logs[1])
             total, cross, square = weight.sum(-1), weight @ self.z, weight @ self.z**2
             with np.errstate(divide="ignore", invalid="ignore"):
                 prior = 0.5 * (np.log(total) + np.log(np.maximum(square - cross**2 / total, 0.0)))
             value = value + self.penalty * np.where(np.isfinite(prior), prior, -np.inf)
         return np.asarray(value)
 
-    def step(self, b: np.ndarray, logs: tuple[np.ndarray, ...] | None = None) -> np.ndarray:
+    def step(self, b: np.ndarray) -> np.ndarray:
         """(d, p) Newton steps of (d,) studies at b (d, p), scoring steps under a penalty; where the information is
-        singular, in studies that have run off to infinity, without meaning. ``logs`` as of `value`."""
-        up, down, bend = slopes_of_link(self.link, b @ self.design.T + self.offset, logs)
+        singular, in studies that have run off to infinity, without meaning."""
+        up, down, bend = slopes_of_link(self.link, b @ self.design.T + self.offset)
         slope = self.hits * up - self.misses * down
         with np.errstate(all="ignore"):
             if self.penalty is not None:
@@ -180,9 +177,9 @@ class HitsAndMisses:
 
     def climb(self, places: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Values and steps of the studies ``which``, for `ascend`."""
-        some, logs = self.of(which), logs_of_link(self.link, places @ self.design.T + self.offset)
-        value = some.value(places, logs)
-        return np.where(np.isfinite(value), value, -np.inf), some.step(places, logs)
+        some = self.of(which)
+        value = some.value(places)
+        return np.where(np.isfinite(value), value, -np.inf), some.step(places)
 
 
 def ascend(
@@ -248,10 +245,9 @@ def penalised_maxima(data: HitsAndMisses, tolerance: float = TOLERANCE) -> np.nd
     rows = np.arange(len(hits))
     # the start with the highest value can lie in the basin of a lower maximum, so several of the best are climbed
     order = np.argsort([-data.value(start) for start in steep], axis=0, kind="stable")
-    starts = np.concatenate([flat, steep[0], *(steep[k, rows] for k in order[:CLIMBED])])
-    places, values = ascend(lambda at, which: data.climb(at, which % len(rows)), starts, tolerance)
-    best = np.argmax(values.reshape(-1, len(rows)), axis=0)
-    return np.asarray(places.reshape(-1, len(rows), 2)[best, rows])
+    starts = (flat, steep[0], *(steep[k, rows] for k in order[:CLIMBED]))
+    places, values = zip(*(ascend(data.climb, start, tolerance) for start in starts), strict=True)
+    return np.asarray(np.array(places)[np.argmax(values, axis=0), rows])
 
 
 def profile(data: HitsAndMisses, z0: float, level: float, slope: float = 1.0) -> tuple[float, float]:
