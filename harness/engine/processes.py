@@ -368,6 +368,8 @@ def render_into_cache(
 
     target, optics = TargetConfig.from_data(target_data), camera_of(CameraConfig.from_data(camera_data)).optics
     view, found = cached_view(target, optics, RenderConfig.from_data(render_data), Path(folder))
+    if "drjit" in sys.modules:  # from the second render on each process has its share of the cores: threads wait busily
+        sys.modules["drjit"].set_thread_count(max((os.cpu_count() or 1) // MOST_RENDERERS, 1))
     return found, view.seconds
 
 
