@@ -27,8 +27,8 @@ def notches_filled(mask: np.ndarray, radius_px: int) -> np.ndarray:
     a closing leaves in right-angled corners hold less (0.17)."""
 
     def deep_in(gaps: np.ndarray) -> np.ndarray:
-        depths = cv2.distanceTransform(np.pad(gaps, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
-        return np.asarray(depths > 1 + radius_px / 4)
+        depths = np.asarray(cv2.distanceTransform(np.pad(gaps, 1).astype(np.uint8), cv2.DIST_L2, 5))
+        return depths[1:-1, 1:-1] > 1 + radius_px / 4
 
     # a closing, which is slow, stays within the convex hull
     rows, hull = np.flatnonzero(mask.any(axis=1)), np.zeros(mask.shape, np.uint8)

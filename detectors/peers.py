@@ -39,8 +39,6 @@ LEAST_SAMPLES = 4
 """Points that a cylinder holds at least in both clouds: the scatter of fewer says too little."""
 MOST_ALONE = 0.01
 """Share of the target without a counterpart from which on it is told."""
-CHUNK = 4096
-"""Features whose distances to the whole memory are held at once."""
 
 
 class PlaneRansacConfig(ScoreMapConfig):
@@ -309,7 +307,6 @@ def coreset(features: np.ndarray, size: int) -> np.ndarray:
 
 def nearest(features: np.ndarray, memory: np.ndarray) -> np.ndarray:
     """Return the distance (n,) of each feature (n, k) from the nearest in the memory (m, k)."""
-    from scipy.spatial.distance import cdist
+    from scipy.spatial import cKDTree
 
-    parts = np.split(features, range(CHUNK, len(features), CHUNK))
-    return np.concatenate([cdist(some, memory).min(axis=1) for some in parts])
+    return np.asarray(cKDTree(memory).query(features)[0])

@@ -134,9 +134,8 @@ def _blurred(image: np.ndarray) -> np.ndarray:
 
 def transformed(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Return the spectrum of an image (r, c), zero beyond, on a grid of even sides, as `cv2.dft` packs it."""
-    padded = np.zeros(shape, np.float32)
-    padded[: image.shape[0], : image.shape[1]] = image
-    return np.asarray(cv2.dft(padded))
+    beyond = shape[0] - image.shape[0], 0, shape[1] - image.shape[1]
+    return np.asarray(cv2.dft(cv2.copyMakeBorder(image, 0, *beyond, cv2.BORDER_CONSTANT)))
 
 
 def packed(half: np.ndarray) -> np.ndarray:
@@ -155,8 +154,7 @@ def response(spectrum_of: np.ndarray, template: np.ndarray, shape: tuple[int, ..
     """Return the correlation (r, c) of a picture with a template, both packed (`spectra`); of a `halved` picture
     for a ``shape`` half as large, in the middles of 2 x 2 pixels."""
     whole = spectrum_of * template if symmetric else cv2.mulSpectrums(spectrum_of, template, 0, conjB=True)
-    inverse = cv2.dft(whole, dst=whole, flags=cv2.DFT_INVERSE | cv2.DFT_SCALE)
-    return np.asarray(inverse[: shape[0], : shape[1]])
+    return np.asarray(cv2.dft(whole, dst=whole, flags=cv2.DFT_INVERSE | cv2.DFT_SCALE))[: shape[0], : shape[1]]
 
 
 def halved(picture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -86,7 +86,6 @@ class Group:
     """Points that share their frames: one set-up, one seed. On the batch ``learning`` detectors that can do so learn;
     the batches ``first`` are hole-free and set the points' thresholds; ``then`` those judged by them. ``poses``: the
     declaration of the views, where there are several. ``folder``: the place of files of what was learned.
-
     Groups of a study that differ only in the damage have the same trials before thresholds: the first of them runs
     these for the points ``also`` of the others, in the same order as its own, whose ``leader`` it is."""
 

@@ -38,8 +38,7 @@ AGREES = 1e-3
 
 
 class Calibration:
-    """Collects the findings of a group's hole-free trials, in any order; the thresholds do not depend on it. ``quiet``:
-    those of all groups, as one may run the trials of others."""
+    """Collects what hole-free trials, added in any order, say of thresholds. ``quiet``: that of all groups' trials."""
 
     def __init__(self, group: Group, quiet: Quiet) -> None:
         self._group, self._quiet = group, quiet

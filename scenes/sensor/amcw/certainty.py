@@ -214,13 +214,12 @@ def fill_even(
     rest = np.interp(own, NOISES, of_rest) * own**2
     centre = np.sqrt((1 - share * (1 - mine)) ** 2 * own**2 + rest)
     variance = each**2 * (squares - (middle * own_carried * own) ** 2) + centre**2
-    re, im, size = (taken(filtered[:, k]) for k in range(3))
-    alone = re + 1j * im
+    alone = taken(filtered[:, 0]) + 1j * taken(filtered[:, 1])
     # noise brings the mean nearer to the centre's own phase, as it does the shares
     mean = taken(light.phasor) * (1 - share) + alone * (share / np.abs(alone))
     out.phasor[:, at] = mean / np.abs(mean)
     # noise across a mean phasor makes it longer
-    out.amplitude[:, at] = size * (1 + 0.5 * variance if window.by_amplitude else 1.0)
+    out.amplitude[:, at] = taken(filtered[:, 2]) * (1 + 0.5 * variance if window.by_amplitude else 1.0)
     out.turned[:, at] = np.sqrt(variance)
     out.spread[:, at] = np.sqrt(spreads) / window.space.sum()
     out.left_out[:, at] = rest / variance
