@@ -83,7 +83,7 @@ def _told(name: str, rest: list[str]) -> int:
     from harness.vocabulary.declaration.diagnose import nearest
 
     near = nearest(name, programs())
-    fix = f"did you mean {near}?" if near else "tofpod --help says what each does"
+    fix = f"did you mean {near}?" if near else "tofpod --help describes each program"
     raise UserError(f"there is no program {name!r}", legal=", ".join(programs()), fix=fix)
 
 

@@ -173,7 +173,7 @@ def sweep(experiment: str | Path, *changes: str, out: str | Path = "results", jo
     if code == 130:
         raise KeyboardInterrupt
     if code:
-        raise UserError(f"{experiment}: trials failed, as was printed", fix="mend that, and run it again")
+        raise UserError(f"{experiment}: trials failed, as printed above", fix="correct the cause, and run it again")
     return found.folder(out)
 
 

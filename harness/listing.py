@@ -338,7 +338,7 @@ def point_to(run: Path) -> None:
     """Let the link ``latest`` beside a run point to it, unless it is not tofpod's; failures are told on stderr."""
     path = Path(run).parent / LATEST
     if os.path.lexists(path) and latest_run(path.parent) is None:
-        print(f"{path}: is not tofpod's and is left as it is; the newest run is {run}", file=sys.stderr)
+        print(f"{path}: was not written by tofpod and is left unchanged; the newest run is {run}", file=sys.stderr)
         return
     part = path.with_name(f".{LATEST}.{secrets.token_hex(4)}.part")
     try:
@@ -373,7 +373,7 @@ def chosen_results(out: Path, name: str) -> list[Path]:
     experiment, slash, digest = name.partition("/")
     if not EXPERIMENT_NAME.fullmatch(experiment) or (slash and not DIGEST_NAME.fullmatch(digest)):
         legal = "NAME or NAME/DIGEST, as python -m harness.ls results shows them"
-        raise UserError(f"{name!r} names no results", legal=legal)
+        raise UserError(f"{name!r} is not the name of any results", legal=legal)
     parent = Path(out) / experiment
     refuse_links(parent, parent / digest)
     found = [path for path in folders_in(parent, DIGEST_NAME) if digest in ("", path.name)]
@@ -381,7 +381,7 @@ def chosen_results(out: Path, name: str) -> list[Path]:
         # every sweep begins with its declaration, whose first line says whose it is
         declared = folder / EXPERIMENT.name
         if not declared.is_file() or not bounded_bytes(declared, TEXT_BYTES).startswith(b"# tofpod experiment "):
-            raise UserError(f"{folder}: is no folder of results", fix="python -m harness.ls results shows them")
+            raise UserError(f"{folder}: is not a folder of results", fix="python -m harness.ls results shows them")
     return found
 
 

@@ -22,17 +22,17 @@ def _options(parser: argparse.ArgumentParser) -> None:
     put("--capture", type=Path, nargs="+", metavar="PATH", help="frames of a static scene, in any format of detect's")
     add_reading(put)
     put("--frames", type=whole_number(4096), metavar="N", help="use the first N frames only")
-    put("--mask", type=Path, metavar="PNG", help="use the pixels only that are not black here")
+    put("--mask", type=Path, metavar="PNG", help="use only the pixels that are not black in this image")
     put("--board", type=Path, metavar="YAML", help="an experiment with a drilled board: set this beside the capture")
-    put("--albedo", type=float, default=0.8, metavar="A", help="of the captured surfaces (default 0.8, a light wall)")
+    put("--albedo", type=float, default=0.8, metavar="A", help="of the captured surfaces (default: 0.8, a light wall)")
 
 
 @program(
     _options,
-    "Measure the simulated cameras as one measures real ones, and set each published figure beside "
-    "what the simulation gives. With --capture: set a real capture of a static scene beside the simulation of the "
+    "Measure the simulated cameras as real cameras are measured, and set each published figure beside "
+    "the simulated figure. With --capture: set a real capture of a static scene beside the simulation of the "
     "planes and edges in it.",
-    epilog="Exit code 1: a figure fails whose entry in the file of figures does not say why.",
+    epilog="The exit code is 1 if a figure fails and its entry in the file of figures gives no reason.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0, 1 where a figure fails and its entry does not say why, 2 on a user's mistake, 130 after Ctrl-C."""

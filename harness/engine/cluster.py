@@ -210,7 +210,7 @@ class ClusterEngine:
             with contextlib.suppress(OSError):
                 there = set(self._client.scheduler_info(n_workers=-1)["workers"])
         if there is None:
-            fix = "start it again; finished trials are kept, and the same command goes on"
+            fix = "start it again; finished trials are kept, and the same command continues"
             raise UserError(f"the scheduler at {self._scheduler} is gone", fix=fix)
         for address in there - self._asked:
             self._asked.add(address)
@@ -253,13 +253,13 @@ class ClusterEngine:
             self._refuse(address, UserError(f"{where} cannot run tofpod: {type(said).__name__}: {said}", fix=fix))
         elif isinstance(said, BaseException):
             # it died meanwhile, or the network failed: no sign of another installation
-            self._tell_once(f"{where} did not say what it is ({type(said).__name__}: {said}); it is not used")
+            self._tell_once(f"{where} did not state its version ({type(said).__name__}: {said}); it is not used")
         elif said.python.split(".")[:2] != list(platform.python_version_tuple()[:2]):
             message = f"{where} runs Python {said.python}, this machine {platform.python_version()}"
             self._refuse(address, UserError(message, fix="use the same Python on all"))
         elif said.digests.get("trials") != self._digests.get("trials"):
             message = f"{where} runs another version of tofpod, of a plug-in, or of numpy, scipy, numba or OpenCV"
-            fix = "install the same there, and start its workers again: they keep the code that they began with"
+            fix = "install the same there, and start its workers again: they keep the code that they loaded"
             self._refuse(address, UserError(f"{message} than this machine", fix=fix))
         elif said.sees != self._nonce:
             message = f"{where} does not see {self._probe.parent}, where this machine keeps renders"

@@ -135,8 +135,8 @@ class Scan:
         steep = [float(np.quantile(self.angle_deg[part & known], 0.99)) for part in (inner, self.judged)]
         if steep[1] - steep[0] < TELLING_DEG:
             return ""
-        inside = f"the inner {100 * (inner & known).sum() / known.sum():.0f} % of what is judged"
-        rim = f"the limit says nothing of the rim, seen at up to {steep[1]:.0f} degrees, where more is missed"
+        inside = f"the inner {100 * (inner & known).sum() / known.sum():.0f} % of the judged area"
+        rim = f"the limit says nothing about the rim, seen at up to {steep[1]:.0f} degrees, where more is missed"
         return f"{self.recording.name}: damage is placed on {inside}, seen at up to {steep[0]:.0f} degrees; {rim}"
 
     def averaged(self, frames: Sequence[Frame]) -> Cloud:
@@ -206,7 +206,7 @@ def placements(
         empty = 0 if placed.damages else empty + 1
         if empty > MOST_EMPTY:
             fix = "smaller --diameters, a larger --crop, or a camera nearer to the part"
-            raise UserError(f"{scan.recording.name}: no place for the damage on what is judged of it", fix=fix)
+            raise UserError(f"{scan.recording.name}: the judged area has no room for the damage", fix=fix)
         implants = []
         for damage in placed.damages:
             spot = scan.place(*damage.centre_m, 0.0)
@@ -241,7 +241,7 @@ def judge_scans(
         groups = [(scan, slice(k, k + count)) for scan in scans for k in range(0, len(scan.frames) - count + 1, count)]
         if not groups:
             longest = max(len(scan.frames) for scan in scans)
-            raise UserError(f"--frames {count}: no recording has so many", legal=f"1 to {longest}")
+            raise UserError(f"--frames {count}: no recording has that many frames", legal=f"1 to {longest}")
         setting, judged = (groups[::2], groups[1::2]) if len(groups) > 1 else (groups, groups)
         if len(groups) == 1:
             warnings.append(f"{count} frames: one average sets the threshold, shows the false calls and is damaged too")

@@ -114,7 +114,7 @@ class Journal:
     def refresh(self) -> None:
         """Read what other processes have appended since."""
         if self.folder.is_symlink():
-            raise UserError(f"{self.folder}: is a link, and a journal is not read through one", fix="remove the link")
+            raise UserError(f"{self.folder}: is a link; a journal is not read through a link", fix="remove the link")
         self._is_read = True
         with suppress(FileNotFoundError, NotADirectoryError):
             for name in sorted(filter(SEGMENT_NAME.fullmatch, os.listdir(self.folder))):

@@ -238,10 +238,10 @@ class _Worker(threading.Thread):
             return "the process that it forks from has died"
         self._process.join(timeout=1.0)
         code = self._process.exitcode
-        why = f"its process ended itself with code {code}"
+        why = f"its process exited with code {code}"
         if code is not None and code < 0:
             name = signal.Signals(-code).name if -code in signal.valid_signals() else f"signal {-code}"
-            by = ": by hand, or by the system as memory ran out" if name == "SIGKILL" else ""
+            by = ": by a user, or by the system because memory ran out" if name == "SIGKILL" else ""
             why = f"its process was ended by {name}{by}"
         said = self._said.read_text()[-TRACEBACK_CHARACTERS:] if self._said.exists() else ""
         return why + (f"\n{said}" if said else "")

@@ -176,7 +176,7 @@ class Shard:
         found = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
         shard = cls(int(found[1]), int(found[2])) if found else None
         if shard is None or not 1 <= shard.number <= shard.count <= MOST:
-            raise UserError(f"--shard {text!r}: is no part of a whole", legal=f"1/10 to 10/10, for up to {MOST} parts")
+            raise UserError(f"--shard {text!r}: is not a part", legal=f"1/10 to 10/10, for up to {MOST} parts")
         return shard
 
     @property
@@ -217,10 +217,10 @@ def _held(path: Path, *, shared: bool) -> Iterator[None]:
     with opened_lock(path) as file:
         answer = lock(file, shared=shared, wait=False)
         if answer == "busy":
-            said = f"{path.parent}: another sweep is at work in this folder"
+            said = f"{path.parent}: another sweep is running in this folder"
             raise UserError(said, fix="wait for it, or name another folder with --out")
         if answer == "no locks":
-            print(f"{path.parent}: cannot be locked on this system: start no second sweep in it", file=sys.stderr)
+            print(f"{path.parent}: cannot be locked on this system: do not start a second sweep in it", file=sys.stderr)
         yield
 
 
@@ -268,7 +268,7 @@ def code_of(detectors: Iterable[str]) -> dict[Stage, Code]:
 
 def add_engine_options(parser: argparse.ArgumentParser) -> None:
     """Add them, in a group of their own."""
-    add = parser.add_argument_group("how it is run").add_argument
+    add = parser.add_argument_group("execution").add_argument
     processes = "processes, or workers of a cluster (default: 2)"
     add("--jobs", type=whole_number(4096), default=2, metavar="N", help=processes)
     add("--serial", action="store_true", help="run everything in this process, for a debugger; without limits")
@@ -277,9 +277,9 @@ def add_engine_options(parser: argparse.ArgumentParser) -> None:
     add("--shard", metavar="K/N", help="run the k-th of n parts only, such as 3/10; python -m harness.merge joins them")
     add("--retry-failed", action="store_true", help="run again what failed, crashed or timed out before")
     for name, unit, default, meaning in (
-        ("--time-limit", "SECONDS", 900.0, "that one trial or render may take"),
-        ("--memory-limit", "GB", 4.0, "that a trial's process may take, on a cluster too"),
-        ("--cache-limit", "GB", 20.0, "of stored renders; the longest unused go first"),
+        ("--time-limit", "SECONDS", 900.0, "time that one trial or render may take"),
+        ("--memory-limit", "GB", 4.0, "memory that a trial's process may use, also on a cluster"),
+        ("--cache-limit", "GB", 20.0, "size of all stored renders; the least recently used are removed first"),
     ):
         add(name, type=_positive, default=default, metavar=unit, help=f"{meaning} (default: {default:g})")
 
@@ -290,7 +290,7 @@ def engine_options(options: argparse.Namespace) -> EngineOptions:
         raise UserError("--serial and --scheduler: ask for different engines", fix="leave one of them out")
     if options.memory_limit < LEAST_MEMORY_GB:
         legal = f"{LEAST_MEMORY_GB:g} GB or more; 1 GB is enough for most trials"
-        said = f"--memory-limit {options.memory_limit:g}: a process needs more than that to begin with"
+        said = f"--memory-limit {options.memory_limit:g}: a process needs more than that to start"
         raise UserError(said, legal=legal)
     limits = Limits(options.time_limit, round(1000 * options.memory_limit))
     shard = WHOLE if options.shard is None else Shard.of(options.shard)

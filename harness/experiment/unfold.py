@@ -87,7 +87,7 @@ def overridden(source: Source, overrides: Sequence[str], declared_of: shape.Decl
     parts = [(text, *text.partition("=")[::2], Place(OPTION, 0, 1, text, max(1, text.find("=")))) for text in overrides]
     for text, name, written, place in parts:
         if not name.strip() or not written.strip():
-            fix = "write null for nothing" if "=" in text and name.strip() else None
+            fix = "write null for no value" if "=" in text and name.strip() else None
             problems.append(Problem("not of the form path=value", place, "capture.frames=10", fix=fix))
             continue
         path, declared = key_path(name.strip()), declared_of(source.data)

@@ -76,7 +76,7 @@ def read_gauge(path: Path) -> Gauge:
     except (OSError, ValueError) as error:
         raise UserError(f"--gauge {path}: cannot be read ({error})", legal=legal) from error
     if not isinstance(data, dict) or "gauge_version" not in data:
-        raise UserError(f"--gauge {path}: is no truth file of a gauge", legal=legal)
+        raise UserError(f"--gauge {path}: is not the truth file of a gauge", legal=legal)
     check_version(data.pop("gauge_version"), GAUGE_VERSION, path, "a gauge")
     return settings_of(Gauge, data, f"--gauge {path}")
 
@@ -155,13 +155,13 @@ def seen_on(gauge: Gauge, judged: Judged, detector: str, threshold: float) -> Ga
         T_camera_board = kabsch(on_board, in_camera, np.ones(len(marks)))
         apart_m = np.linalg.norm(transform_points(T_camera_board, on_board) - in_camera, axis=-1)
         fit_mm = float(np.sqrt((apart_m**2).mean())) / MM
-        notes.append(f"{board.name}: {len(marks)} marks, {fit_mm:.2f} mm from where the board has them")
+        notes.append(f"{board.name}: {len(marks)} marks, {fit_mm:.2f} mm (rms) from their places on the board")
         if fit_mm > WORST_FIT_MM:
             doubt = f"its marks are {fit_mm:.1f} mm off: was it printed at 100 %, and is it flat?"
             warnings.append(f"{board.name}: {doubt}")
         own, beside = _matched(board, counted, judged, invert(T_camera_board))
         if unjudged := [str(row.hole.id) for row in own if row.found == "NA"]:
-            told = "is not judged all around, as near the edge of what is judged: it counts neither as hit nor as miss"
+            told = "is too near the edge of the judged area: it counts neither as a hit nor as a miss"
             warnings.append(f"{board.name}: hole {', '.join(unjudged)} {told}")
         rows += own
         calls += beside

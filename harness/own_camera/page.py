@@ -32,7 +32,7 @@ SHOWN = (RANGE, ANGLE, AMPLITUDE, NEIGHBOURS, PATTERN, SPECTRUM, OF_PATTERN, FRA
 FREQUENCIES = np.linspace(0, 0.5, 41)
 SHOWN_LAGS, SHOWN_PATTERN_LAGS = (1, 2, 3, 5), (1, 3, 5, 10)
 CAPTION = (
-    "The surfaces that were found; temporal noise against range, angle and amplitude, each dot of pixels where all "
+    "The surfaces that were found; temporal noise against range, angle and amplitude, each dot for pixels where all "
     "three are alike; correlation of noise and of fixed pattern between neighbours along x and y, and their spectra, "
     "where white noise would be 1; displacement of whole frames; dropouts. The camera file's simulation is orange."
 )
@@ -185,6 +185,6 @@ def _draw(canvas: Figure, found: Characteristics, curves: list[dict[str, Any]]) 
         x, y = diagram.split(" against ")[::-1]
         axis.set(xlabel=x, ylabel=y, yscale="log" if diagram in (SPECTRUM, OF_PATTERN) else "linear")
         if not own:
-            axis.text(0.5, 0.5, "not told by the captures", transform=axis.transAxes, ha="center", color=GREY)
+            axis.text(0.5, 0.5, "not determined by the captures", transform=axis.transAxes, ha="center", color=GREY)
     axes[1].legend(fontsize=8)
     axes[1].set(ylim=(0, None))
