@@ -48,7 +48,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     epilog="example: python -m harness.ask --damage hole --size 5mm --distance 1m",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Returns 0 whatever the answer, 2 on a mistake of the user, 130 after Ctrl-C."""
+    """Returns 0 for any answer, 2 on a mistake of the user, 130 after Ctrl-C."""
     from harness.evaluation.atlas import surfaces_of
     from harness.tables.atlas import ATLAS, curves
     from harness.tables.schema import write_table

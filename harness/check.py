@@ -1,9 +1,9 @@
-"""``python -m harness.check experiments/regression.yaml``: a gate that fails where a detection limit got worse.
+"""``python -m harness.check experiments/regression.yaml``: a gate that fails if a detection limit became worse.
 
 The study is run and compared with a baseline that lies in the repository, by `harness.evaluation.study.verdict`: a
 set-up fails if its a90 or its rate of false calls has grown, or its signals over what is needed have fallen, by more
 than 10 % and not by chance, as the tests say (0.1 % for the whole check); or if its limit is gone, more trials failed,
-or it is missing. With the same seed and code nothing fails that is the same.
+or it is missing. With the same seed and code nothing fails.
 
 Of 20 checks each with 1.2 and 1.4 times the camera's noise and with 1.2 times the threshold all fail; of 25 whose a90
 grows by 20 % about the same a50, 11; with another draw of all noise alone 3 of 250 (95 %: 0.2 to 3.5 %), all by the

@@ -35,7 +35,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "both studies have the same boards. python -m harness.check fails if a detection limit grew.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Returns 0 whatever the comparison says, 2 on a mistake of the user, 130 after Ctrl-C."""
+    """Returns 0 for any result of the comparison, 2 on a mistake of the user, 130 after Ctrl-C."""
     from harness.evaluation.study.record import read_record
     from harness.evaluation.study.verdict import compare_studies, paired_set_ups
     from harness.report.compare import compare_parts

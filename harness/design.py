@@ -1,4 +1,4 @@
-"""``python -m harness.design``: what a study of detection limits will be able to say, before anybody drills a hole."""
+"""``python -m harness.design``: what a planned study of detection limits can demonstrate."""
 
 from __future__ import annotations
 

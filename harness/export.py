@@ -1,4 +1,4 @@
-"""``python -m harness.export``: the simulated views of an experiment for other people's mapping, with their truth."""
+"""``python -m harness.export``: the simulated views of an experiment for other mapping programs, with their truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``python -m harness.gauge``: a board with holes to check a detection limit with, as a drilling template and truth."""
+"""``python -m harness.gauge``: a board with holes that checks a detection limit, as drilling template and truth."""
 
 from __future__ import annotations
 

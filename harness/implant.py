@@ -1,4 +1,4 @@
-"""``python -m harness.implant``: the detection limit of your camera on your part, by virtual damage in real scans."""
+"""``python -m harness.implant``: the detection limit of your camera on your part, by virtual damage in captures."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def merge_into(into: Journal, other: Journal, counts: Counter[str]) -> list[str]:
-    """Copy what ``into`` lacks or has not done; count trials copied, known, and of these alike but for last digits.
+    """Copy trials that ``into`` lacks or has not finished; count those copied, known, and alike but for last digits.
     Returns the keys of those that differ. Raises UserError where a newer tofpod wrote either."""
     different = []
     for key, entry in other.entries():

@@ -1,4 +1,4 @@
-"""``python -m harness.pod``: the probability of detection of anybody's inspections, by the field's standard."""
+"""``python -m harness.pod``: the probability of detection of the user's inspections (MIL-HDBK-1823A)."""
 
 from __future__ import annotations
 

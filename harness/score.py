@@ -1,4 +1,4 @@
-"""``python -m harness.score PREDICTIONS --dataset DIR``: the detection limit of anybody's anomaly maps.
+"""``python -m harness.score PREDICTIONS --dataset DIR``: the detection limit of a method's anomaly maps.
 
 A map is judged as a study judges a score: the threshold is the lowest with the wanted rate of false calls on the good
 boards of ``validation``; pixels above it that steps of at most `LINK_M` join are a finding, which hits a damage by the

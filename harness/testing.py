@@ -118,7 +118,7 @@ class Look:
         return found
 
     def everything(self) -> tuple[Any, ...]:
-        """Return all that a detector says of a cloud."""
+        """Return all results of a detector on a cloud."""
         quiet = self.quiet
         found = self.find(quiet / 2)
         return self.evidence, quiet, found, [self.measured(finding) for finding in found[:STRONGEST]]
@@ -228,7 +228,7 @@ def survives_missing_pixels(make: Make, cloud: Cloud) -> None:
 
 
 def refuses_an_empty_cloud(make: Make, cloud: Cloud) -> None:
-    """A cloud without any point is the user's mistake, told as a UserError; one with a single point is no crash."""
+    """A cloud without any point raises a UserError; a cloud with a single point causes no crash."""
     detector, gone = make(), np.ones_like(cloud.valid)
     for points in (0, 1):
         gone.reshape(-1)[np.flatnonzero(cloud.valid)[:points]] = False

@@ -49,7 +49,7 @@ def load_npy(path: Path) -> dict[str, np.ndarray]:
 
 
 def load_npz(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of an ``.npz`` file by name. Raises UserError where it is broken, too large, or of objects."""
+    """Return the arrays of an ``.npz`` file by name. Raises UserError where it is broken, too large, or has objects."""
     with damage_told(f"{path}: cannot be read as arrays", LEGAL_ARRAYS):
         with zipfile.ZipFile(path) as archive:
             stated = sum(entry.file_size for entry in archive.infolist())
@@ -149,7 +149,7 @@ class RawLoader:
         return {"": np.ndarray((size // frame, self.height, self.width), kind, content, strides=strides)}
 
     def refuse_doubtful(self, path: Path, frames: np.ndarray) -> int:
-        """Return the bytes left over after the frames. Raises UserError where neighbours differ as no surface's do."""
+        """Return the bytes left over after the frames. Raises UserError where neighbours differ too much."""
         rough = _apart(frames[0][:, 1:], frames[0][:, :-1])
         if not rough < NEIGHBOURS:
             what = f"in this layout the median pixel differs from its neighbour by {100 * rough:.3g} %"

@@ -295,7 +295,7 @@ def _lens_of_images(bag: Bag, topic: str, shape: tuple[int, ...]) -> Lens:
 
 
 def lens_of_info(message: Any, shape: tuple[int, ...], is_rectified: bool = False) -> Lens | str:
-    """Return the lens of a CameraInfo for images of a shape (h, w), or why it is none of theirs. A rectified image has
+    """Return the lens of a CameraInfo for images of a shape (h, w), or why it does not fit. A rectified image has
     the lens P and no distortion. K and P are of the whole sensor: binning and the region of interest are taken off."""
     d, k, p = (np.asarray(getattr(message, key, getattr(message, key.upper(), ())), float) for key in ("d", "k", "p"))
     d = np.zeros(0) if is_rectified or not d.any() else d

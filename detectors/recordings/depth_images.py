@@ -40,7 +40,7 @@ def read_picture(path: Path, flags: int) -> np.ndarray:
 
 
 def decoded(name: str, content: bytes, flags: int) -> np.ndarray:
-    """Return the same of a file's content."""
+    """Decode a file's content as `read_picture` does."""
     refuse_pixels(name, *_header(name, content).size)
     with damage_told(f"{name}: cannot be decoded", LEGAL_PICTURE):
         picture = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
@@ -80,7 +80,7 @@ NOT_DEPTH = re.compile(
 
 
 def open_depth_folder(folder: Path, asked: Asked) -> Recording:
-    """Open a folder of depth PNGs. Raises UserError where none is in it, or their lens is not known."""
+    """Open a folder of depth PNGs. Raises UserError where it has none, or their lens is unknown."""
     inner = folder / "depth"
     depths = depth_files(inner if inner.is_dir() else folder)
     root = folder if inner.is_dir() or folder.name != "depth" else folder.parent
@@ -146,7 +146,7 @@ def shown(folder: Path) -> list[Path]:
 
 
 def depth_files(folder: Path) -> tuple[Path, ...]:
-    """Return a folder's depth pictures in the order of their numbers, without masks. Raises UserError where none is."""
+    """Return a folder's depth pictures by their numbers, without masks. Raises UserError where there is none."""
     pictures = [path for path in shown(folder) if path.suffix.lower() == ".png"]
     numbered = [path for path in pictures if NUMBER.fullmatch(path.stem)]
     # a 16-bit infrared picture looks like depth
@@ -169,7 +169,7 @@ def depth_named(paths: Sequence[Path], others: Sequence[Path]) -> tuple[Path, ..
 
 
 def png_kind(path: Path) -> tuple[int, int, int, int]:
-    """Return (width, height, bits, colour type) of a PNG. Raises UserError where it is none, or too large."""
+    """Return (width, height, bits, colour type) of a PNG. Raises UserError where it is no PNG, or too large."""
     with damage_told(f"{path}: cannot be read", LEGAL_PNG), path.open("rb") as file:
         head = file.read(26)
     if len(head) < 26 or head[:8] != PNG_SIGNATURE or head[12:16] != b"IHDR":

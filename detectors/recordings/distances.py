@@ -1,4 +1,4 @@
-"""Stored numbers as distances: which of them mean "no return", what one of them is in metres, and who says so."""
+"""Stored numbers as distances: codes that mean "no return", the depth unit in metres, and its origin."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ QUARTER_SIZES = {(1024, 768): 20.0, (640, 480): 2.0, (1280, 720): 2.0, (1920, 10
 
 
 class Unit(NamedTuple):
-    """Metres in one stored number, and who says so. ``warning``: why to doubt it, "" for no doubt."""
+    """Metres in one stored number, and the origin of this unit. ``warning``: why to doubt it, "" for no doubt."""
 
     scale_m: float
     origin: str

@@ -37,7 +37,7 @@ class ColourCamera(NamedTuple):
 
 
 def parse_calibration(name: str, content: bytes) -> dict[str, Any]:
-    """Parse the calibration's JSON (a trailing zero byte is the recorder's). Raises UserError where it is none."""
+    """Parse the calibration's JSON (a trailing zero byte is the recorder's). Raises UserError for any other content."""
     refuse_bytes(name, len(content), TEXT_BYTES)
     legal = "the JSON that k4arecorder attaches: CalibrationInformation with its Cameras"
     with damage_told(f"{name}: is not an Azure Kinect calibration", legal, OWN_LENS):
@@ -209,7 +209,7 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
 
 
 def parsed_lens(path: Path) -> dict[str, Any]:
-    """Return the file's mapping; of bare numbers, these by name. Raises UserError on what is no JSON or YAML."""
+    """Return the file's mapping; of bare numbers, these by name. Raises UserError where it is neither JSON nor YAML."""
     if not path.exists():
         raise UserError(f"{path}: no such file", legal=LEGAL_LENS)
     with damage_told(f"{path}: cannot be read", LEGAL_LENS, "give another file"):

@@ -35,7 +35,7 @@ def encoding_of(message: Any) -> str:
 
 
 def stored_depth(name: str, message: Any) -> np.ndarray:
-    """Return the stored numbers (h, w), uint16 or float32. Raises UserError where there is no or less depth."""
+    """Return the stored numbers (h, w), uint16 or float32. Raises UserError where depth is missing or cut off."""
     encoding = encoding_of(message)
     if encoding not in DEPTH_NUMBERS:
         what = encoding or getattr(message, "format", "")

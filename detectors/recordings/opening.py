@@ -1,4 +1,4 @@
-"""Recognise a capture by what it is, and open it."""
+"""Recognise the format of a capture, and open it."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ NO_GRID = "the cloud has no pixel grid; it is treated as unorganised points"
 
 @contextmanager
 def damage_told(what: str, legal: str, fix: str = "copy or export it again") -> Iterator[None]:
-    """Turn what a library raises on a damaged file into a UserError that begins with ``what``; limit its memory."""
+    """Turn a library's exception on a damaged file into a UserError that begins with ``what``; limit its memory."""
     try:
         with limited_memory():
             yield
@@ -94,7 +94,7 @@ class Recording:
 
     @property
     def unit_text(self) -> str:
-        """The depth unit and who says so, as programs print it."""
+        """The depth unit and its origin, as programs print it."""
         return f"depth unit {1e3 * self.scale_m:.4g} mm, from {self.unit_from}"
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Boards of a data set: which there are, and the files of each; and how programs read them again.
+"""Boards of a data set: their plan, the files of each, and reading them again.
 
 Every board is one average of frames of one unit of a camera. Splits have boards of their own, ``validation`` and
 ``test`` those of a study of the same experiment. Not included: several views, real captures."""

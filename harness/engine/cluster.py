@@ -1,7 +1,7 @@
 """Jobs on a cluster by dask.distributed: each dask worker is a node that runs the local engine inside.
 
 The driver calls the nodes through the scheduler with bundles of jobs, two at a time for each; dask neither queues nor
-retries them. When a node dies, its jobs go to others; a job that `TRIES` nodes had as they died counts as crashed."""
+retries them. When a node dies, its jobs go to others; a job that ran on `TRIES` nodes as they died has crashed."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Bundle:
 
 @dataclass(frozen=True)
 class NodeFacts:
-    """A node's own account. ``digests``: of installed code by stage; ``sees``: content of the file it was asked for."""
+    """A node's facts. ``digests``: of installed code by stage; ``sees``: content of the file it was asked for."""
 
     python: str
     digests: Mapping[Stage, str]
@@ -389,7 +389,7 @@ def examine(code: Mapping[Stage, Code], probe: str, dask_worker: Any) -> NodeFac
 
 
 def drop(driver: str) -> None:
-    """End all jobs of a driver, which waits for them no longer."""
+    """End all jobs of a driver that no longer waits for them."""
     for answers in _awaited.pop(driver, ()):
         for engine in _engines.values():
             engine.drop(answers)

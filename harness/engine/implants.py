@@ -1,6 +1,6 @@
 """A study on recorded frames: virtual damage at random places of scans of an undamaged part, judged as boards are.
 
-A placement is what a board is to a simulated study: some damages at once, in one group of recorded frames. Placements
+A placement takes the part of a simulated board: some damages at once, in one group of recorded frames. Placements
 of one recording share its surface and fixed pattern, and where there are few frames its noise."""
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Judging:
 
 
 class Scan:
-    """A recording of an undamaged part, its surface, what is judged of it. Raises UserError without either."""
+    """A recording of an undamaged part, its surface and judged area. Raises UserError where either is missing."""
 
     def __init__(self, recording: Recording, judging: Judging) -> None:
         if recording.lens is None or recording.slopes is None or recording.projection != "central":
@@ -124,7 +124,7 @@ class Scan:
         return np.asarray(np.degrees(np.arccos(np.clip(np.abs(along), 0, 1))))
 
     def rim_px(self, family: DrawnTargetConfig) -> float:
-        """Return how far inside of what is judged a damage's centre lies at least, whatever the damage's size."""
+        """Return how far inside the judged area a damage's centre lies at least, whatever the damage's size."""
         return family.damage.widest_mm * MM / 2 / self.pitch_m + BEYOND_PX + self.reach_px
 
     def left_out(self, family: DrawnTargetConfig) -> str:

@@ -1,5 +1,5 @@
-"""The seam between what is to be done and what does it: jobs go in, each comes back once with how it ended, whatever it
-did; one part of a sweep (`--shard 3/10`); and the options of every program that runs an experiment."""
+"""The interface between plans and engines: jobs go in, and each comes back exactly once with how it
+ended; one part of a sweep (`--shard 3/10`); and the options of every program that runs an experiment."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class StageCounts:
 
     @property
     def over(self) -> int:
-        """All that need no more work."""
+        """The number that need no more work."""
         return self.done + self.found + self.failed
 
 
@@ -124,14 +124,14 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of a job: ``seconds`` of time, ``memory_mb`` of its worker's memory; None: as much as it likes."""
+    """Limits of a job: ``seconds`` of time, ``memory_mb`` of its worker's memory; None: no limit."""
 
     seconds: float | None = None
     memory_mb: int | None = None
 
 
 def attempt(job: Job, worker: str) -> Ended:
-    """Run a job here; whatever it raises is how it ended. What ends the process is the engine's to notice."""
+    """Run a job here; an exception becomes its end. The engine has to notice if the process dies."""
     with contextlib.suppress(OSError):  # count the peak of memory anew (Linux)
         Path("/proc/self/clear_refs").write_text("5")
     began = time.monotonic()
@@ -181,18 +181,18 @@ class Shard:
 
     @property
     def is_whole(self) -> bool:
-        """Return whether there is no other part."""
+        """Return whether this part is the whole sweep."""
         return self.count == 1
 
     def __str__(self) -> str:
         return f"{self.number}/{self.count}"
 
     def part(self, total: int) -> range:
-        """Return this shard's part of ``total`` things in a row; the parts of all shards are all, each once."""
+        """Return this shard's range of ``total`` items; the ranges of all shards cover each item exactly once."""
         return range((self.number - 1) * total // self.count, self.number * total // self.count)
 
     def rotated(self, things: Sequence[T]) -> list[T]:
-        """Return all things, beginning at this shard's own place."""
+        """Return all items, beginning at this shard's own place."""
         start = self.part(len(things)).start
         return [*things[start:], *things[:start]]
 
@@ -267,7 +267,7 @@ def code_of(detectors: Iterable[str]) -> dict[Stage, Code]:
 
 
 def add_engine_options(parser: argparse.ArgumentParser) -> None:
-    """Add them, in a group of their own."""
+    """Add these options, in a group of their own."""
     add = parser.add_argument_group("execution").add_argument
     processes = "processes, or workers of a cluster (default: 2)"
     add("--jobs", type=whole_number(4096), default=2, metavar="N", help=processes)
@@ -285,7 +285,7 @@ def add_engine_options(parser: argparse.ArgumentParser) -> None:
 
 
 def engine_options(options: argparse.Namespace) -> EngineOptions:
-    """Return the options that were given. Raises UserError where they make no sense."""
+    """Return the options that were given. Raises UserError where they contradict each other."""
     if options.serial and options.scheduler is not None:
         raise UserError("--serial and --scheduler: ask for different engines", fix="leave one of them out")
     if options.memory_limit < LEAST_MEMORY_GB:

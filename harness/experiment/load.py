@@ -1,4 +1,4 @@
-"""Loading an experiment from a YAML file and ``--set`` overrides, or telling everything that is wrong with it."""
+"""Loading an experiment from a YAML file and ``--set`` overrides, with all of its mistakes reported at once."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ def add_reading(add: Callable[..., Any]) -> None:
 
 
 def reading_of(options: argparse.Namespace) -> dict[str, Any]:
-    """Return what `add_reading`'s options state but the lens, for `opened`."""
+    """Return the values of `add_reading`'s options except the lens, for `opened`."""
     return {name: getattr(options, name) for name in READING}
 
 
@@ -111,7 +111,7 @@ def detector_of(
 
 
 def mapping_of(arguments: argparse.Namespace) -> MappingConfig:
-    """Return the settings from views to one cloud. Raises UserError where they are not legal, every problem at once."""
+    """Return the settings that merge views to one cloud. Raises UserError with every problem at once."""
     from detectors.mapping.settings import MappingConfig
     from harness.vocabulary.declaration.diagnose import settings_of
 

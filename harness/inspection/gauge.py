@@ -69,7 +69,7 @@ class Gauge(Config):
 
 
 def read_gauge(path: Path) -> Gauge:
-    """Read the truth file of `harness.gauge`. Raises UserError where it cannot be read or is none."""
+    """Read the truth file of `harness.gauge`. Raises UserError where it cannot be read or is another file."""
     legal = "the gauge.json that python -m harness.gauge wrote"
     try:
         data = strict_json(bounded_bytes(path, RECORD_BYTES))
@@ -83,7 +83,7 @@ def read_gauge(path: Path) -> Gauge:
 
 @dataclass(frozen=True)
 class GaugeRow:
-    """A hole in a capture. ``found`` "NA": not all around it was judged; ``offset_mm`` and ``score`` of the hit.
+    """A hole in a capture. ``found`` "NA": it was not judged all around; ``offset_mm`` and ``score`` of the hit.
     ``counted``: detector with its version, its threshold in units of score, and the hit radius, mm."""
 
     board: str

@@ -1,4 +1,4 @@
-"""`harness.detect` step by step: one capture, or several views that become one cloud, judged and told in one way."""
+"""`harness.detect` step by step: one capture, or several views that become one cloud, judged and reported alike."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ OPEN_MM, FILTER_PX = 75.0, 3.0
 
 
 def refuse_thresholds(arguments: argparse.Namespace) -> None:
-    """Raise UserError where several arguments set the threshold, or where its value is none."""
+    """Raise UserError where several arguments set the threshold, or its value is not legal."""
     given = [f"--{name.replace('_', '-')}" for name in THRESHOLDS if getattr(arguments, name) is not None]
     if len(given) > 1:
         raise UserError(f"{' and '.join(given)} set the threshold", fix="give one of them")

@@ -1,4 +1,4 @@
-"""The results as text on the terminal, as facts for the JSON, and as a scene that turns in the browser."""
+"""The results as text on the terminal, as facts for the JSON, and as a 3-D scene for the browser."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def print_warnings(warnings: Iterable[str]) -> None:
 
 
 def print_notes(notes: Iterable[str]) -> None:
-    """Print a line for each thing that is good to know."""
+    """Print a line for each fact that helps to read the numbers."""
     for note in notes:
         print(f"note: {note}")
 

@@ -1,7 +1,7 @@
-"""The camera file that repeats what captures show: a known camera's model refitted, or an empirical camera.
+"""The camera file that reproduces the captures: a known camera's model refitted, or an empirical camera.
 
-A refitted model takes the unit's lens, gain, fixed pattern, displaced frames and, where the captures tell it, the gate
-of faint pixels; all else stays the known camera's. The surfaces have one albedo, which is stated and not measured."""
+A refitted model takes the unit's lens, gain, fixed pattern, displaced frames and, where the captures show it, the gate
+of faint pixels; all other numbers are those of the known camera. The surfaces' albedo is stated and not measured."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ NOT_TOLD = "not determined by the captures"
 
 
 def opened_as(camera: str | None, paths: Sequence[Path], intrinsics: str | None, **reading: Any) -> Recording:
-    """Open a capture; without a lens anywhere, the nominal one of the ``camera`` that took it counts."""
+    """Open a capture; without a lens anywhere, the nominal lens of ``camera`` is used."""
     try:
         return opened(paths, intrinsics, **reading)
     except UserError:

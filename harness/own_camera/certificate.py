@@ -1,4 +1,4 @@
-"""Two pages to file or to send: what was measured of one unit, in the terms of the standards, and what that is worth.
+"""Two pages to file or to send: the measurements of one unit, in the terms of the standards, and their validity.
 
 The terms are those of VDI/VDE 2634 part 2 and ISO 10360-13 (optical 3D measuring systems), and of MIL-HDBK-1823A, ASTM
 E2862 and E3023 (probability of detection). Figures are in their manner: neither their artefacts nor their procedures

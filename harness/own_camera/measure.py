@@ -1,8 +1,8 @@
-"""Characteristics that static captures of a depth camera tell: noise, correlation, dropouts, whole frames, edges.
+"""Characteristics of a depth camera, measured on static captures: noise, correlation, dropouts, whole frames, edges.
 
 Flat surfaces are found in each capture; where there is none, every pixel with a steady range counts, and neither angle
-nor fixed pattern nor edges are told. Temporal noise is that of single pixels about their own mean, each frame's
-displacement taken off. Not told: errors that all frames and all pixels share, and noise slower than the capture."""
+nor fixed pattern nor edges are measured. Temporal noise is that of single pixels about their own mean, each frame's
+displacement subtracted. Not measured: errors that all frames and pixels share, and noise slower than the capture."""
 
 from __future__ import annotations
 
@@ -407,7 +407,7 @@ def edge_of(captures: Sequence[StillCapture]) -> EdgeFigures | None:
 
 @dataclass(frozen=True)
 class Characteristics:
-    """All that captures of one camera tell. ``correlation`` (2, lags): of the noise along x and y;
+    """The results of all captures of one camera. ``correlation`` (2, lags): of the noise along x and y;
     ``pattern_correlation`` likewise of the fixed pattern, None where that is not told."""
 
     captures: tuple[StillCapture, ...]
@@ -442,7 +442,7 @@ class Characteristics:
 
     @cached_property
     def doubts(self) -> tuple[str, ...]:
-        """Full sentences on what these captures cannot tell, or tell wrongly."""
+        """Full sentences on what these captures cannot show, or show wrongly."""
         said, law, first = [], self.law, self.captures[0]
         if not self.surfaces:
             said.append("no flat surface was found: angle, plane fit, fill rate, fixed pattern and edges are unknown")

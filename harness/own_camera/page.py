@@ -1,4 +1,4 @@
-"""The page of one's own camera: what its captures show beside what its camera file simulates, with the data files."""
+"""The page of the user's camera: measured figures beside those simulated from its camera file, with the data files."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def own_figures(found: Characteristics) -> Iterator[Told]:
 
 
 def shared_figures(found: Characteristics) -> Iterator[Told]:
-    """Yield the figures that are of no single surface."""
+    """Yield the figures that do not belong to a single surface."""
     for axis, name in enumerate("xy"):
         for lag in SHOWN_LAGS:
             alike = float(found.correlation[axis, lag])
