@@ -17,14 +17,14 @@ REPEATED = 0.15  # Relative error of the simulated noise from which on the camer
 
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("paths", nargs="+", type=Path, metavar="PATH", help="captures of one camera in one mode")
+    add("paths", nargs="+", type=Path, metavar="PATH", help="captures by one camera in one mode")
     add("--out", required=True, type=Path, metavar="DIR", help="folder for the page, the tables and my_camera.yaml")
     like = "refit this camera's model (a name or a .yaml file); without it, the file is an empirical camera"
     add("--like", metavar="CAMERA", help=like)
     add_reading(add)
-    add("--poses", type=Path, metavar="FILE", help="where the camera stood for each PATH, as for harness.detect")
-    add("--albedo", type=float, default=0.6, help="albedo that the surfaces are taken to have (default: 0.6)")
-    add("--rate", type=float, metavar="FPS", help="frames per second (default: of --like, or 30)")
+    add("--poses", type=Path, metavar="FILE", help="camera pose for each PATH, as for harness.detect")
+    add("--albedo", type=float, default=0.6, help="assumed albedo of the surfaces (default: 0.6)")
+    add("--rate", type=float, metavar="FPS", help="frames per second (default: that of --like, or 30)")
     add("--title", default="my camera", help="the camera's and the unit's name on page and certificate")
     add("--certificate", action="store_true", help="write also a certificate of two pages, certificate.html and .json")
     study = "results of harness.sweep with a study, or of harness.implant, whose limits the certificate quotes"

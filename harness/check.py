@@ -36,7 +36,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
     add("--baseline", type=Path, metavar="FILE", help="default: results/baselines/<name of the experiment>.json")
     add("--update", action="store_true", help="write a new baseline, and print what changes")
-    add("--out", type=Path, default=Path("results"), metavar="DIR", help="where results go (default: results)")
+    add("--out", type=Path, default=Path("results"), metavar="DIR", help="folder of results (default: results)")
     add_engine_options(parser)
 
 

@@ -20,7 +20,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("name", nargs="?", default="", metavar="NAME[/DIGEST]", help=which)
     add("--limit", metavar="SIZE", help="cache: remove the longest unused renders until the rest fits, such as 5GB")
     add("--all", action="store_true", help="cache: remove all renders")
-    add("--out", type=Path, default=Path("results"), metavar="DIR", help="where results are (default: results)")
+    add("--out", type=Path, default=Path("results"), metavar="DIR", help="folder of results (default: results)")
     add("--dry-run", action="store_true", help="print what would be removed; remove nothing")
     add("--yes", action="store_true", help="do not ask for confirmation")
 

@@ -20,7 +20,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Set the detectors of a simulated study beside the ideal observer, which knows each damage's exact "
+    "Compare the detectors of a simulated study with the ideal observer, which knows each damage's exact "
     "signature and the covariance of the noise over units of the camera, but not the place: its a50 and a90 at the "
     f"study's rate of false calls, and every detector's efficiency. Writes {EFFICIENCY_PAGE.name} and tables into "
     "the study's folder.",

@@ -28,10 +28,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--out", required=True, type=Path, metavar="DIR", help="a folder that does not exist yet, or is empty")
     change = "change one value of the file, such as source.target.distance_m=0.9; may be repeated"
     add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
-    add("--views", type=whole_number(10_000), metavar="N", help="the first N views only (default: all)")
+    add("--views", type=whole_number(10_000), metavar="N", help="export only the first N views (default: all)")
     frames = "frames of each view (default: the experiment's capture.frames)"
     add("--frames", type=whole_number(10_000), metavar="N", help=frames)
-    add("--hole-free", action="store_true", help="the same target without its damage")
+    add("--hole-free", action="store_true", help="export the same target without its damage")
     results = "where experiments' results go: renders are taken from there, and kept there (default: results)"
     add("--results", type=Path, default=Path("results"), metavar="DIR", help=results)
 

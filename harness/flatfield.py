@@ -32,7 +32,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, required=True, metavar="FILE.npz", help=written)
     add_reading(add)
     add("--crop", default="auto", metavar="KIND", help="the part that shows the wall, as for harness.detect")
-    poses = "where the camera stood, as for harness.detect: the surface's shape is then not counted as noise"
+    poses = "camera poses, as for harness.detect: the surface's shape is then not counted as noise"
     add("--poses", type=Path, metavar="FILE", help=poses)
 
 

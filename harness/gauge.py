@@ -27,17 +27,17 @@ HIT_SHARE = 0.4  # Hit radius as a share of the distance between holes, so that 
 
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--diameters", required=True, type=span, metavar="FROM:TO", help="range of the drills, mm")
+    add("--diameters", required=True, type=span, metavar="FROM:TO", help="range of drill diameters, mm")
     add("--depths", type=span, metavar="FROM:TO", help="depths of blind holes, mm (default: all are through-holes)")
     add("--study", type=Path, metavar="DIR", help="plan by the curve of this study, simulated or implanted")
-    add("--set-up", metavar="NAME", help='which of its set-ups: "50 frames"')
+    add("--set-up", metavar="NAME", help='set-up of that study: "50 frames"')
     add("--a50", type=float, metavar="MM", help="plan by a guess: the size found half the time")
     add("--a90", type=float, metavar="MM", help="and the size found nine times out of ten")
     add("--targets", type=int, default=36, metavar="N", help="total number of holes (default: 36)")
     add("--board", default="270x175", metavar="WxH", help="size of a board, mm (default: 270x175, one sheet of A4)")
     add("--apart", type=float, default=30.0, metavar="MM", help="distance between holes (default: 30)")
     add("--paper", choices=("A4", "A3", "letter"), default="A4", help="default: A4")
-    add("--out", type=Path, required=True, metavar="DIR", help="template.pdf, board-N.svg and gauge.json")
+    add("--out", type=Path, required=True, metavar="DIR", help="folder for template.pdf, board-N.svg and gauge.json")
 
 
 @program(

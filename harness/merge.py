@@ -17,7 +17,7 @@ from harness.vocabulary.program import program
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER", help="a folder with a journal")
+    parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER", help="a folder of results with a journal")
     parser.add_argument("--into", type=Path, required=True, metavar="FOLDER", help="created if it does not exist")
 
 

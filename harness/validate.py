@@ -13,15 +13,15 @@ from harness.vocabulary.program import program, whole_number
 
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--camera", action="append", default=[], metavar="NAME", help="this camera only; may be repeated")
+    add("--camera", action="append", default=[], metavar="NAME", help="only this camera; may be repeated")
     add("--out", type=Path, default=Path("results/validate"), metavar="DIR", help="default: results/validate")
     add("--jobs", type=whole_number(4096), default=2, metavar="N", help="worker processes (default: 2)")
-    add("--figures", type=Path, metavar="FILE", help="other published figures")
+    add("--figures", type=Path, metavar="FILE", help="a file with other published figures")
     capture = parser.add_argument_group("a real capture")
     put = capture.add_argument
-    put("--capture", type=Path, nargs="+", metavar="PATH", help="frames of a static scene, in any format of detect's")
+    put("--capture", type=Path, nargs="+", metavar="PATH", help="frames of a static scene, as harness.detect reads them")
     add_reading(put)
-    put("--frames", type=whole_number(4096), metavar="N", help="use the first N frames only")
+    put("--frames", type=whole_number(4096), metavar="N", help="use only the first N frames")
     put("--mask", type=Path, metavar="PNG", help="use only the pixels that are not black in this image")
     put("--board", type=Path, metavar="YAML", help="an experiment with a drilled board: set this beside the capture")
     put("--albedo", type=float, default=0.8, metavar="A", help="of the captured surfaces (default: 0.8, a light wall)")

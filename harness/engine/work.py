@@ -274,8 +274,8 @@ def add_engine_options(parser: argparse.ArgumentParser) -> None:
     add("--serial", action="store_true", help="run everything in this process, for a debugger; without limits")
     help = "run on a Dask cluster: tcp://host:8786, or jobqueue:slurm and the like as your Dask configuration has it"
     add("--scheduler", metavar="ADDRESS", help=help)
-    add("--shard", metavar="K/N", help="run the k-th of n parts only, such as 3/10; python -m harness.merge joins them")
-    add("--retry-failed", action="store_true", help="run again what failed, crashed or timed out before")
+    add("--shard", metavar="K/N", help="run part K of N only, such as 3/10; python -m harness.merge joins them")
+    add("--retry-failed", action="store_true", help="run again the trials that failed, crashed or timed out before")
     for name, unit, default, meaning in (
         ("--time-limit", "SECONDS", 900.0, "time that one trial or render may take"),
         ("--memory-limit", "GB", 4.0, "memory that a trial's process may use, also on a cluster"),

@@ -38,11 +38,11 @@ READING = ("unit", "topic", "array", "pitch", "raw")  # options that `open_captu
 def add_reading(add: Callable[..., Any]) -> None:
     """Add the options that say how captures are read, by a parser's or a group's ``add_argument``."""
     add("--unit", help="unit of stored distances: mm, m, cm, um, in, tum (5000/m) or N/m; default: from the data")
-    add("--intrinsics", metavar="FILE|CAMERA", help="lens of the depth pixels: a file, or a camera's nominal one")
-    add("--topic", help="of a ROS bag: the topic with the depth images or clouds (default: the only one)")
-    add("--array", metavar="NAME[:NUMBER]", help="of a .npz, .mat or .npy: the array, and which of several maps in it")
+    add("--intrinsics", metavar="FILE|CAMERA", help="lens of the depth pixels: a file, or a camera with its nominal lens")
+    add("--topic", help="topic of a ROS bag with depth images or clouds (default: the only one)")
+    add("--array", metavar="NAME[:NUMBER]", help="name of the array in a .npz, .mat or .npy, and number of the map")
     add("--pitch", metavar="LENGTH", help="the array is a height map with this distance between pixels, such as 0.5mm")
-    add("--raw", metavar="LAYOUT", help="of a file of bare numbers: WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]], 640x480:u2")
+    add("--raw", metavar="LAYOUT", help="layout of bare numbers: WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]], 640x480:u2")
 
 
 def reading_of(options: argparse.Namespace) -> dict[str, Any]:
