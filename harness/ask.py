@@ -33,11 +33,11 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--depth", metavar="LENGTH", help="the damage's depth, where the atlas has several")
     add("--distance", metavar="LENGTH", help="distance from camera to target, such as 1m")
     add("--frames", type=int, metavar="N", help="frames averaged (default: the fewest and the most of the atlas)")
-    add("--albedo", type=float, metavar="A", help="of the target (default: the lowest and the highest of the atlas)")
+    add("--albedo", type=float, metavar="A", help="albedo of the target (default: the extremes of the atlas)")
     add("--camera", action="append", metavar="NAME", help="only this camera; may be repeated")
     add("--detector", metavar="NAME", help=f"only this detector (default: {BEST}, else the first)")
     add("--atlas", type=Path, metavar="PATH", help="limits.parquet of a study, or its folder (default: the stored one)")
-    add("--out", type=Path, metavar="DIR", help=f"write the whole atlas there: {ATLAS_PAGE.name}, a picture, atlas.csv")
+    add("--out", type=Path, metavar="DIR", help=f"folder for the whole atlas: {ATLAS_PAGE.name}, a picture, atlas.csv")
 
 
 @program(

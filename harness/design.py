@@ -26,7 +26,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     put("--a50", type=float, metavar="SIZE", help="size that is found half the time")
     put("--a90", type=float, metavar="SIZE", help="size that is found nine times out of ten")
     put("--link", choices=LINKS, help="shape of the curve (default: logit)")
-    put("--log", action="store_true", default=None, help="the curve is against the sizes' logarithm")
+    put("--log", action="store_true", default=None, help="use the logarithm of the sizes")
     put("--study", type=Path, metavar="DIR", help="the curve of a study: its result folder, or its study.json")
     put("--set-up", metavar="NAME", help='set-up of that study, as named in its tables: "50 frames"')
     add("--sizes", type=float, nargs=2, metavar=("FROM", "TO"), help="sizes to choose from (default: the study's)")
@@ -48,7 +48,7 @@ Guess = tuple["PodCurve", str, tuple[float, float], float | None]
 @program(
     _options,
     "Plan a hit/miss study from a guess of its probability of detection curve: simulate studies, "
-    "analyse them as real ones would be, and say which a90/95 to expect, how many targets it takes, and which "
+    "analyse them like real ones, and state which a90/95 to expect, how many targets it takes, and which "
     "sizes to make.",
     epilog="example: python -m harness.design --a50 5 --a90 7 --sizes 2 12 --goal 9. Takes about 5 ms a "
     "simulated study.",

@@ -44,7 +44,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--hit-radius", type=float, default=15.0, metavar="MM", help="largest distance of a hit (default: 15)")
     add("--apart", type=float, metavar="MM", help="least distance of damages (default: 2 hit radii plus 10)")
     add("--seed", type=int, default=1, help="seed of places, sizes and noise (default: 1)")
-    calls = f"expected in a capture, as in harness.detect (default: {asked.DEFAULT_FALSE_CALLS:g})"
+    calls = f"expected number, which sets the threshold as in harness.detect (default: {asked.DEFAULT_FALSE_CALLS:g})"
     add("--false-calls", type=float, metavar="N", help=calls)
     add("--threshold", type=float, metavar="K", help="threshold in units of score, instead of --false-calls")
     add("--detector", default=asked.DEFAULT_DETECTOR, help=f"detector's name (default: {asked.DEFAULT_DETECTOR})")

@@ -27,29 +27,29 @@ def _options(parser: argparse.ArgumentParser) -> None:
     hits = "column of 1 (found) and 0 (missed), yes and no, hit and miss; once for each inspector"
     add("--hit", metavar="COL", action="append", help=hits)
     add("--ahat", metavar="COL", help="column of signals, instead of --hit; needs --decision")
-    add("--target", metavar="COL", help="column of the flaws' names, where some were inspected more than once")
-    add("--unit", default="", metavar="UNIT", help="of the sizes, for the labels: mm, inch, ...")
+    add("--target", metavar="COL", help="column of the flaws' names, if some were inspected more than once")
+    add("--unit", default="", metavar="UNIT", help="unit of the sizes, for the labels: mm, inch, ...")
     add("--out", type=Path, default=Path("results/pod"), metavar="DIR", help="default: results/pod")
     least = "(default: the choice with the lower deviance)"
-    add("--log", action=switch, help=f"the curve against the sizes' logarithm, or not {least}")
+    add("--log", action=switch, help=f"use the logarithm of the sizes, or not {least}")
     put = parser.add_argument_group("with --hit").add_argument
     put("--link", choices=LINKS, help="shape of the curve (default: the one with the least deviance)")
     put = parser.add_argument_group("with --ahat").add_argument
     put("--decision", type=float, metavar="Y", help="a flaw is called where the signal is higher than this")
     put("--left", type=float, metavar="Y", help="signals at or below this value are censored (noise)")
     put("--right", type=float, metavar="Y", help="signals at or above this value are censored (saturation)")
-    put("--log-signal", action=switch, help=f"the straight line is of the signals' logarithm, or not {least}")
+    put("--log-signal", action=switch, help=f"use the logarithm of the signals, or not {least}")
     told = "with --prior: model-assisted POD (MAPOD), a simulated curve corrected by these hits and misses"
     put = parser.add_argument_group(told).add_argument
     prior = "folder of a study, simulated or by virtual damage (harness.implant)"
     put("--prior", type=Path, metavar="STUDY", help=prior)
-    put("--set-up", metavar="NAME", help='which set-up of the study: "50 frames"')
+    put("--set-up", metavar="NAME", help='set-up of the study: "50 frames"')
     put("--board", metavar="COL", help="column of the boards' names, in the order in which they were inspected")
 
 
 @program(
     _options,
-    "Fit a probability of detection curve to inspections, one per row of a CSV file, and state the size "
+    "Fit a probability of detection curve to inspections, one per row of a table, and state the size "
     "found 90 % of the time with 95 % confidence (a90/95). Writes pod.json, pod.png and pod.html.",
     epilog="example: python -m harness.pod blades.csv --hit found --size length --target blade --unit mm",
 )

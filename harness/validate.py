@@ -19,12 +19,12 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--figures", type=Path, metavar="FILE", help="a file with other published figures")
     capture = parser.add_argument_group("a real capture")
     put = capture.add_argument
-    put("--capture", type=Path, nargs="+", metavar="PATH", help="frames of a static scene, as harness.detect reads them")
+    put("--capture", type=Path, nargs="+", metavar="PATH", help="frames of a static scene, as read by harness.detect")
     add_reading(put)
     put("--frames", type=whole_number(4096), metavar="N", help="use only the first N frames")
     put("--mask", type=Path, metavar="PNG", help="use only the pixels that are not black in this image")
-    put("--board", type=Path, metavar="YAML", help="an experiment with a drilled board: set this beside the capture")
-    put("--albedo", type=float, default=0.8, metavar="A", help="of the captured surfaces (default: 0.8, a light wall)")
+    put("--board", type=Path, metavar="YAML", help="an experiment with a drilled board to compare with the capture")
+    put("--albedo", type=float, default=0.8, metavar="A", help="albedo of the surfaces (default: 0.8, a light wall)")
 
 
 @program(

@@ -38,7 +38,7 @@ READING = ("unit", "topic", "array", "pitch", "raw")  # options that `open_captu
 def add_reading(add: Callable[..., Any]) -> None:
     """Add the options that say how captures are read, by a parser's or a group's ``add_argument``."""
     add("--unit", help="unit of stored distances: mm, m, cm, um, in, tum (5000/m) or N/m; default: from the data")
-    add("--intrinsics", metavar="FILE|CAMERA", help="lens of the depth pixels: a file, or a camera with its nominal lens")
+    add("--intrinsics", metavar="FILE|CAMERA", help="lens of the depth pixels: a file, or a camera (nominal lens)")
     add("--topic", help="topic of a ROS bag with depth images or clouds (default: the only one)")
     add("--array", metavar="NAME[:NUMBER]", help="name of the array in a .npz, .mat or .npy, and number of the map")
     add("--pitch", metavar="LENGTH", help="the array is a height map with this distance between pixels, such as 0.5mm")
