@@ -49,7 +49,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     from scenes.render.cache import in_use
 
     if not FEWEST <= options.boards <= MOST or options.jobs < 1:
-        asked = f"--boards {options.boards} --jobs {options.jobs}"
+        asked = f"--boards {options.boards} --jobs {options.jobs}: out of range"
         raise UserError(asked, legal=f"{FEWEST} to {MOST} boards, 1 process or more")
     experiment, out = load_experiment(options.experiment, options.overrides), options.out
     cache = options.results / ".cache" / "renders"

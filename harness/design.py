@@ -125,7 +125,7 @@ def _check(options: argparse.Namespace, guess: Guess) -> None:
     wrong = next((number for number in options.targets if not LEAST <= number <= MOST), None)
     # NaN compares false with everything, so every rule is written as what has to hold.
     rules = (
-        (0 <= low < high < float("inf"), f"--sizes {low:g} {high:g}", "0 <= FROM < TO"),
+        (0 <= low < high < float("inf"), f"--sizes {low:g} {high:g}: not a range", "0 <= FROM < TO"),
         (low < a50 < high, f"sizes of {low:g} to {high:g} do not hold a50 = {a50:.4g}", "--sizes FROM < a50 < TO"),
         (not curve.log_size or low > 0, "--sizes from 0 under a logarithm", "FROM above 0"),
         (wrong is None, f"--targets {wrong}", f"{LEAST} to {MOST}; MIL-HDBK-1823A asks for 60 at least"),

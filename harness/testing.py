@@ -315,7 +315,7 @@ def _sound(look: Look) -> None:
     require(told == 0, f"{told} pixels without a point have a score; NaN is wanted there")
     require(not np.isinf(score).any(), "a score is infinite")
     require(np.isfinite(score).any(), "no pixel has a score; where a cloud cannot be judged, a UserError is wanted")
-    require(np.isfinite(scale) and scale > 0, f"`scale_m` is {scale:g}: a length above 0 is wanted")
+    require(np.isfinite(scale) and scale > 0, f"`scale_m` is {scale:g}: it must be a length above 0")
 
 
 def _sound_findings(look: Look, *thresholds: float) -> None:

@@ -271,7 +271,7 @@ def ray_lengths_doubt(z_m: np.ndarray, slopes: np.ndarray) -> str:
         bends = [_bend(inverse), _bend(inverse * np.sqrt(1.0 + (slopes**2).sum(axis=-1)))]
     if not bends[0] > RAYS_TELL * bends[1]:
         return ""
-    what = f"the numbers look like lengths along the rays, not like z: read so, surfaces are {bends[0] / bends[1]:.0f}"
+    what = f"the numbers look like lengths along the rays, not z: as lengths, surfaces are {bends[0] / bends[1]:.0f}"
     return f"{what} times as flat. Places and sizes are then wrong: store z, the length times the ray's cosine"
 
 

@@ -308,7 +308,7 @@ class ClusterEngine:
         elif lacking:
             self._tell_once(f"waiting for a {lacking} at {self._scheduler}, at most {WAIT_FOR_NODES_S:.0f} s")
             if time.monotonic() - self._lacking_since > WAIT_FOR_NODES_S:
-                raise UserError(f"no {lacking} came to {self._scheduler} within {WAIT_FOR_NODES_S:.0f} s", fix=fix)
+                raise UserError(f"no {lacking} connected to {self._scheduler} within {WAIT_FOR_NODES_S:.0f} s", fix=fix)
 
     def _tell_once(self, message: str) -> None:
         if message not in self._told:

@@ -144,7 +144,7 @@ def attempt(job: Job, worker: str) -> Ended:
         why, ends_all = str(mistake), isinstance(mistake, DiskFull)
     except MemoryError as error:
         where = "".join(traceback.format_exception(error))[-TRACEBACK_CHARACTERS:]
-        why = f"out of memory ({str(error) or 'no more'}), of what its process may have (--memory-limit)\n{where}"
+        why = f"out of memory ({str(error) or 'no more'}): its process has a limit (--memory-limit)\n{where}"
     except Exception as error:
         why, is_bug = "".join(traceback.format_exception(error))[-TRACEBACK_CHARACTERS:], True
     seconds, peak_mb = time.monotonic() - began, 0.0
