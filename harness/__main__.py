@@ -1,4 +1,4 @@
-"""``tofpod PROGRAM ...``: every program under one command; ``tofpod`` alone shows the commonest tasks."""
+"""``tofpod PROGRAM ...``: every program under one command; ``tofpod`` alone shows the most common tasks."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ complete -o filenames -F _tofpod tofpod
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The command. Returns what the program returns; 2 for a program that there is not."""
+    """The command. Returns what the program returns; 2 for an unknown program."""
     given = sys.argv[1:] if arguments is None else arguments
     name, *rest = given or [""]
     if name in programs():
@@ -83,7 +83,7 @@ def _told(name: str, rest: list[str]) -> int:
     from harness.vocabulary.declaration.diagnose import nearest
 
     near = nearest(name, programs())
-    fix = f"did you mean {near}?" if near else "tofpod --help says what each does"
+    fix = f"did you mean {near}?" if near else "tofpod --help describes each program"
     raise UserError(f"there is no program {name!r}", legal=", ".join(programs()), fix=fix)
 
 

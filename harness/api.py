@@ -1,4 +1,4 @@
-"""tofpod from Python, as ``import tofpod`` (or ``harness.api``): a facade over what the programs do.
+"""tofpod from Python, as ``import tofpod`` (or ``harness.api``): a facade over the programs.
 
 Build a target, render what a camera sees of it, draw noisy frames, average them, look for damage:
 
@@ -18,7 +18,7 @@ Build a target, render what a camera sees of it, draw noisy frames, average them
     >>> figure = tofpod.plot(found)  # a Figure of Matplotlib
 
 Examples below go on from this one. A real capture goes the same way from `load`; whole experiments are run by `sweep`.
-What a program refuses with a message is a `UserError` here. Units are SI; where they are not, names say so.
+A program's error message is a `UserError` here. Units are SI; where they are not, names say so.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ def plot(found: Judged, title: str = "") -> Figure:
 
 def sweep(experiment: str | Path, *changes: str, out: str | Path = "results", jobs: int = 1) -> Path:
     """Run an experiment, or what is missing of it, and return the folder of its results. ``changes``: as of ``--set``,
-    such as ``"repeats=5"``. More than one of ``jobs`` are processes: a script then needs ``if __name__ ==
+    such as ``"repeats=5"``. With ``jobs`` above 1 it runs processes: a script then needs ``if __name__ ==
     "__main__":``. Raises UserError for a wrong experiment, and where trials failed.
 
     >>> tofpod.sweep("averaging", "repeats=0")
@@ -173,7 +173,7 @@ def sweep(experiment: str | Path, *changes: str, out: str | Path = "results", jo
     if code == 130:
         raise KeyboardInterrupt
     if code:
-        raise UserError(f"{experiment}: trials failed, as was printed", fix="mend that, and run it again")
+        raise UserError(f"{experiment}: trials failed, as printed above", fix="correct the cause, and run it again")
     return found.folder(out)
 
 
@@ -189,7 +189,7 @@ def table(folder: str | Path, name: str) -> pd.DataFrame:
 
 def limits(folder: str | Path) -> tuple[SetUpLimit, ...]:
     """Return the detection limits of a study, such as ``results/detection_limit/latest``: ``a90_mm``, ``a90_95``,
-    ``statement`` (the curve) and so on. Raises UserError for what is no study."""
+    ``statement`` (the curve) and so on. Raises UserError where it is no study."""
     return tuple(limit_of(record) for record in read_record(Path(folder)).set_ups)
 
 

@@ -29,26 +29,26 @@ BEST = "matched"
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--damage", default="through", metavar="KIND", help="hole (through; the default), blind, dent, ...")
-    add("--size", metavar="LENGTH", help="the damage's size with its unit, as 5mm or 0.25in; its diameter for holes")
+    add("--size", metavar="LENGTH", help="size of the damage (of a hole: its diameter), such as 5mm or 0.25in")
     add("--depth", metavar="LENGTH", help="the damage's depth, where the atlas has several")
-    add("--distance", metavar="LENGTH", help="from camera to target, as 1m")
-    add("--frames", type=int, metavar="N", help="frames averaged (default: the least and the most of the atlas)")
-    add("--albedo", type=float, metavar="A", help="of the target (default: the least and the most of the atlas)")
+    add("--distance", metavar="LENGTH", help="distance from camera to target, such as 1m")
+    add("--frames", type=int, metavar="N", help="frames averaged (default: the fewest and the most of the atlas)")
+    add("--albedo", type=float, metavar="A", help="albedo of the target (default: the extremes of the atlas)")
     add("--camera", action="append", metavar="NAME", help="only this camera; may be repeated")
     add("--detector", metavar="NAME", help=f"only this detector (default: {BEST}, else the first)")
     add("--atlas", type=Path, metavar="PATH", help="limits.parquet of a study, or its folder (default: the stored one)")
-    add("--out", type=Path, metavar="DIR", help=f"write the whole atlas there: {ATLAS_PAGE.name}, a picture, atlas.csv")
+    add("--out", type=Path, metavar="DIR", help=f"folder for the whole atlas: {ATLAS_PAGE.name}, a picture, atlas.csv")
 
 
 @program(
     _options,
-    "Say which cameras find damage of a size nine times in ten at a distance, with how many frames, "
+    "State which cameras find damage of a given size nine times in ten at a given distance, with how many frames, "
     "from a stored table of limits of simulated set-ups (experiments/atlas.yaml), with intervals. Nothing is "
     "extrapolated.",
     epilog="example: python -m harness.ask --damage hole --size 5mm --distance 1m",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Returns 0 whatever the answer, 2 on a mistake of the user, 130 after Ctrl-C."""
+    """Returns 0 for any answer, 2 on a mistake of the user, 130 after Ctrl-C."""
     from harness.evaluation.atlas import surfaces_of
     from harness.tables.atlas import ATLAS, curves
     from harness.tables.schema import write_table
@@ -128,7 +128,7 @@ def _answer(options: argparse.Namespace, surfaces: Sequence[LimitSurface], title
                 raise UserError(f"{option} is missing", legal=f"{computed[0]:g} to {computed[-1]:g} in this atlas")
             given[axis] = sorted({computed[0], computed[-1]}) if computed else []
         elif not computed:
-            raise UserError(f"{option}: the atlas has none for {damage_words(kind)}s", fix=f"leave {option} out")
+            raise UserError(f"{option}: the atlas has no values for {damage_words(kind)}s", fix=f"leave {option} out")
     places = [dict(zip(filter(given.get, given), each, strict=True)) for each in product(*filter(None, given.values()))]
     rows, whose = [], dict[str, set[str]]()
     for place in places:
@@ -149,7 +149,7 @@ def _answer(options: argparse.Namespace, surfaces: Sequence[LimitSurface], title
     asked_for = f"{damage_words(kind).capitalize()}s of {size_mm:g} mm at {distance_m:g} m"
     answer = f"{asked_for} are found nine times out of ten in {of_all}"
     errors = [row.surface.error for row in rows if np.isfinite(row.surface.error)]
-    left_out = f"the surfaces miss set-ups left out by {100 * max(errors, default=0):.0f} % of a90 at the most (rms)"
+    left_out = f"a90 of set-ups left out is predicted within {100 * max(errors, default=0):.0f} % (rms)"
     missed = f"; {left_out}" if errors else ""
     study, heads = about.get("experiment", "the study"), {} if len(given["albedo"]) > 1 else {"albedo": ""}
     notes = [f"Simulated: one unit of each camera, under the conditions of {study}.yaml{missed}."]
@@ -183,7 +183,7 @@ def length_m(option: str, text: str) -> float:
     """Return the metres of a length with its unit. Raises UserError, which names the option."""
     match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*([a-z]+)\s*", text)
     if match is None or match[2] not in UNITS_M or not float(match[1]) > 0:
-        raise UserError(f"{option} {text}: no length with its unit", legal="such as 5mm, 0.5cm, 1m or 0.25in")
+        raise UserError(f"{option} {text}: is not a length with a unit", legal="such as 5mm, 0.5cm, 1m or 0.25in")
     return float(match[1]) * UNITS_M[match[2]]
 
 

@@ -17,19 +17,19 @@ REPEATED = 0.15  # Relative error of the simulated noise from which on the camer
 
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("paths", nargs="+", type=Path, metavar="PATH", help="captures of one camera in one mode")
+    add("paths", nargs="+", type=Path, metavar="PATH", help="captures by one camera in one mode")
     add("--out", required=True, type=Path, metavar="DIR", help="folder for the page, the tables and my_camera.yaml")
     like = "refit this camera's model (a name or a .yaml file); without it, the file is an empirical camera"
     add("--like", metavar="CAMERA", help=like)
     add_reading(add)
-    add("--poses", type=Path, metavar="FILE", help="where the camera stood for each PATH, as for harness.detect")
-    add("--albedo", type=float, default=0.6, help="albedo that the surfaces are taken to have (default: 0.6)")
-    add("--rate", type=float, metavar="FPS", help="frames per second (default: of --like, or 30)")
+    add("--poses", type=Path, metavar="FILE", help="camera pose for each PATH, as for harness.detect")
+    add("--albedo", type=float, default=0.6, help="assumed albedo of the surfaces (default: 0.6)")
+    add("--rate", type=float, metavar="FPS", help="frames per second (default: that of --like, or 30)")
     add("--title", default="my camera", help="the camera's and the unit's name on page and certificate")
-    add("--certificate", action="store_true", help="write two pages to send, certificate.html and .json, too")
+    add("--certificate", action="store_true", help="write also a certificate of two pages, certificate.html and .json")
     study = "results of harness.sweep with a study, or of harness.implant, whose limits the certificate quotes"
     add("--study", type=Path, metavar="DIR", help=study)
-    about = "what the certificate says of the unit, such as serial=1234, firmware=1.6, warm-up='40 minutes'; repeat it"
+    about = "what to state about the unit, such as serial=1234, firmware=1.6, warm-up='40 minutes'; may be repeated"
     add("--about", action="append", default=[], metavar="KEY=TEXT", help=about)
 
 
@@ -58,9 +58,9 @@ def main(options: argparse.Namespace, command: str) -> int:
     if not 0 < options.albedo <= 1:
         raise UserError(f"--albedo {options.albedo:g}", legal="above 0 and up to 1")
     if not options.certificate and (options.study or options.about):
-        raise UserError("--study and --about concern the certificate", fix="give --certificate too, or leave them out")
+        raise UserError("--study and --about need --certificate", fix="add --certificate, or leave them out")
     if odd := [text for text in options.about if not text.partition("=")[2]]:
-        raise UserError(f"--about {odd[0]}: is no KEY=TEXT", legal="such as --about firmware=1.6")
+        raise UserError(f"--about {odd[0]}: is not KEY=TEXT", legal="such as --about firmware=1.6")
     if options.rate is not None and not options.rate > 0:
         raise UserError(f"--rate {options.rate:g}", legal="above 0 frames per second")
     study = read_record(options.study) if options.study else None
@@ -95,7 +95,7 @@ def main(options: argparse.Namespace, command: str) -> int:
         off = [abs(row.ratio - 1) for row in rows if row.figure == figure]
         worst = max(np.nan_to_num(off, nan=1.0), default=0.0)
         if worst > REPEATED:
-            wrong = f"{CAMERA_FILE} has the captures' {figure} wrong by up to {100 * worst:.0f} %"
+            wrong = f"{CAMERA_FILE} misses the captures' {figure} by up to {100 * worst:.0f} %"
             warnings.insert(0, f"{wrong}: limits that are simulated with it are wrong, too")
         elif noise:
             repeated.append(f"the {figure} within {100 * worst:.1g} %")

@@ -1,9 +1,9 @@
-"""``python -m harness.check experiments/regression.yaml``: a gate that fails where a detection limit got worse.
+"""``python -m harness.check experiments/regression.yaml``: a gate that fails if a detection limit became worse.
 
 The study is run and compared with a baseline that lies in the repository, by `harness.evaluation.study.verdict`: a
 set-up fails if its a90 or its rate of false calls has grown, or its signals over what is needed have fallen, by more
 than 10 % and not by chance, as the tests say (0.1 % for the whole check); or if its limit is gone, more trials failed,
-or it is missing. With the same seed and code nothing fails that is the same.
+or it is missing. With the same seed and code nothing fails.
 
 Of 20 checks each with 1.2 and 1.4 times the camera's noise and with 1.2 times the threshold all fail; of 25 whose a90
 grows by 20 % about the same a50, 11; with another draw of all noise alone 3 of 250 (95 %: 0.2 to 3.5 %), all by the
@@ -35,8 +35,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     change = "change one value of the file, such as seed=7 for another draw of the noise; may be repeated"
     add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
     add("--baseline", type=Path, metavar="FILE", help="default: results/baselines/<name of the experiment>.json")
-    add("--update", action="store_true", help="write the baseline anew, and print what changes")
-    add("--out", type=Path, default=Path("results"), metavar="DIR", help="where results go (default: results)")
+    add("--update", action="store_true", help="write a new baseline, and print what changes")
+    add("--out", type=Path, default=Path("results"), metavar="DIR", help="folder of results (default: results)")
     add_engine_options(parser)
 
 
@@ -63,8 +63,8 @@ def main(options: argparse.Namespace, command: str) -> int:
         raise UserError(f"{options.experiment}: has no `study`", fix="name an experiment with one: it measures limits")
     needed = fewest_boards(set_ups)
     if study.boards < needed:  # no loss could ever be told from chance, and the gate would pass everything
-        said = f"with {study.boards} boards no loss can be told from chance at {100 * ALPHA:g} %: it could not fail"
-        fix = "raise study.boards: 24 are needed to see a threshold of 1.2 times as much"
+        said = f"with {study.boards} boards no loss is significant at {100 * ALPHA:g} %: the check cannot fail"
+        fix = "raise study.boards: 24 are needed to detect a threshold that is 1.2 times as high"
         raise UserError(said, legal=f"at least {needed} boards for {many(set_ups, 'set-up')}", fix=fix)
     asked = engine_options(options)
     if not asked.shard.is_whole:
@@ -84,7 +84,7 @@ def main(options: argparse.Namespace, command: str) -> int:
         print(f"comparison with the baseline: {folder / FILES[1]}")
     if options.update or comparison is None:
         if code == 1:
-            raise UserError(f"{path}: is left as it was, since trials failed", fix="mend what makes them fail first")
+            raise UserError(f"{path}: is unchanged, as trials failed", fix="correct the cause of the failures")
         write_text(path, record_text(found))
         print(f"wrote {path}")
         return 0
@@ -92,12 +92,12 @@ def main(options: argparse.Namespace, command: str) -> int:
     if missing:
         print(f"missing, and in the baseline: {'; '.join(missing)}", file=sys.stderr)
     if missing or any(row.is_worse for row in comparison.rows):
-        print("the check fails: if this is meant, run it again with --update and commit the baseline", file=sys.stderr)
+        print("the check fails: if it is intended, run it again with --update and commit the baseline", file=sys.stderr)
         return 1
     if apart := comparison.marked("not comparable"):
         said = "; ".join(f"{row.label}: {row.why}" for row in apart)
         fix = "run the check again with --update and commit the baseline"
-        raise UserError(f"{path}: cannot be compared with: {said}", fix=fix)
+        raise UserError(f"{path}: cannot serve as a baseline: {said}", fix=fix)
     return 0
 
 
@@ -113,7 +113,7 @@ def _baseline(path: Path, *, update: bool) -> StudyRecord | None:
         return read_record(path) if path.exists() else None
     except UserError as mistake:
         if not update:
-            raise UserError(mistake.message, legal=mistake.legal, fix="write it anew with --update") from mistake
+            raise UserError(mistake.message, legal=mistake.legal, fix="write a new one with --update") from mistake
         print(f"no comparison with the old baseline, which will be overwritten. {mistake.message}")
         return None
 

@@ -16,13 +16,13 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     what = "cache: stored renders, which are made again when they are needed; results: folders of results"
     add("what", choices=("cache", "results"), help=what)
-    which = "which results, as python -m harness.ls results names them"
+    which = "name of the results, as listed by python -m harness.ls results"
     add("name", nargs="?", default="", metavar="NAME[/DIGEST]", help=which)
-    add("--limit", metavar="SIZE", help="of renders: the longest unused go until the rest fits, such as 5GB")
-    add("--all", action="store_true", help="of renders: all of them")
-    add("--out", type=Path, default=Path("results"), metavar="DIR", help="where results are (default: results)")
-    add("--dry-run", action="store_true", help="say what would be removed; remove nothing")
-    add("--yes", action="store_true", help="do not ask")
+    add("--limit", metavar="SIZE", help="cache: remove the longest unused renders until the rest fits, such as 5GB")
+    add("--all", action="store_true", help="cache: remove all renders")
+    add("--out", type=Path, default=Path("results"), metavar="DIR", help="folder of results (default: results)")
+    add("--dry-run", action="store_true", help="print what would be removed; remove nothing")
+    add("--yes", action="store_true", help="do not ask for confirmation")
 
 
 @program(
@@ -50,7 +50,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     else:
         folders = [options.out / ".cache" / "renders"]
         if (limit is None) != options.all:
-            raise UserError("which renders are to go?", legal="--limit SIZE, or --all")
+            raise UserError("no renders are selected for removal", legal="--limit SIZE, or --all")
         if not folders[0].is_dir():
             print(f"{folders[0]}: there is no cache")
             return 0
@@ -69,7 +69,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     for folder in folders if of_results else ():
         remove_empty(folder)
         if folder.exists():
-            print(f"{folder}: is kept, as there are files in it that are not tofpod's", file=sys.stderr)
+            print(f"{folder}: is kept because it contains files that tofpod did not write", file=sys.stderr)
     print(f"removed {many(len(gone), 'file')}, {size_text(sum(file.size_bytes for file in gone))}")
     if kept := len(wanted) - len(gone):
         print(f"{many(kept, 'file')} could not be removed", file=sys.stderr)
@@ -86,7 +86,7 @@ def _held(folders: list[Path], of_results: bool) -> ExitStack:
             try:
                 held.enter_context(locked(folder) if of_results else alone(folder))
             except OSError as error:
-                raise UserError(f"{folder}: cannot be written ({error.strerror})", fix="ask whoever owns it") from error
+                raise UserError(f"{folder}: cannot be written ({error.strerror})", fix="ask its owner") from error
         return held.pop_all()
 
 
@@ -98,7 +98,7 @@ def _agreed(options: argparse.Namespace, what: str, count: int) -> bool:
     if options.yes:
         return True
     if not sys.stdin.isatty():
-        raise UserError(f"this would remove {what}", fix="say --yes where nobody can be asked, or --dry-run to look")
+        raise UserError(f"this would remove {what}", fix="add --yes where nobody can confirm, or --dry-run to look")
     try:
         return input(f"remove {what}? [y/N] ").strip().lower() in ("y", "yes")
     except EOFError:

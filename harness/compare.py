@@ -20,8 +20,8 @@ FILES = (COMPARISON.name, COMPARISON_PAGE.name)
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("first", type=Path, metavar="A", help="a result folder of a sweep with a `study`, or its study.json")
-    add("second", type=Path, metavar="B", help="likewise; the question is whether B is worse or better than A")
-    level = "level of the tests, all set-ups together (default: 0.05)"
+    add("second", type=Path, metavar="B", help="the other study, of the same form: is B worse or better than A?")
+    level = "significance level of the tests, for all set-ups together (default: 0.05)"
     add("--alpha", type=float, default=0.05, metavar="P", help=level)
     add("--out", type=Path, metavar="DIR", help=f"write {' and '.join(FILES)} there as well")
 
@@ -32,10 +32,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "hits and false calls with tests, and a mark for each set-up: + worse, - better, ~ not significant, ! newly "
     "failing, x not comparable.",
     epilog="Set-ups are paired by name and frames; where each study has one only, by that. Tests are paired where "
-    "both studies have the same boards. To make a change of a detection limit fail: python -m harness.check.",
+    "both studies have the same boards. python -m harness.check fails if a detection limit grew.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Returns 0 whatever the comparison says, 2 on a mistake of the user, 130 after Ctrl-C."""
+    """Returns 0 for any result of the comparison, 2 on a mistake of the user, 130 after Ctrl-C."""
     from harness.evaluation.study.record import read_record
     from harness.evaluation.study.verdict import compare_studies, paired_set_ups
     from harness.report.compare import compare_parts
@@ -46,7 +46,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     first, second = read_record(options.first), read_record(options.second)
     if not any(one is not None and other is not None for one, other in paired_set_ups(first, second)):
         both = " / ".join("; ".join(one.label for one in study.set_ups) for study in (first, second))
-        said = f"nothing could be paired: no set-up of the two has the same name and frames: {both}"
+        said = f"no set-ups can be paired: none has the same name and frames in both studies: {both}"
         legal = "set-ups of the same name, or at the same values on the axes, and frames; or one set-up in each"
         raise UserError(said, legal=legal, fix="run both studies with the same `sweep`, or each with a single set-up")
     comparison = compare_studies(first, second, options.alpha)

@@ -26,7 +26,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("experiment", type=Path, help="a YAML file, or the name of one that comes with tofpod, with random boards")
     change = "change one value of the file, such as source.target.distance_m=0.9; may be repeated"
     add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
-    add("--boards", type=int, required=True, metavar="N", help="boards of each set-up: cameras, frames and so on")
+    add("--boards", type=int, required=True, metavar="N", help="boards for each set-up (camera, frames and so on)")
     add("--out", type=Path, required=True, metavar="DIR", help="a new folder, or one that this command has begun")
     add("--licence", default="CC-BY-4.0", metavar="NAME", help="the licence that the card states (default: CC-BY-4.0)")
     results = "where experiments' results go: renders are taken from there, and kept there (default: results)"
@@ -40,7 +40,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "Write a data set of simulated boards: organised clouds, depth, intensity, validity, masks and "
     "truth, as NPZ and PNG, in the layout of MVTec 3D-AD, and as COCO masks.",
     epilog="Finished boards are kept: the same command resumes after Ctrl-C or a fault. "
-    "python -m harness.score states the detection limit of anybody's anomaly maps on it.",
+    "python -m harness.score states the detection limit of any anomaly maps on it.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0, 1 where boards failed, 2 on a mistake of the user, 130 after Ctrl-C."""
@@ -49,7 +49,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     from scenes.render.cache import in_use
 
     if not FEWEST <= options.boards <= MOST or options.jobs < 1:
-        asked = f"--boards {options.boards} --jobs {options.jobs}"
+        asked = f"--boards {options.boards} --jobs {options.jobs}: out of range"
         raise UserError(asked, legal=f"{FEWEST} to {MOST} boards, 1 process or more")
     experiment, out = load_experiment(options.experiment, options.overrides), options.out
     cache = options.results / ".cache" / "renders"
@@ -60,14 +60,14 @@ def main(options: argparse.Namespace, command: str) -> int:
             said = f"{out}: holds a data set of another experiment, number of boards or version of the code"
             raise UserError(said, fix="name a new folder with --out")
     elif out.is_dir() and any(out.iterdir()):
-        raise UserError(f"{out}: is not empty, and nothing is written over", fix="name a new folder with --out")
+        raise UserError(f"{out}: is not empty, and no file is overwritten", fix="name a new folder with --out")
     write_text(out / INDEX, json.dumps({**about, "samples": None}, indent=1) + "\n")
     write_text(out / "experiment.yaml", resolved_yaml(experiment))
     with in_use(cache), locked(out), engine_of(EngineOptions(jobs=options.jobs, serial=options.serial)) as engine:
         failures = _written(out, samples, engine)
     if failures:
         print(f"{len(failures)} jobs failed, the first: {failures[0]}", file=sys.stderr)
-        print("the same command goes on with what is missing", file=sys.stderr)
+        print("the same command continues with what is missing", file=sys.stderr)
         return 1
     _finish(out, samples, about)
     print(f"wrote {out}: {len(samples)} boards in {len(about['categories'])} categories; README.md there explains them")

@@ -1,4 +1,4 @@
-"""``python -m harness.design``: what a study of detection limits will be able to say, before anybody drills a hole."""
+"""``python -m harness.design``: what a planned study of detection limits can demonstrate."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ def _options(parser: argparse.ArgumentParser) -> None:
     put("--a50", type=float, metavar="SIZE", help="size that is found half the time")
     put("--a90", type=float, metavar="SIZE", help="size that is found nine times out of ten")
     put("--link", choices=LINKS, help="shape of the curve (default: logit)")
-    put("--log", action="store_true", default=None, help="the curve is against the sizes' logarithm")
+    put("--log", action="store_true", default=None, help="use the logarithm of the sizes")
     put("--study", type=Path, metavar="DIR", help="the curve of a study: its result folder, or its study.json")
-    put("--set-up", metavar="NAME", help='which one of that study, as in its tables: "50 frames"')
+    put("--set-up", metavar="NAME", help='set-up of that study, as named in its tables: "50 frames"')
     add("--sizes", type=float, nargs=2, metavar=("FROM", "TO"), help="sizes to choose from (default: the study's)")
-    add("--unit", help="of all sizes, for the labels (default: mm)")
+    add("--unit", help="unit of all sizes, for the labels (default: mm)")
     add("--targets", type=int, nargs="+", default=list(TARGETS), metavar="N", help="default: 30 40 60 120")
-    goal = "the a90/95 wanted: recommend the fewest targets that are sure of it"
+    goal = "the wanted a90/95: recommend the fewest targets that reach it reliably"
     add("--goal", type=float, metavar="SIZE", help=goal)
-    add("--studies", type=int, default=200, metavar="N", help="simulated for each plan (default: 200)")
+    add("--studies", type=int, default=200, metavar="N", help="studies simulated for each plan (default: 200)")
     put = parser.add_argument_group("hole-free boards").add_argument
-    put("--false-calls-per-m2", type=float, metavar="RATE", help="wanted rate: how much has to be inspected for it")
+    put("--false-calls-per-m2", type=float, metavar="RATE", help="wanted rate: states how much to inspect for it")
     put("--board-m2", type=float, metavar="AREA", help="face of one hole-free board (default: the study's)")
     add("--out", type=Path, metavar="DIR", help=f"write {', '.join(FILES)} there as well")
 
@@ -48,7 +48,7 @@ Guess = tuple["PodCurve", str, tuple[float, float], float | None]
 @program(
     _options,
     "Plan a hit/miss study from a guess of its probability of detection curve: simulate studies, "
-    "analyse them as real ones would be, and say which a90/95 to expect, how many targets it takes, and which "
+    "analyse them like real ones, and state which a90/95 to expect, how many targets it takes, and which "
     "sizes to make.",
     epilog="example: python -m harness.design --a50 5 --a90 7 --sizes 2 12 --goal 9. Takes about 5 ms a "
     "simulated study.",
@@ -89,8 +89,8 @@ def _refuse_what_does_not_belong(options: argparse.Namespace) -> None:
     missing = [f"--{name}" for name in ("a50", "a90", "sizes") if getattr(options, name) is None]
     if options.study is None and missing:
         legal = "--a50 SIZE --a90 SIZE --sizes FROM TO, or --study DIR"
-        fix = "guess from what is known; a plan for a guess too good is a study that demonstrates nothing"
-        raise UserError(f"{', '.join(missing)}: not told", legal=legal, fix=fix)
+        fix = "guess from what is known; a study planned for too good a guess demonstrates nothing"
+        raise UserError(f"{', '.join(missing)}: not stated", legal=legal, fix=fix)
     for name, owner in (("set-up", "study"), ("board-m2", "false-calls-per-m2")):
         given, of = (getattr(options, each.replace("-", "_")) for each in (name, owner))
         if given is not None and of is None:
@@ -110,7 +110,7 @@ def _guess(options: argparse.Namespace) -> Guess:
     record = set_up_named(study, options.set_up)
     limit = limit_of(record)
     if limit.statement is None:
-        fix = "tell a guess in place of --study: --a50 SIZE --a90 SIZE --sizes FROM TO; or name another set-up"
+        fix = "state a guess in place of --study: --a50 SIZE --a90 SIZE --sizes FROM TO; or name another set-up"
         raise UserError(f"{options.study}: {record.label} has no curve to guess from: {limit.why}", fix=fix)
     curve, origin = limit.statement.curve, f"fitted to {study.name}, {record.label}"
     seen, boards = record.inspected.size_mm, record.unflawed.area_m2
@@ -125,7 +125,7 @@ def _check(options: argparse.Namespace, guess: Guess) -> None:
     wrong = next((number for number in options.targets if not LEAST <= number <= MOST), None)
     # NaN compares false with everything, so every rule is written as what has to hold.
     rules = (
-        (0 <= low < high < float("inf"), f"--sizes {low:g} {high:g}", "0 <= FROM < TO"),
+        (0 <= low < high < float("inf"), f"--sizes {low:g} {high:g}: not a range", "0 <= FROM < TO"),
         (low < a50 < high, f"sizes of {low:g} to {high:g} do not hold a50 = {a50:.4g}", "--sizes FROM < a50 < TO"),
         (not curve.log_size or low > 0, "--sizes from 0 under a logarithm", "FROM above 0"),
         (wrong is None, f"--targets {wrong}", f"{LEAST} to {MOST}; MIL-HDBK-1823A asks for 60 at least"),
@@ -135,11 +135,11 @@ def _check(options: argparse.Namespace, guess: Guess) -> None:
         if not holds:
             raise UserError(said, legal=legal)
     if options.goal is not None and not options.goal > a90:
-        fix = "no study can be sure to demonstrate less than the truth: improve the detector, or want less"
+        fix = "no study can demonstrate a limit below the true a90: improve the detector, or state a larger goal"
         said = f"--goal {options.goal:g} is not above the guess's own {a90:.4g}"
         raise UserError(said, legal=f"more than {a90:.4g}", fix=fix)
     if options.false_calls_per_m2 is not None and options.board_m2 is None and board_m2 is None:
-        raise UserError("--false-calls-per-m2 needs --board-m2: boards of which face?", legal="square metres")
+        raise UserError("--false-calls-per-m2 needs --board-m2, the area of a board", legal="square metres")
 
 
 if __name__ == "__main__":

@@ -17,32 +17,32 @@ def _options(parser: argparse.ArgumentParser) -> None:
         " .bin; a ROS bag (folder, .mcap, .db3, .bag); a Stray Scanner folder; with --pitch a height map"
     )
     add("paths", nargs="+", type=Path, metavar="PATH", help=formats)
-    add("--out", type=Path, metavar="DIR", help="write tables, pictures and clouds here (docs/recordings.md)")
+    add("--out", type=Path, metavar="DIR", help="folder for tables, pictures and clouds (docs/recordings.md)")
     asked.add_reading(add)
     crop = f"the target: {asked.LEGAL_CROP}; auto: the nearest large smooth surface without its rim (crop.inset_px)"
     add("--crop", default="auto", metavar="KIND", help=crop)
-    target = "with --crop auto: take surface N of those that a run lists and that targets.png shows"
+    target = "with --crop auto: inspect surface N of those that a run lists and targets.png shows"
     add("--target", type=whole_number(10**9), metavar="N", help=target)
-    add("--detector", default=asked.DEFAULT_DETECTOR, help=f"detector's name (default: {asked.DEFAULT_DETECTOR})")
-    setting = "detector's setting by dotted path: surface.degree=5"
+    add("--detector", default=asked.DEFAULT_DETECTOR, help=f"name of the detector (default: {asked.DEFAULT_DETECTOR})")
+    setting = "a setting of the detector by dotted path: surface.degree=5"
     add("--set", action="append", default=[], metavar="KEY=VALUE", help=setting)
-    mesh = "the undamaged part's mesh, laid onto the cloud; --set surface.reference.unit=m, .front=-y"
+    mesh = "mesh of the undamaged part, registered to the cloud; --set surface.reference.unit=m, .front=-y"
     add("--reference", metavar="MESH", help=mesh)
     averages = ("mean", "median", "clipped")
     add("--average", choices=averages, default="mean", help="how frames are averaged (default: mean)")
-    add("--max-frames", type=whole_number(10**9), metavar="N", help="use the first N frames only")
-    calls = f"false calls expected here, by the noise towards the camera (default: {asked.DEFAULT_FALSE_CALLS:g})"
+    add("--max-frames", type=whole_number(10**9), metavar="N", help="use only the first N frames")
+    calls = f"expected number of false calls, by the noise towards the camera (default: {asked.DEFAULT_FALSE_CALLS:g})"
     add("--false-calls", type=float, metavar="N", help=calls)
-    add("--threshold", type=float, metavar="K", help="threshold in units of score instead")
-    flat = "take this unit's fixed pattern, as harness.flatfield measured it, off each capture"
+    add("--threshold", type=float, metavar="K", help="threshold in units of score, instead of --false-calls")
+    flat = "subtract this unit's fixed pattern, measured by harness.flatfield, from each capture"
     add("--flat-field", type=Path, metavar="FILE.npz", help=flat)
-    gauge = "find the boards of this gauge.json (harness.gauge) by their marks, and tell hits and misses: gauge.csv"
+    gauge = "find the boards of this gauge.json (harness.gauge) by their marks; write hits and misses to gauge.csv"
     add("--gauge", type=Path, metavar="FILE.json", help=gauge)
     quiet = "calibrate the threshold on this capture of an undamaged target"
     add("--quiet-capture", type=Path, metavar="PATH", help=quiet)
     add = parser.add_argument_group(
         "several views of one target",
-        "Each PATH is one view, --crop cuts the target out of each, and the detector judges all that is merged (or"
+        "Each PATH is one view. --crop cuts the target out of each view, and the detector judges the merged cloud (or"
         " --set crop.kind=..). --set mapping.KEY=VALUE sets the rest: mapping.merge.cell_mm=1,"
         " mapping.marks.dictionary=DICT_4X4_50, mapping.registration.points=target (icp and cpd on the whole target,"
         " not on the points of the marks).",
@@ -56,7 +56,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     )
     marks = "marks: colour (strips that stand apart; default), red (the thesis' rule), coded (ArUco, AprilTag)"
     add("--marks", choices=asked.MARKS, metavar="KIND", help=marks)
-    poses = "where the views may stand, for a start: JSON with 4x4 matrices in metres, or TUM's groundtruth.txt"
+    poses = "poses from which registration starts: JSON with 4x4 matrices in metres, or TUM's groundtruth.txt"
     add("--poses", type=Path, metavar="FILE", help=poses)
 
 

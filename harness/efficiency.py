@@ -20,11 +20,11 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Set the detectors of a simulated study beside the ideal observer, which knows each damage's exact "
+    "Compare the detectors of a simulated study with the ideal observer, which knows each damage's exact "
     "signature and the covariance of the noise over units of the camera, but not the place: its a50 and a90 at the "
     f"study's rate of false calls, and every detector's efficiency. Writes {EFFICIENCY_PAGE.name} and tables into "
     "the study's folder.",
-    epilog="Takes some seconds a damaged board. Views that are not in the store of renders are rendered again.",
+    epilog="It takes some seconds per damaged board. Views that are not in the store of renders are rendered again.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Returns 0, 2 on a mistake of the user, 130 after Ctrl-C."""
@@ -72,7 +72,7 @@ def main(options: argparse.Namespace, command: str) -> int:
         first = (
             f"The ideal observer is for a new unit of {names}, by the noise of {rows[0].ideal.units} units, at "
             f"{rate:g} false call{'' if rate == 1 else 's'} per m², size and depth known; the detectors' hits are on "
-            f"unit {seeds}. Not in it: missing returns, tails that are not Gaussian, noise that differs within damage."
+            f"unit {seeds}. Not modelled: missing returns, non-Gaussian tails, noise that differs within damage."
         )
         if study.digest != experiment.digest:
             changed = "hits are those of another version of the camera or of a detector than the one installed now"

@@ -59,7 +59,7 @@ class ExportedView:
 
 
 def on_window(values: np.ndarray, region: Region, window: Region, outside: float) -> np.ndarray:
-    """Return what values (h, w, ...) of a region of the sensor are on a ``window`` that holds it; else ``outside``."""
+    """Return values (h, w, ...) of a region of the sensor on a ``window`` that contains it; elsewhere ``outside``."""
     whole = np.full((*window.shape, *values.shape[2:]), outside, values.dtype)
     whole[region.within(window)] = values
     return whole

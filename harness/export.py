@@ -1,4 +1,4 @@
-"""``python -m harness.export``: the simulated views of an experiment for other people's mapping, with their truth."""
+"""``python -m harness.export``: the simulated views of an experiment for other mapping programs, with their truth."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ REPEAT = 0  # The trial whose noise is exported: the same frames as an experimen
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("experiment", type=Path, metavar="EXPERIMENT.yaml", help="an experiment's file or name")
-    add("--format", required=True, choices=FORMATS, help="tum: one sequence; ros2 (sqlite3), mcap: one bag a view")
+    add("--format", required=True, choices=FORMATS, help="tum: one sequence; ros2 (sqlite3), mcap: one bag per view")
     add("--out", required=True, type=Path, metavar="DIR", help="a folder that does not exist yet, or is empty")
     change = "change one value of the file, such as source.target.distance_m=0.9; may be repeated"
     add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
-    add("--views", type=whole_number(10_000), metavar="N", help="the first N views only (default: all)")
+    add("--views", type=whole_number(10_000), metavar="N", help="export only the first N views (default: all)")
     frames = "frames of each view (default: the experiment's capture.frames)"
     add("--frames", type=whole_number(10_000), metavar="N", help=frames)
-    add("--hole-free", action="store_true", help="the same target without its damage")
+    add("--hole-free", action="store_true", help="export the same target without its damage")
     results = "where experiments' results go: renders are taken from there, and kept there (default: results)"
     add("--results", type=Path, default=Path("results"), metavar="DIR", help=results)
 
@@ -124,8 +124,8 @@ def _write_beside(
             "frames_per_second": views[0].frames_per_second,
             "rounding_step_mm": 1e3 * views[0].source.z_step_m,
             "notes": [
-                "The target is turned as on a table: it alone agrees with the poses from view to view, not the room.",
-                "Outside the simulated region of each image there is no range and black.",
+                "The target turns as on a turntable: only the target agrees with the poses of all views, not the room.",
+                "Outside the simulated region of each image, pixels have no range and are black.",
                 "Colour is the surfaces' albedo, evenly lit, on the depth camera's own pixels.",
             ],
         },

@@ -32,16 +32,16 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, required=True, metavar="FILE.npz", help=written)
     add_reading(add)
     add("--crop", default="auto", metavar="KIND", help="the part that shows the wall, as for harness.detect")
-    poses = "where the camera stood, as for harness.detect: the surface's own shape then counts as no noise"
+    poses = "camera poses, as for harness.detect: the surface's shape is then not counted as noise"
     add("--poses", type=Path, metavar="FILE", help=poses)
 
 
 @program(
     _options,
-    "Measure the fixed pattern of one unit of a camera: the error of range at each pixel that is the same in every "
+    "Measure the fixed pattern of one unit of a camera: the range error at each pixel that is the same in every "
     "frame. Each PATH is one capture, 50 frames or more of a matte wall that fills the view, taken with a warm "
-    "camera, moved by 30 mm or more between captures, at two distances, some captures at each. The captures' "
-    "order is that of time.",
+    "camera, moved by 30 mm or more between captures, at two distances, some captures at each. Name the "
+    "captures in the order of recording.",
     epilog="example: python -m harness.flatfield near1 near2 far1 far2 --out unit.npz, then "
     "python -m harness.detect captures/board --flat-field unit.npz",
 )
@@ -57,7 +57,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.vocabulary.provenance import RESULTS_VERSION, record
 
     if options.out.suffix.lower() != ".npz":
-        raise UserError(f"--out {options.out}: is no name of a flat field", legal="a name that ends in .npz")
+        raise UserError(f"--out {options.out}: is not a name for a flat field", legal="a name that ends in .npz")
     lens, captures, doubted = _captures(options)
     found = separated(captures, lens)
     field = replace(found.field, warnings=(*doubted, *found.field.warnings))
@@ -109,7 +109,7 @@ def _captures(options: argparse.Namespace) -> tuple[Lens, list[FlatCapture], lis
         if recording.lens is None:
             raise UserError(f"{path}: the lens is not known", fix="name a file or a camera with --intrinsics")
         if recording.lens != first.lens:
-            said = f"{path}: is of another lens than {options.paths[0]}"
+            said = f"{path}: has another lens than {options.paths[0]}"
             raise UserError(said, legal="captures of one unit and mode")
     found = []
     for recording, pose in zip(recordings, poses, strict=True):

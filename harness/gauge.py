@@ -1,4 +1,4 @@
-"""``python -m harness.gauge``: a board with holes to check a detection limit with, as a drilling template and truth."""
+"""``python -m harness.gauge``: a board with holes that checks a detection limit, as drilling template and truth."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ HIT_SHARE = 0.4  # Hit radius as a share of the distance between holes, so that 
 
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--diameters", required=True, type=span, metavar="FROM:TO", help="range of the drills, mm")
-    add("--depths", type=span, metavar="FROM:TO", help="of blind holes, mm (default: all go through)")
+    add("--diameters", required=True, type=span, metavar="FROM:TO", help="range of drill diameters, mm")
+    add("--depths", type=span, metavar="FROM:TO", help="depths of blind holes, mm (default: all are through-holes)")
     add("--study", type=Path, metavar="DIR", help="plan by the curve of this study, simulated or implanted")
-    add("--set-up", metavar="NAME", help='which of its set-ups: "50 frames"')
-    add("--a50", type=float, metavar="MM", help="plan by this guess: found half the time")
-    add("--a90", type=float, metavar="MM", help="and found nine times out of ten")
-    add("--targets", type=int, default=36, metavar="N", help="holes in all (default: 36)")
+    add("--set-up", metavar="NAME", help='set-up of that study: "50 frames"')
+    add("--a50", type=float, metavar="MM", help="plan by a guess: the size found half the time")
+    add("--a90", type=float, metavar="MM", help="and the size found nine times out of ten")
+    add("--targets", type=int, default=36, metavar="N", help="total number of holes (default: 36)")
     add("--board", default="270x175", metavar="WxH", help="size of a board, mm (default: 270x175, one sheet of A4)")
     add("--apart", type=float, default=30.0, metavar="MM", help="distance between holes (default: 30)")
     add("--paper", choices=("A4", "A3", "letter"), default="A4", help="default: A4")
-    add("--out", type=Path, required=True, metavar="DIR", help="template.pdf, board-N.svg and gauge.json")
+    add("--out", type=Path, required=True, metavar="DIR", help="folder for template.pdf, board-N.svg and gauge.json")
 
 
 @program(
@@ -67,7 +67,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     # evenly spread: sizes crowded where the study's curve rises tell nothing where the real curve rises elsewhere
     (chosen,) = plan.design(curve, [options.targets], (low, high), studies=100, seed=SEED)
     if not low < (wrong_mm := PRIOR_SIZE * curve.size_at(0.9)) < high:
-        were = f"were the curve's a90 too small by a factor of {PRIOR_SIZE:g}, it would be {wrong_mm:.3g} mm"
+        were = f"if the curve's a90 is too small by a factor of {PRIOR_SIZE:g}, the true a90 is {wrong_mm:.3g} mm"
         print(f"warning: {were}, and no hole of {low:g} to {high:g} mm would show it: choose other --diameters")
     gauge = _laid_out(options, chosen.sizes)
     text = json.dumps({"gauge_version": GAUGE_VERSION, **gauge.to_data()}, indent=1)
@@ -93,7 +93,7 @@ def _curve(options: argparse.Namespace) -> PodCurve:
 
     guessed = options.a50 is not None and options.a90 is not None
     if guessed == (options.study is not None):
-        raise UserError("which holes? the curve to plan by is told once", legal="--study DIR, or --a50 MM --a90 MM")
+        raise UserError("state exactly one curve by which to plan", legal="--study DIR, or --a50 MM --a90 MM")
     if guessed:
         return curve_through(options.a50, options.a90)
     limit = limit_of(set_up_named(read_record(options.study), options.set_up))
@@ -112,11 +112,11 @@ def _laid_out(options: argparse.Namespace, sizes: np.ndarray) -> Gauge:
         if not all(0 < each < LARGEST_MM for each in (width, height)):
             raise ValueError("no size of a board")
     except ValueError as error:
-        raise UserError(f"--board {options.board}: is no size", legal="WIDTHxHEIGHT in mm: 270x175") from error
+        raise UserError(f"--board {options.board}: is not a size", legal="WIDTHxHEIGHT in mm: 270x175") from error
     side, apart = MARK_MM, options.apart
     if not 0 < options.diameters[1] < apart - 4:
-        said = f"--apart {apart:g}: holes of {options.diameters[1]:g} mm meet"
-        raise UserError(said, legal="their diameter and 5 more")
+        said = f"--apart {apart:g}: holes of {options.diameters[1]:g} mm overlap"
+        raise UserError(said, legal="at least their diameter plus 5 mm")
     inset = np.array([width, height]) / 2 - side / 2 - CLEAR_MM
     corners = inset * [(-1, 1), (1, 1), (1, -1), (-1, -1)]
     rim = options.diameters[1] / 2 + EDGE_MM

@@ -1,4 +1,4 @@
-"""``python -m harness.implant``: the detection limit of your camera on your part, by virtual damage in real scans."""
+"""``python -m harness.implant``: the detection limit of your camera on your part, by virtual damage in captures."""
 
 from __future__ import annotations
 
@@ -31,25 +31,25 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("paths", nargs="+", type=Path, metavar="PATH", help="captures, in any format that harness.detect reads")
     add("--camera", required=True, metavar="NAME|FILE.yaml", help="the camera that took them, or the most similar one")
-    add("--damage", required=True, choices=DAMAGES, help="as on the drawn boards of an experiment")
-    add("--diameters", required=True, type=span, metavar="FROM:TO", help="of the damage, mm; of slots their widths")
-    add("--depths", type=span, metavar="FROM:TO", help="depths, mm (of bumps and protrusions: heights)")
-    add("--lengths", type=span, metavar="FROM:TO", help="of slots, mm")
-    add("--thickness", type=float, default=12.7, metavar="MM", help="of the part (default: 12.7)")
-    behind = "distance of what stands behind a through-hole, mm, or none (default: 20)"
+    add("--damage", required=True, choices=DAMAGES, help="kind of damage, as on the drawn boards of an experiment")
+    add("--diameters", required=True, type=span, metavar="FROM:TO", help="diameters, mm; for slots their widths")
+    add("--depths", type=span, metavar="FROM:TO", help="depths, mm (for bumps and protrusions, heights)")
+    add("--lengths", type=span, metavar="FROM:TO", help="lengths of slots, mm")
+    add("--thickness", type=float, default=12.7, metavar="MM", help="thickness of the part (default: 12.7)")
+    behind = "distance to the surface behind a through-hole, mm, or none (default: 20)"
     add("--backing", default="20", metavar="MM|none", help=behind)
-    add("--albedo", type=float, default=0.6, help="of part and backing at the camera's wavelength (default: 0.6)")
-    add("--frames", type=int, nargs="+", metavar="N", help="frames to average (default: 1 and all)")
-    add("--targets", type=int, default=60, metavar="N", help="damages in all (default: 60, as MIL-HDBK-1823A asks)")
-    add("--hit-radius", type=float, default=15.0, metavar="MM", help="a finding this near is a hit (default: 15)")
-    add("--apart", type=float, metavar="MM", help="least distance of damages (default: hit radius times 2, plus 10)")
-    add("--seed", type=int, default=1, help="of places, sizes and noise (default: 1)")
-    calls = f"expected in a capture; sets the threshold as harness.detect does (default: {asked.DEFAULT_FALSE_CALLS:g})"
+    add("--albedo", type=float, default=0.6, help="albedo of part and backing at this wavelength (default: 0.6)")
+    add("--frames", type=int, nargs="+", metavar="N", help="numbers of frames to average (default: 1 and all)")
+    add("--targets", type=int, default=60, metavar="N", help="number of damages (default: 60, as MIL-HDBK-1823A asks)")
+    add("--hit-radius", type=float, default=15.0, metavar="MM", help="largest distance of a hit (default: 15)")
+    add("--apart", type=float, metavar="MM", help="least distance of damages (default: 2 hit radii plus 10)")
+    add("--seed", type=int, default=1, help="seed of places, sizes and noise (default: 1)")
+    calls = f"expected number, which sets the threshold as in harness.detect (default: {asked.DEFAULT_FALSE_CALLS:g})"
     add("--false-calls", type=float, metavar="N", help=calls)
-    add("--threshold", type=float, metavar="K", help="threshold in units of score instead")
+    add("--threshold", type=float, metavar="K", help="threshold in units of score, instead of --false-calls")
     add("--detector", default=asked.DEFAULT_DETECTOR, help=f"detector's name (default: {asked.DEFAULT_DETECTOR})")
-    add("--set", action="append", default=[], metavar="KEY=VALUE", help="detector's setting: surface.degree=5")
-    add("--crop", default="auto", metavar="KIND", help=f"which part is the target: {asked.LEGAL_CROP}")
+    add("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of the detector: surface.degree=5")
+    add("--crop", default="auto", metavar="KIND", help=f"the target: {asked.LEGAL_CROP}")
     asked.add_reading(add)
     add("--out", type=Path, default=Path("results/implant"), metavar="DIR", help="default: results/implant")
 
@@ -179,7 +179,7 @@ def _family(options: argparse.Namespace, scans: list[Scan]) -> DrawnTargetConfig
     try:
         backing = None if options.backing == "none" else {"distance_mm": float(options.backing)}
     except ValueError as error:
-        raise UserError(f"--backing {options.backing}: is no number", legal="millimetres, or none") from error
+        raise UserError(f"--backing {options.backing}: is not a number", legal="millimetres, or none") from error
     data = {
         "seed": options.seed,
         "damage": damage,

@@ -54,7 +54,7 @@ def plug_ins(kind: str) -> PlugIns:
 
 
 def offered(kind: str) -> list[Row]:
-    """Return a row for each offer; what cannot be used has ``broken``, which says why, and ``fix``."""
+    """Return a row for each offer; an unusable offer has ``broken``, which gives the reason, and ``fix``."""
     rows: list[Row] = []
     for offer in plug_ins(kind).offers():
         try:
@@ -71,7 +71,7 @@ def offered(kind: str) -> list[Row]:
 
 
 def shown(kind: str, name: str) -> Row:
-    """Return an offer's row with all that can be set. Raises UserError where it is unknown, taken twice or broken."""
+    """Return an offer's row with all of its settings. Raises UserError where it is unknown, taken twice or broken."""
     settable = _detector_settings(name) if kind == "detectors" else _numbers(name)
     return {**_origin(plug_ins(kind).offer(name)), **_facts(kind, name), SETTABLE[kind]: settable}
 
@@ -159,7 +159,7 @@ def _numbers(name: str) -> list[dict[str, Any]]:
 
 
 def leaves(data: Mapping[str, Any], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield (path, value) of everything in nested mappings that is no mapping, or an empty one."""
+    """Yield (path, value) of the leaves of nested mappings; an empty mapping is a leaf."""
     for key, value in data.items():
         if isinstance(value, dict) and value:
             yield from leaves(value, (*path, key))
@@ -221,7 +221,7 @@ def result_folders(out: Path, experiment: str | None = None) -> list[dict[str, A
 
 
 def limit_text(limits: list[dict[str, Any]]) -> str:
-    """Return the detection limit with its set-up; the span of several; nothing of what is no study."""
+    """Return the detection limit with its set-up; the span of several; "" where there is no study."""
     found = [row for row in limits if row["a90_95_mm"] is not None and row["verdict"] == "demonstrated"]
     if not found:
         return "a90/95 not demonstrated" if limits else ""
@@ -323,7 +323,7 @@ def folders_in(folder: Path, names: re.Pattern[str]) -> list[Path]:
 
 
 def files_below(folder: Path) -> Iterator[Path]:
-    """Yield everything below a folder that is no folder; links are not followed."""
+    """Yield all files and links below a folder; links are not followed."""
     return (Path(inner, name) for inner, _, names in os.walk(folder) for name in names)
 
 
@@ -335,10 +335,10 @@ def latest_run(parent: Path) -> str | None:
 
 
 def point_to(run: Path) -> None:
-    """Let the link ``latest`` beside a run point to it, unless it is not tofpod's; failures are told on stderr."""
+    """Let the link ``latest`` beside a run point to it, unless it is not tofpod's; failures are printed on stderr."""
     path = Path(run).parent / LATEST
     if os.path.lexists(path) and latest_run(path.parent) is None:
-        print(f"{path}: is not tofpod's and is left as it is; the newest run is {run}", file=sys.stderr)
+        print(f"{path}: was not written by tofpod and is left unchanged; the newest run is {run}", file=sys.stderr)
         return
     part = path.with_name(f".{LATEST}.{secrets.token_hex(4)}.part")
     try:
@@ -373,7 +373,7 @@ def chosen_results(out: Path, name: str) -> list[Path]:
     experiment, slash, digest = name.partition("/")
     if not EXPERIMENT_NAME.fullmatch(experiment) or (slash and not DIGEST_NAME.fullmatch(digest)):
         legal = "NAME or NAME/DIGEST, as python -m harness.ls results shows them"
-        raise UserError(f"{name!r} names no results", legal=legal)
+        raise UserError(f"{name!r} is not the name of any results", legal=legal)
     parent = Path(out) / experiment
     refuse_links(parent, parent / digest)
     found = [path for path in folders_in(parent, DIGEST_NAME) if digest in ("", path.name)]
@@ -381,7 +381,7 @@ def chosen_results(out: Path, name: str) -> list[Path]:
         # every sweep begins with its declaration, whose first line says whose it is
         declared = folder / EXPERIMENT.name
         if not declared.is_file() or not bounded_bytes(declared, TEXT_BYTES).startswith(b"# tofpod experiment "):
-            raise UserError(f"{folder}: is no folder of results", fix="python -m harness.ls results shows them")
+            raise UserError(f"{folder}: is not a folder of results", fix="python -m harness.ls results shows them")
     return found
 
 

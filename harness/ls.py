@@ -20,7 +20,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("what", nargs="?", help="detectors, cameras, results, cache, keys (of experiments); or a detector or camera")
     add("name", nargs="?", help="a detector or camera, to show all its settings; with results, the experiment")
-    add("--out", type=Path, default=Path("results"), metavar="DIR", help="where results are (default: results)")
+    add("--out", type=Path, default=Path("results"), metavar="DIR", help="folder of results (default: results)")
     add("--json", action="store_true", help="as JSON, for programs")
 
 

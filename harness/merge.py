@@ -17,14 +17,14 @@ from harness.vocabulary.program import program
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER", help="a folder with a journal")
-    parser.add_argument("--into", type=Path, required=True, metavar="FOLDER", help="made if it is not there")
+    parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER", help="a folder of results with a journal")
+    parser.add_argument("--into", type=Path, required=True, metavar="FOLDER", help="created if it does not exist")
 
 
 @program(
     _options,
     "Copy the trials of one or more folders of results (as `harness.sweep --shard` leaves them) into "
-    "another. Nothing is run; where a trial is in several, one that is done counts.",
+    "another. Nothing is run; if a trial is in several folders, a finished one is used.",
     epilog="example: python -m harness.merge shard1/averaging/0123456789abcdef shard2/averaging/0123456789abcdef "
     "--into results/averaging/0123456789abcdef; then the sweep's own command, without --shard, writes the report",
 )
@@ -46,16 +46,16 @@ def main(options: argparse.Namespace, command: str) -> int:
             different += merge_into(goal, other, counts)
             damaged += other.damaged
             print(f"{folder}: {counts['copied'] - before} trials copied")
-    print(f"{goal.folder}: {counts['copied']} trials copied, {counts['known']} were there")
+    print(f"{goal.folder}: {counts['copied']} trials copied, {counts['known']} were already there")
     if damaged:
         told = f"{len(damaged)} damaged or older records left out, to be run again"
         print(f"{told}: {', '.join(damaged[:3])}", file=sys.stderr)
     if counts["alike"]:
-        alike = f"{counts['alike']} trials differ in last digits, as unlike processors make them"
+        alike = f"{counts['alike']} trials differ in the last digits, as between different processors"
         print(f"{alike}; the first copied was kept")
     if different:
         told = f"{len(different)} trials have different results in different folders, the first copied was kept"
-        why = "The machines do not compute alike (other processors, or versions?)"
+        why = "The machines disagree (different processors or versions?)"
         print(f"{told}: {', '.join(different[:3])}. {why}", file=sys.stderr)
         return 1
     out = into.parent.parent
@@ -64,7 +64,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def merge_into(into: Journal, other: Journal, counts: Counter[str]) -> list[str]:
-    """Copy what ``into`` lacks or has not done; count trials copied, known, and of these alike but for last digits.
+    """Copy trials that ``into`` lacks or has not finished; count those copied, known, and alike but for last digits.
     Returns the keys of those that differ. Raises UserError where a newer tofpod wrote either."""
     different = []
     for key, entry in other.entries():
@@ -116,11 +116,11 @@ def _refuse_others(folders: list[Path], into: Path) -> None:
     names = {"/".join(folder.resolve().parts[-2:]) for folder in folders}
     if len(names) > 1:
         what = f"these are results of different experiments: {', '.join(sorted(names))}"
-        raise UserError(what, fix="merge those of each experiment by themselves")
+        raise UserError(what, fix="merge the folders of each experiment separately")
     (name,) = names
     if "/".join(into.resolve().parts[-2:]) != name:
         fix = f"--into {into}/{name}, and --out {into} for the sweep"
-        raise UserError(f"--into {into}: results of {name} are looked for in a folder of that name", fix=fix)
+        raise UserError(f"--into {into}: results of {name} must be in a folder of that name", fix=fix)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""``python -m harness.pod``: the probability of detection of anybody's inspections, by the field's standard."""
+"""``python -m harness.pod``: the probability of detection of the user's inspections (MIL-HDBK-1823A)."""
 
 from __future__ import annotations
 
@@ -22,34 +22,34 @@ LINKS = ("logit", "probit", "cloglog", "loglog")
 
 def _options(parser: argparse.ArgumentParser) -> None:
     add, switch = parser.add_argument, argparse.BooleanOptionalAction
-    add("file", type=Path, metavar="FILE", help="CSV or Excel (.xlsx): a header row, then one row an inspection")
+    add("file", type=Path, metavar="FILE", help="CSV or Excel (.xlsx): a header row, then one row per inspection")
     add("--size", required=True, metavar="COL", help="column of the flaws' true sizes")
     hits = "column of 1 (found) and 0 (missed), yes and no, hit and miss; once for each inspector"
     add("--hit", metavar="COL", action="append", help=hits)
     add("--ahat", metavar="COL", help="column of signals, instead of --hit; needs --decision")
-    add("--target", metavar="COL", help="column of the flaws' names, where some were inspected more than once")
-    add("--unit", default="", metavar="UNIT", help="of the sizes, for the labels: mm, inch, ...")
+    add("--target", metavar="COL", help="column of the flaws' names, if some were inspected more than once")
+    add("--unit", default="", metavar="UNIT", help="unit of the sizes, for the labels: mm, inch, ...")
     add("--out", type=Path, default=Path("results/pod"), metavar="DIR", help="default: results/pod")
-    least = "(default: what gives less deviance)"
-    add("--log", action=switch, help=f"the curve against the sizes' logarithm, or not {least}")
+    least = "(default: the choice with the lower deviance)"
+    add("--log", action=switch, help=f"use the logarithm of the sizes, or not {least}")
     put = parser.add_argument_group("with --hit").add_argument
     put("--link", choices=LINKS, help="shape of the curve (default: the one with the least deviance)")
     put = parser.add_argument_group("with --ahat").add_argument
     put("--decision", type=float, metavar="Y", help="a flaw is called where the signal is higher than this")
-    put("--left", type=float, metavar="Y", help="signals at or below this are known to be no more than that (noise)")
-    put("--right", type=float, metavar="Y", help="signals at or above this are known to be no less (saturation)")
-    put("--log-signal", action=switch, help=f"the straight line is of the signals' logarithm, or not {least}")
+    put("--left", type=float, metavar="Y", help="signals at or below this value are censored (noise)")
+    put("--right", type=float, metavar="Y", help="signals at or above this value are censored (saturation)")
+    put("--log-signal", action=switch, help=f"use the logarithm of the signals, or not {least}")
     told = "with --prior: model-assisted POD (MAPOD), a simulated curve corrected by these hits and misses"
     put = parser.add_argument_group(told).add_argument
     prior = "folder of a study, simulated or by virtual damage (harness.implant)"
     put("--prior", type=Path, metavar="STUDY", help=prior)
-    put("--set-up", metavar="NAME", help='which set-up of the study: "50 frames"')
+    put("--set-up", metavar="NAME", help='set-up of the study: "50 frames"')
     put("--board", metavar="COL", help="column of the boards' names, in the order in which they were inspected")
 
 
 @program(
     _options,
-    "Fit a probability of detection curve to inspections, one a row of a CSV file, and state the size "
+    "Fit a probability of detection curve to inspections, one per row of a table, and state the size "
     "found 90 % of the time with 95 % confidence (a90/95). Writes pod.json, pod.png and pod.html.",
     epilog="example: python -m harness.pod blades.csv --hit found --size length --target blade --unit mm",
 )
@@ -93,7 +93,7 @@ def _corrected(options: argparse.Namespace) -> Mapod:
     read = table.read_inspections(options.file, options.size, options.hit, options.target)
     table.require_positive(read, response=False, why="--prior")
     if read.targets < len(read.size):
-        raise UserError(f"{options.file}: targets stand in it more than once", fix="keep one inspection of each target")
+        raise UserError(f"{options.file}: some targets appear more than once", fix="keep one inspection of each target")
     boards = table.texts_of(read, options.board) if options.board else None
     doubt = _unlike(read, limit.record, study.hit_radius_mm)
     return Mapod.of(limit.record.label, limit.statement, limit.why, read, boards, doubt)
@@ -121,7 +121,7 @@ def _stated(options: argparse.Namespace) -> PodStatement:
             raise UserError(f"--{name.replace('_', '-')} belongs to --prior", fix="add --prior, or leave it out")
     of_hits, legal = options.hit is not None, "--hit COL with 0 and 1, or --ahat COL with signals and --decision Y"
     if of_hits == (options.ahat is not None):
-        said = "one of them, not both" if of_hits else "which column tells what was found?"
+        said = "one of them, not both" if of_hits else "no column states what was found"
         raise UserError(f"--hit and --ahat: {said}", legal=legal, fix="name one column; none is guessed")
     other = "--ahat" if of_hits else "--hit"
     for name in ("decision", "left", "right", "log_signal") if of_hits else ("link",):

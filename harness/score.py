@@ -1,4 +1,4 @@
-"""``python -m harness.score PREDICTIONS --dataset DIR``: the detection limit of anybody's anomaly maps.
+"""``python -m harness.score PREDICTIONS --dataset DIR``: the detection limit of a method's anomaly maps.
 
 A map is judged as a study judges a score: the threshold is the lowest with the wanted rate of false calls on the good
 boards of ``validation``; pixels above it that steps of at most `LINK_M` join are a finding, which hits a damage by the
@@ -65,7 +65,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
     index = read_index(options.dataset)
     if index["samples"] is None:
-        raise UserError(f"{options.dataset}: is not finished", fix="run the command that wrote it again; it goes on")
+        raise UserError(f"{options.dataset}: is not finished", fix="run the command that wrote it again; it continues")
     rate = index["false_calls_per_m2"] if options.false_calls is None else options.false_calls
     if not 0 < rate <= 1e6:
         raise UserError(f"--false-calls {rate:g}", legal="above 0, up to 1e6 a square metre")
@@ -88,7 +88,7 @@ def main(options: argparse.Namespace, command: str) -> int:
         if limit.statement is not None:
             write_text(options.out / f"{limit.record.variant}.html", pod_html(limit.statement, command))
     single = [name for name, one in index["categories"].items() if one["units"] == 1]
-    warned = [f"warning: one unit of the camera, for which alone the limit holds: {', '.join(single)}"] * bool(single)
+    warned = [f"warning: the limit holds for one unit of the camera only: {', '.join(single)}"] * bool(single)
     show([*warned, LIMITS.grid(limits, terminal=True), "", SCORES.grid(rows, terminal=True)])
     print(f"wrote {options.out}: study.json, limits.csv, scores.csv, a page for each curve")
     return 0
@@ -108,11 +108,11 @@ def _found(predictions: Path, dataset: Path, samples: list[str]) -> dict[str, Pa
         if name not in files:
             faults.setdefault("missing", []).append(name)
         elif name not in wanted:
-            faults.setdefault("of no board of validation or test", []).append(name)
+            faults.setdefault("not for a board of validation or test", []).append(name)
         elif len(files[name]) > 1:
             faults.setdefault("there twice", []).append(name)
         elif fault := _fault(files[name][0], *read_arrays(dataset, name, "inspected")):
-            faults.setdefault("not as they must be", []).append(f"{name} ({fault})")
+            faults.setdefault("invalid", []).append(f"{name} ({fault})")
     if faults:
         said = [
             f"{len(names)} maps are {what}: {', '.join(names[:MOST_NAMED])}{', ...' * (len(names) > MOST_NAMED)}"

@@ -17,8 +17,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=help)
     help = "a recording (.mkv) whose own lens replaces the camera's nominal one, so that your unit is simulated"
     add("--calibration", type=Path, metavar="FILE", help=help)
-    add("--out", type=Path, default=Path("results"), metavar="DIR", help="where results go (default: results)")
-    add("--dry-run", action="store_true", help="validate and say what would be run; run nothing")
+    add("--out", type=Path, default=Path("results"), metavar="DIR", help="folder of results (default: results)")
+    add("--dry-run", action="store_true", help="validate and print what would be run; run nothing")
     add_engine_options(parser)
 
 

@@ -22,7 +22,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("target", help=f"a named target ({', '.join(NAMED_TARGETS)}) or a YAML or JSON file that declares one")
     add("--out", type=Path, metavar="MESH", help="where to write the mesh: .glb (textured) or .ply")
     add("--truth", type=Path, metavar="JSON", help="where to write each damage's size, place and axis")
-    add("--board", type=int, default=0, metavar="N", help="which damaged board, where the file declares a family (0)")
+    add("--board", type=int, default=0, metavar="N", help="number of the damaged board of a family (default: 0)")
     add("--hole-free", action="store_true", help="leave out all damage")
 
 

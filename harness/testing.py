@@ -112,13 +112,13 @@ class Look:
         found = self.detector.measure(self.cloud, self.evidence, finding)
         diameter, centre = found.extent_diameter_m, np.asarray(found.extent_centre_m)
         require(np.isfinite(diameter) and diameter >= 0, f"`extent_diameter_m` is {diameter:g}")
-        require(centre.shape == (3,) and np.isfinite(centre).all(), "`extent_centre_m` is no (3,) finite numbers")
+        require(centre.shape == (3,) and np.isfinite(centre).all(), "`extent_centre_m` is not 3 finite numbers")
         require(found.score == finding.score, f"`measure` says score {found.score:g} of a finding of {finding.score:g}")
         require(found.points >= 1, f"`measure` says {found.points} points")
         return found
 
     def everything(self) -> tuple[Any, ...]:
-        """Return all that a detector says of a cloud."""
+        """Return all results of a detector on a cloud."""
         quiet = self.quiet
         found = self.find(quiet / 2)
         return self.evidence, quiet, found, [self.measured(finding) for finding in found[:STRONGEST]]
@@ -129,7 +129,7 @@ def declares_itself(make: Make, cloud: Cloud) -> None:
     detector = make()
     require(isinstance(detector.name, str) and detector.name != "", "`name` is no text")
     version = detector.version
-    require(type(version) is int and version >= 1, f"`version` is {version!r}: a whole number from 1 is wanted")
+    require(type(version) is int and version >= 1, f"`version` is {version!r}: it must be a whole number, 1 or more")
     settings_type: Any = getattr(type(detector), "settings_type", None)
     is_config = isinstance(settings_type, type) and issubclass(settings_type, Config)
     require(is_config, "the class has no `settings_type` that is a harness.vocabulary.config.Config")
@@ -147,10 +147,10 @@ def gives_the_same_twice(make: Make, cloud: Cloud) -> None:
     """The same bits for the same cloud: again, after another cloud, and from a detector made anew."""
     detector = make()
     first = Look.at(detector, cloud).everything()
-    require(_same(first, Look.at(detector, cloud).everything()), "the second time the same cloud gave another result")
+    require(_same(first, Look.at(detector, cloud).everything()), "the same cloud gave another result the second time")
     Look.at(detector, with_gaps(cloud, seed=9)).everything()
     again = Look.at(detector, cloud).everything()
-    require(_same(first, again), "after another cloud the same one gave another result")
+    require(_same(first, again), "the same cloud gave another result after another cloud")
     require(_same(first, Look.at(make(), cloud).everything()), "a detector made anew gave another result")
 
 
@@ -228,7 +228,7 @@ def survives_missing_pixels(make: Make, cloud: Cloud) -> None:
 
 
 def refuses_an_empty_cloud(make: Make, cloud: Cloud) -> None:
-    """A cloud without any point is the user's mistake, told as a UserError; one with a single point is no crash."""
+    """A cloud without any point raises a UserError; a cloud with a single point causes no crash."""
     detector, gone = make(), np.ones_like(cloud.valid)
     for points in (0, 1):
         gone.reshape(-1)[np.flatnonzero(cloud.valid)[:points]] = False
@@ -265,13 +265,13 @@ def learns_plain_arrays(make: Make, cloud: Cloud) -> None:
         return
     before, clouds = Look.at(make(), cloud).everything(), [plane(seed=seed, damage=()) for seed in range(8)]
     learned, again = (dict(detector.calibrate([_with_arrays(one, _read_only) for one in clouds])) for _ in range(2))
-    require(_same(learned, again), "the second time the same clouds taught something else")
+    require(_same(learned, again), "the same clouds gave another learned state the second time")
     file = io.BytesIO()
     np.savez(file, **learned)  # type: ignore[arg-type]
     file.seek(0)
     with np.load(file, allow_pickle=False) as stored:
         restored = dict(stored)
-    require(_same(learned, restored), "what was learned is not the same once it is stored: no plain arrays")
+    require(_same(learned, restored), "what was learned changes when it is stored: it must be plain arrays")
     taught: Any = detector.calibrated(restored)
     require((taught.name, taught.version) == (detector.name, detector.version), "learning changed name or version")
     require(_same(before, Look.at(detector, cloud).everything()), "learning changed the detector that was asked")
@@ -309,13 +309,13 @@ def _sound(look: Look) -> None:
     for name in ("score", "residual_m", "surface_z_m"):
         image = np.asarray(getattr(evidence, name))
         require(image.shape == shape, f"`{name}` is an array of {image.shape}; the cloud's grid is {shape}")
-        require(image.dtype.kind == "f", f"`{name}` holds {image.dtype}, which knows no NaN")
+        require(image.dtype.kind == "f", f"`{name}` holds {image.dtype}, which cannot hold NaN")
     score, scale = evidence.score, float(evidence.scale_m)
     told = int(np.isfinite(score[~look.cloud.valid]).sum())
     require(told == 0, f"{told} pixels without a point have a score; NaN is wanted there")
     require(not np.isinf(score).any(), "a score is infinite")
     require(np.isfinite(score).any(), "no pixel has a score; where a cloud cannot be judged, a UserError is wanted")
-    require(np.isfinite(scale) and scale > 0, f"`scale_m` is {scale:g}: a length above 0 is wanted")
+    require(np.isfinite(scale) and scale > 0, f"`scale_m` is {scale:g}: it must be a length above 0")
 
 
 def _sound_findings(look: Look, *thresholds: float) -> None:
@@ -324,13 +324,13 @@ def _sound_findings(look: Look, *thresholds: float) -> None:
     low, high = points.min(axis=0) - CENTRE_MARGIN_M, points.max(axis=0) + CENTRE_MARGIN_M
     for finding in (each for threshold in thresholds for each in look.find(threshold)):
         pixels, centre = np.asarray(finding.pixels), np.asarray(finding.centre_m)
-        require(pixels.ndim == 1 and pixels.dtype.kind in "iu", "a finding's pixels are no (n,) whole numbers")
+        require(pixels.ndim == 1 and pixels.dtype.kind in "iu", "a finding's pixels are not a row of whole numbers")
         require(len(pixels) > 0, "a finding has no pixels")
         require((np.diff(pixels.astype(np.int64)) > 0).all(), "a finding's pixels do not ascend, or one is named twice")
         require(pixels[0] >= 0 and pixels[-1] < cloud.valid.size, "a finding's pixels reach beyond the cloud's grid")
         invalid = int((~cloud.valid.reshape(-1)[pixels]).sum())
         require(invalid == 0, f"{invalid} pixels of a finding have no point")
-        require(centre.shape == (3,) and np.isfinite(centre).all(), "a finding's `centre_m` is no (3,) finite numbers")
+        require(centre.shape == (3,) and np.isfinite(centre).all(), "a finding's `centre_m` is not 3 finite numbers")
         is_inside = bool(((low <= centre) & (centre <= high)).all())
         require(is_inside, f"a finding's centre {np.round(centre, 4).tolist()} m lies outside the cloud")
 

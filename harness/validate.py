@@ -13,29 +13,29 @@ from harness.vocabulary.program import program, whole_number
 
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--camera", action="append", default=[], metavar="NAME", help="this camera only; may be repeated")
+    add("--camera", action="append", default=[], metavar="NAME", help="only this camera; may be repeated")
     add("--out", type=Path, default=Path("results/validate"), metavar="DIR", help="default: results/validate")
     add("--jobs", type=whole_number(4096), default=2, metavar="N", help="worker processes (default: 2)")
-    add("--figures", type=Path, metavar="FILE", help="other published figures")
+    add("--figures", type=Path, metavar="FILE", help="a file with other published figures")
     capture = parser.add_argument_group("a real capture")
     put = capture.add_argument
-    put("--capture", type=Path, nargs="+", metavar="PATH", help="frames of a static scene, in any format of detect's")
+    put("--capture", type=Path, nargs="+", metavar="PATH", help="frames of a static scene, as read by harness.detect")
     add_reading(put)
-    put("--frames", type=whole_number(4096), metavar="N", help="use the first N frames only")
-    put("--mask", type=Path, metavar="PNG", help="use the pixels only that are not black here")
-    put("--board", type=Path, metavar="YAML", help="an experiment with a drilled board: set this beside the capture")
-    put("--albedo", type=float, default=0.8, metavar="A", help="of the captured surfaces (default 0.8, a light wall)")
+    put("--frames", type=whole_number(4096), metavar="N", help="use only the first N frames")
+    put("--mask", type=Path, metavar="PNG", help="use only the pixels that are not black in this image")
+    put("--board", type=Path, metavar="YAML", help="an experiment with a drilled board to compare with the capture")
+    put("--albedo", type=float, default=0.8, metavar="A", help="albedo of the surfaces (default: 0.8, a light wall)")
 
 
 @program(
     _options,
-    "Measure the simulated cameras as one measures real ones, and set each published figure beside "
-    "what the simulation gives. With --capture: set a real capture of a static scene beside the simulation of the "
+    "Measure the simulated cameras as real cameras are measured, and set each published figure beside "
+    "the simulated figure. With --capture: set a real capture of a static scene beside the simulation of the "
     "planes and edges in it.",
-    epilog="Exit code 1: a figure fails whose entry in the file of figures does not say why.",
+    epilog="The exit code is 1 if a figure fails and its entry in the file of figures gives no reason.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Returns 0, 1 where a figure fails and its entry does not say why, 2 on a user's mistake, 130 after Ctrl-C."""
+    """Returns 0, 1 where a figure fails and its entry gives no reason, 2 on a mistake of the user, 130 after Ctrl-C."""
     if options.capture or options.board:
         if options.figures:
             raise UserError("--figures belongs to the scorecard, not to a capture")

@@ -194,13 +194,13 @@ def test_the_exact_command_is_a_valid_experiment(stored: Path, capsys: pytest.Ca
     ("asked", "said"),
     [
         (["--size", "5mm"], "a question needs --size and --distance"),
-        (["--size", "5", "--distance", "1m"], "--size 5: no length with its unit"),
+        (["--size", "5", "--distance", "1m"], "--size 5: is not a length with a unit"),
         (["--size", "5mm", "--distance", "9m"], "not reach so far: distance 9 m: the atlas has 0.5 to 1.5 m\n"),
         (["--size", "5mm", "--distance", "1m", "--camera", "kinect"], "--camera kinect: not in the atlas"),
         (["--size", "5mm", "--distance", "1m", "--damage", "crack"], "--damage crack: not in the atlas\n  legal: hole"),
         (["--size", "5mm", "--distance", "1m", "--damage", "crak"], "did you mean 'crack'?"),
         (["--size", "5mm", "--distance", "1m", "--damage", "blind"], "--depth is missing"),
-        (["--size", "5mm", "--distance", "1m", "--depth", "2mm"], "--depth: the atlas has none for through-holes"),
+        (["--size", "5mm", "--distance", "1m", "--depth", "2mm"], "--depth: the atlas has no values for through-holes"),
     ],
 )
 def test_a_question_without_an_answer_is_refused(

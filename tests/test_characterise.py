@@ -226,8 +226,8 @@ def test_bad_input_is_one_message(tmp_path, capsys):
         ("short.npz", [], "2 frames; temporal noise needs repeats"),
         ("equal.npz", ["--albedo", "0"], "--albedo 0"),
         ("equal.npz", ["--rate", "-1"], "--rate -1"),
-        ("equal.npz", ["--about", "firmware=1"], "concern the certificate"),
-        ("equal.npz", ["--certificate", "--about", "firmware"], "is no KEY=TEXT"),
+        ("equal.npz", ["--about", "firmware=1"], "need --certificate"),
+        ("equal.npz", ["--certificate", "--about", "firmware"], "is not KEY=TEXT"),
         ("none.npz", [], "no such file"),
     ):
         assert characterise.main([str(tmp_path / name), *lens, *more]) == 2

@@ -89,7 +89,7 @@ def test_a_baseline_that_cannot_be_read_is_written_anew_by_update_alone(program,
     program.baseline.write_text(content)
     assert program(record()) == 2
     said = capsys.readouterr().err
-    assert f"{program.baseline}: {why}" in said and "to do: write it anew with --update" in said
+    assert f"{program.baseline}: {why}" in said and "to do: write a new one with --update" in said
     assert program.baseline.read_text() == content
     assert program(record(), "--update") == 0
     said = capsys.readouterr().out

@@ -477,7 +477,7 @@ def test_nothing_paired_is_said_with_what_there_is(tmp_path, capsys):
         (tmp_path / name).write_text(record_text(study))
     assert compare.main([str(tmp_path / "one.json"), str(tmp_path / "other.json"), "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr()
-    assert "nothing could be paired" in said.err and "a, 1 frame; b, 1 frame / c, 5 frames; d, 9 frames" in said.err
+    assert "no set-ups can be paired" in said.err and "a, 1 frame; b, 1 frame / c, 5 frames; d, 9 frames" in said.err
     assert not said.out and not (tmp_path / "out").exists()
 
 

@@ -214,7 +214,7 @@ def test_a_cloud_without_a_grid_works_too(tmp_path: Path, capsys: pytest.Capture
     assert finding["size_from"] == "extent" and finding["depth_from"] == "extreme residual"
     assert finding["u_px"] is None
     said = capsys.readouterr().out
-    assert "1.0 false calls expected, 95 % interval 0.03 to 4.0" in said and "single points" in said
+    assert "1.0 false calls expected, 95 % interval 0.03 to 4.0" in said and "unorganised points" in said
 
 
 @pytest.mark.usefixtures("unpictured")

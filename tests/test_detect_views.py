@@ -82,7 +82,7 @@ def test_three_views_become_one_cloud_and_the_hole_is_in_its_place(
     out = tmp_path / "new" / "out"
     assert detect.main([*views, "--register", "marks", "--out", str(out), *SHARP]) == 0
     said = capsys.readouterr().out
-    assert "marks: 5 of 5 to be relied on" in said and "merged: 3 views" in said
+    assert "marks: 5 of 5 are reliable" in said and "merged: 3 views" in said
     pictures = [f"targets-{number}.png" for number in (1, 2, 3)]
     assert sorted(path.name for path in out.iterdir()) == sorted((*FILES, *pictures))
     assert said.count("target 1 of 1: ") == 3
@@ -135,7 +135,7 @@ def test_other_methods_start_from_the_marks_where_nobody_says_where_views_stand(
 ) -> None:
     few = ["--false-calls", "0.01"]
     assert detect.main([*views[:2], "--register", method, "--out", str(tmp_path / "out"), *few]) == 0
-    assert "starts from where" not in capsys.readouterr().out
+    assert "starts from the pose of" not in capsys.readouterr().out
     row = json.loads((tmp_path / "out" / "registrations.json").read_text())["views"][1]
     assert row["method"] == method
     assert np.abs(error_m(row["T_reference_view"], 1)).max() < 2e-3
@@ -241,7 +241,7 @@ def test_views_without_overlap_are_refused(
 @pytest.mark.parametrize(
     ("arguments", "told"),
     (
-        (("--register", "nominal"), "there are none"),
+        (("--register", "nominal"), "none are stated"),
         (("--register", "marks", "--quiet-capture", "x"), "--quiet-capture is one cloud"),
         (("--register", "marks", "--poses", "nowhere"), "nowhere: cannot be read"),
         (("--register", "marks", "--set", "mapping.merge.cell=1"), "unknown key `cell` in `mapping.merge`"),
@@ -252,7 +252,7 @@ def test_views_without_overlap_are_refused(
         (("--register", "marks", "--set", "surface.degre=1"), "unknown key `degre` in `surface`"),
         (("--register", "marks", "--crop", "box:0,1,0,1,0,1"), "view view_0: the crop box"),
         (("--register", "marks", "--threshold", "0"), "above 0"),
-        (("--register", "marks", "--topic", "points2"), "is no ROS bag"),
+        (("--register", "marks", "--topic", "points2"), "is not a ROS bag"),
         (("--merge", "grid"), "--merge: concerns several views"),
         (("--marks", "red"), "--marks: concerns several views"),
         (("--poses", "x"), "--poses: concerns several views"),
@@ -267,8 +267,8 @@ def test_a_mistake_is_one_message_and_leaves_nothing(
 
 
 def test_one_view_is_none_too_many(views: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert "1 view to register" in failed(capsys, views[0], "--register", "marks")
-    assert "1 view to register" in failed(capsys, *views, "--register", "marks", "--set", "mapping.views=1")
+    assert "1 view cannot be registered" in failed(capsys, views[0], "--register", "marks")
+    assert "1 view cannot be registered" in failed(capsys, *views, "--register", "marks", "--set", "mapping.views=1")
 
 
 def test_several_captures_are_no_list_of_frames_and_no_capture_counts_twice(
@@ -314,13 +314,13 @@ def test_poses_are_read_in_both_forms(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "told"),
     (
-        ("[[1, 2], [3, 4]]", "pose 0 is no rigid 4x4 transform"),
-        (json.dumps([np.eye(4).tolist(), np.diag([1, 1, -1, 1]).tolist()]), "pose 1 is no rigid 4x4 transform"),
-        (json.dumps([np.eye(4).tolist(), np.diag([2, 2, 2, 1]).tolist()]), "pose 1 is no rigid 4x4 transform"),
-        (json.dumps([np.eye(4).tolist(), np.diag([1, 1, 1, 2]).tolist()]), "pose 1 is no rigid 4x4 transform"),
+        ("[[1, 2], [3, 4]]", "pose 0 is not a rigid 4x4 transform"),
+        (json.dumps([np.eye(4).tolist(), np.diag([1, 1, -1, 1]).tolist()]), "pose 1 is not a rigid 4x4 transform"),
+        (json.dumps([np.eye(4).tolist(), np.diag([2, 2, 2, 1]).tolist()]), "pose 1 is not a rigid 4x4 transform"),
+        (json.dumps([np.eye(4).tolist(), np.diag([1, 1, 1, 2]).tolist()]), "pose 1 is not a rigid 4x4 transform"),
         (
             json.dumps([[[float("inf")] * 4] * 4] * 2).replace("Infinity", "1e999"),
-            "pose 0 is no rigid 4x4 transform",
+            "pose 0 is not a rigid 4x4 transform",
         ),
         (json.dumps([[[float("nan")] * 4] * 4] * 2), "holds no poses (NaN is no number of JSON)"),
         ("[[[" + "9" * 400 + "]]]", "holds no poses (int too large"),
@@ -333,9 +333,9 @@ def test_poses_are_read_in_both_forms(tmp_path: Path) -> None:
         ("[", "holds no poses"),
         ("0 0 0 0 0 0 0 1\n1 0 0 340 0 0 0 1", "pose 1 is 340 m from pose 0 .. metres, not millimetres"),
         ("0 0 0 0 0 0 0 1\n1 1.7e308 -1.7e308 1 0 0 0 1", "pose 1 is inf m from pose 0"),
-        ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 1", ":2: is no pose"),
-        ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 2", ":2: is no pose"),
-        ("0 0 0 0 0 0 0 one", ":1: is no pose"),
+        ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 1", ":2: is not a pose"),
+        ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 2", ":2: is not a pose"),
+        ("0 0 0 0 0 0 0 one", ":1: is not a pose"),
         ("", "0 poses for 2 views"),
     ),
 )

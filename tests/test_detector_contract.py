@@ -354,7 +354,7 @@ BROKEN: list[tuple[Callable[..., None], type[Sound], str]] = [
     (checks.gives_the_same_twice, OtherScore, "`measure` says score 0"),
     (checks.survives_pickling, Unpicklable, "pickle|local object"),
     (checks.survives_pickling, LosesItself, "a detector that was pickled gave another result"),
-    (checks.learns_plain_arrays, LearnsAnew, "taught something else"),
+    (checks.learns_plain_arrays, LearnsAnew, "another learned state"),
     (checks.learns_plain_arrays, LearnsObjects, "allow_pickle"),
     (checks.turns_with_the_cloud, AlongRows, "turned by 90 degrees, a score changed"),
     (checks.turns_with_the_cloud, LooksAtX, "turned by 90 degrees, a finding's centre"),

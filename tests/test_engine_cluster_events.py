@@ -208,7 +208,7 @@ def test_a_node_that_dies_while_it_is_looked_at_is_passed_over(client, capsys):
     engine = engine_with(client)
     client.nodes = {FIRST: ValueError("half an answer"), SECOND: facts()}
     stepped(engine, lambda: engine._nodes)
-    stepped(engine, lambda: "first:1 did not say what it is" in capsys.readouterr().err)
+    stepped(engine, lambda: "first:1 did not state its version" in capsys.readouterr().err)
     assert list(engine._nodes) == [SECOND]
 
 

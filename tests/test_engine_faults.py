@@ -165,7 +165,7 @@ def test_a_second_sweep_in_the_same_folder_is_refused(home):
     with locked(folder):
         done = run(home, "calm")
     assert (done.returncode, "Traceback" in done.stderr) == (2, False)
-    assert "another sweep is at work in this folder" in done.stderr
+    assert "another sweep is running in this folder" in done.stderr
     assert content(folder) == before
     assert run(home, "calm").returncode == 0
 

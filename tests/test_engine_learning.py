@@ -75,7 +75,7 @@ def test_the_contract_of_a_detector_that_learns_is_checked() -> None:
             Shifting.seen += 1
             return {"scales_m": np.full(3, 1e-3 * Shifting.seen)}
 
-    with pytest.raises(AssertionError, match="the second time the same clouds taught something else"):
+    with pytest.raises(AssertionError, match="the same clouds gave another learned state the second time"):
         learns_plain_arrays(lambda: Shifting(Shifting.settings_type()), plane(seed=1))
 
 

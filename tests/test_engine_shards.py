@@ -91,7 +91,7 @@ def test_a_shard_renders_only_what_it_needs(home):
 
 @pytest.mark.parametrize("text", ["0/3", "4/3", "3", "a/b", "-1/3", "1/0", "1/3/5", "1/100001"])
 def test_shards_that_are_no_part_are_refused(text):
-    with pytest.raises(UserError, match="no part of a whole"):
+    with pytest.raises(UserError, match="is not a part"):
         Shard.of(text)
 
 
@@ -100,7 +100,7 @@ def test_the_same_shard_twice_or_beside_a_whole_sweep_is_refused(tmp_path):
         with locked(tmp_path, Shard(2, 3)):
             pass
         for other in (Shard(1, 3), Shard(1, 1)):
-            with pytest.raises(UserError, match="another sweep is at work"), locked(tmp_path, other):
+            with pytest.raises(UserError, match="another sweep is running"), locked(tmp_path, other):
                 pass
     with locked(tmp_path):
         pass
@@ -121,9 +121,9 @@ def test_merging_twice_copies_once(two, capsys):
     other, into = two
     assert merge.main([str(other), "--into", str(into)]) == 0
     count = len(Journal(other / "journal"))
-    assert f"{count} trials copied, 0 were there" in capsys.readouterr().out
+    assert f"{count} trials copied, 0 were already there" in capsys.readouterr().out
     assert merge.main([str(other), "--into", str(into)]) == 0
-    assert f"0 trials copied, {count} were there" in capsys.readouterr().out
+    assert f"0 trials copied, {count} were already there" in capsys.readouterr().out
     assert not [path for path in into.rglob("*.part*")]
 
 
@@ -165,7 +165,7 @@ def test_mistakes_in_merging(two, tmp_path, capsys):
         ([str(tmp_path / "empty"), "--into", str(into)], "has no journal"),
         ([str(other), "--into", str(other)], "is the folder to merge into"),
         ([str(other), str(stranger), "--into", str(into)], "different experiments"),
-        ([str(other), "--into", str(tmp_path / "elsewhere")], "looked for in a folder of that name"),
+        ([str(other), "--into", str(tmp_path / "elsewhere")], "must be in a folder of that name"),
     ):
         assert merge.main(arguments) == 2
         assert said in capsys.readouterr().err

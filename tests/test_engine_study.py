@@ -43,7 +43,7 @@ def written(folder: Path, text: str = STUDY) -> Path:
 @pytest.mark.parametrize(
     ("changed", "expected"),
     [
-        ("study=null", "a family of boards is for a study"),
+        ("study=null", "a family of boards needs a study"),
         ("source.target={name: thesis}", "a study needs a family of boards"),
         ("threshold.calibrate={repeats: 5}", "a study's threshold is set on boards of their own"),
         ("threshold.calibrate={boards: 5, false_calls_per_m2: 1.0}", "cannot show 1 false calls per m2"),

@@ -68,7 +68,7 @@ def test_a_capture_is_known_by_its_content(folder: Path, tmp_path_factory: pytes
         ("[frames]", "[frmes]", ["2:33:", "frmes: there is no such file or folder", "did you mean: frames"]),
         ("frames], ", "frames], unit: feet, ", ["2:32:", "feet: no such unit"]),
         ("intrinsics: azure_kinect_nfov", "intrinsics: nothing.json", ["2:54:", "neither a file nor a camera"]),
-        (", intrinsics: azure_kinect_nfov", "", ["2:32:", "nothing says which lens"]),
+        (", intrinsics: azure_kinect_nfov", "", ["2:32:", "the lens of these depth images is unknown"]),
         ("{k: 3.5}", "{calibrate: {repeats: 5}}", ["5:24: a threshold can be calibrated only on hole-free repeats"]),
     ],
 )

@@ -148,7 +148,7 @@ def test_override_values_are_yaml_and_have_their_place() -> None:
         ("target.distances.4=1", "the list has no item 4; it has 1, counted from 0"),
         ("target.nothing.albedo=1", "--set: `target.nothing` is null here, which has no `albedo`"),
         ("frames", "--set: not of the form path=value"),
-        ("frames=", "to do: write null for nothing"),
+        ("frames=", "to do: write null for no value"),
         ("=3", "--set: not of the form path=value"),
         ("frames={a: 1, a: 2}", "--set: duplicate key `a`\n      | frames={a: 1, a: 2}\n      |               ^"),
     ],

@@ -292,7 +292,7 @@ def test_the_program_refuses_what_makes_no_flat_field(recorded, tmp_path, capsys
     single = tmp_path.parent / "single.npy"
     np.save(single, np.load(one)[:1])
     for arguments, message in (
-        ([one, "--unit", "m", "--out", "unit.npz"], "nothing says which lens"),
+        ([one, "--unit", "m", "--out", "unit.npz"], "the lens of these depth images is unknown"),
         ([one, *lens, "--out", "unit.png"], "a name that ends in .npz"),
         ([one, *lens, "--crop", "sphere", "--out", "unit.npz"], "no such crop"),
         ([one, one, *lens, "--out", "unit.npz"], "is named twice"),

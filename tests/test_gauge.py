@@ -243,7 +243,7 @@ def test_the_combined_limit_covers_the_truth_of_a_camera_that_the_study_has_wron
 @pytest.mark.parametrize(
     ("wrong", "word"),
     [
-        (["--a50", "5"], "told once"),
+        (["--a50", "5"], "exactly one curve"),
         (["--diameters", "12:2", "--a50", "5", "--a90", "7"], "--diameters"),
         (["--a50", "5", "--a90", "7", "--board", "60x60"], "a larger --board"),
         (["--a50", "5", "--a90", "7", "--board", "big"], "280x190|270x175"),

@@ -330,7 +330,7 @@ def test_lenses_as_other_programs_write_them(tmp_path: Path, text: str, distorti
 def test_pictures_beside_clouds_are_told(tmp_path: Path) -> None:
     plane.write_pcd(tmp_path / "c.pcd", plane.points_m(plane.depth_mm()))
     cv2.imwrite(str(tmp_path / "1.png"), plane.depth_mm())
-    assert "1 pictures or arrays beside the .pcd files are not read" in open_capture([tmp_path]).notes
+    assert "1 pictures or arrays beside the .pcd files are ignored" in open_capture([tmp_path]).notes
 
 
 @pytest.mark.parametrize("suffix", (".npy", ".tiff", ".pfm"))
@@ -439,7 +439,7 @@ def test_lists_of_points_in_every_dialect(tmp_path: Path, head: str, apart: str,
     path = plane.write_points(tmp_path / "c.txt", TRUE_M, head, apart, rest)
     recording = open_capture([path])
     frame = next(recording.frames())
-    assert not recording.organised and "single points" in recording.notes[0]
+    assert not recording.organised and "unorganised points" in recording.notes[0]
     np.testing.assert_allclose(points_of(recording, frame)[0], TRUE_M.reshape(-1, 3), atol=1e-6)
     assert (frame.rgb is not None) == ("16" in rest) and (frame.amplitude is not None) == ("7" in rest.split("0.7")[0])
     if frame.rgb is not None:

@@ -146,7 +146,7 @@ def test_faulty_recordings_are_explained(tmp_path: Path) -> None:
         (tmp_path / "cut.mkv").write_bytes(content[: int(part * len(content))])
         assert "cut.mkv" in refusal(tmp_path / "cut.mkv") and "truncated" in refusal(tmp_path / "cut.mkv")
     assert "no DEPTH track (its tracks: IR)" in refusal(plane.write_mkv(tmp_path / "ir.mkv", [{"IR": DEPTH}]))
-    assert "which lens" in refusal(plane.write_mkv(tmp_path / "bare.mkv", [{"DEPTH": DEPTH}]))
+    assert "lens of these depth images" in refusal(plane.write_mkv(tmp_path / "bare.mkv", [{"DEPTH": DEPTH}]))
     odd = plane.write_mkv(tmp_path / "odd.mkv", [{"DEPTH": DEPTH}], "PASSIVE_IR", plane.calibration())
     assert "PASSIVE_IR" in refusal(odd) and "NFOV_UNBINNED" in refusal(odd)
     wrong = plane.write_mkv(tmp_path / "wrong.mkv", [{"DEPTH": DEPTH}], "WFOV_UNBINNED", plane.calibration())

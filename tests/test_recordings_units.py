@@ -74,7 +74,7 @@ def test_no_return_is_said_and_left_out(tmp_path: Path) -> None:
     recording = opened(tmp_path / "c", stored)
     frame = next(recording.frames())
     assert (frame.reason[:7] == Reason.NO_RETURN).all() and np.isfinite(frame.z_m[7:]).all()
-    assert "65535 taken as no return, 9.7 % of pixels" in recording.notes
+    assert "65535 is read as no return, 9.7 % of pixels" in recording.notes
 
 
 def test_a_cloud_that_looks_backwards_is_turned_and_said(tmp_path: Path) -> None:

@@ -117,5 +117,5 @@ def test_mistakes_are_told(tmp_path: Path) -> None:
     given = ["capture", "--reference", str(path), "--set", "surface.reference.unit=cm"]
     _, settings = detector_of(main.parser().parse_args(given), "none", ["surface.reference.unit=cm"])
     assert settings["surface"]["reference"] == {"file": str(path), "unit": "cm", "front": "+z"}
-    with pytest.raises(UserError, match="has no surface"):
+    with pytest.raises(UserError, match="has no surface setting"):
         detector_of(main.parser().parse_args([*given, "--detector", "plane_ransac"]), "none", [])

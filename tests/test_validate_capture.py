@@ -115,7 +115,7 @@ def test_one_frame_is_refused(tmp_path, capsys):
 
 def test_another_size_a_wrong_camera_and_a_missing_lens_are_refused(tmp_path, capsys):
     capture = recorded(tmp_path / "frames", plane_view(AZURE, REGION, 1.0, 0.8, 0.05, 0.02))
-    assert "nothing says which lens" in refused(["--capture", str(capture)], capsys)
+    assert "the lens of these depth images is unknown" in refused(["--capture", str(capture)], capsys)
     lens = tmp_path / "lens.json"
     lens.write_text(json.dumps({"fx": 300, "fy": 300, "cx": 100, "cy": 80}))
     small = tmp_path / "small"
@@ -127,7 +127,7 @@ def test_another_size_a_wrong_camera_and_a_missing_lens_are_refused(tmp_path, ca
     told = refused(["--capture", str(small), "--intrinsics", str(lens), "--camera", "azure_kinect_nfov"], capsys)
     assert "the capture has 200 x 160 pixels, but azure_kinect_nfov has 640 x 576" in told
     told = refused(["--capture", str(capture), "--intrinsics", "azure_kinect_nfov", "--mask", str(lens)], capsys)
-    assert "no image that can be read" in told and "neither as PNG nor as JPEG" in told
+    assert "no image that can be read" in told and "neither PNG nor JPEG" in told
 
 
 def test_nothing_flat_is_refused(tmp_path, capsys):

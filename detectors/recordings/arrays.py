@@ -27,7 +27,7 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import RAISE, refuse_bytes, refuse_pixels
 from harness.vocabulary.geometry import Frame, Lens, Reason
 
-LEGAL_ARRAYS = "numeric arrays as numpy.save or numpy.savez write them, no objects"
+LEGAL_ARRAYS = "numeric arrays as written by numpy.save or numpy.savez, without objects"
 LEGAL_MAT = "MATLAB 5 to 7 files (-v6, -v7) of numeric arrays: Location (h, w, 3), (n, 3) or (k, n, 3), and Color"
 LEGAL_RAW = (
     "--raw WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]]: TYPE u2 (the default), >u2, u4, f4 ..; STEP bytes from pixel to pixel; "
@@ -49,7 +49,7 @@ def load_npy(path: Path) -> dict[str, np.ndarray]:
 
 
 def load_npz(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of an ``.npz`` file by name. Raises UserError where it is broken, too large, or of objects."""
+    """Return the arrays of an ``.npz`` file by name. Raises UserError where it is broken, too large, or has objects."""
     with damage_told(f"{path}: cannot be read as arrays", LEGAL_ARRAYS):
         with zipfile.ZipFile(path) as archive:
             stated = sum(entry.file_size for entry in archive.infolist())
@@ -64,7 +64,7 @@ def load_mat(path: Path) -> dict[str, np.ndarray]:
     for -v7.3 (HDF5), for objects such as ``pointCloud``, and for a broken file."""
     import scipy.io
 
-    fix = f"save it with '-v7', not '-v7.3', and of a cloud pc its arrays: {EXPORT}"
+    fix = f"save it with '-v7', not '-v7.3'; save the arrays of a point cloud pc: {EXPORT}"
     with damage_told(f"{path}: cannot be read as a MATLAB file", LEGAL_MAT, fix):
         try:
             # cells and structs hold no frames, and nested deeply enough they end the process without a word
@@ -93,7 +93,7 @@ def load_picture(path: Path) -> dict[str, np.ndarray]:
         with damage_told(f"{path}: cannot be read", LEGAL_PICTURES):
             is_read, pages = cv2.imreadmulti(str(path), flags=cv2.IMREAD_UNCHANGED)
             if not is_read or not pages:
-                raise ValueError("it is damaged, or of another kind than its name says")
+                raise ValueError("it is damaged, or its type does not match its name")
             stack = np.stack(pages)
             if stack.ndim == 4 and (stack.dtype.kind != "f" or stack.shape[3] != 3):
                 raise ValueError(f"{stack.shape[3]} channels of {stack.dtype}, which is a picture")
@@ -128,7 +128,7 @@ class RawLoader:
         """Parse WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]]. Raises UserError for anything else."""
         match = re.fullmatch(r"(\d{1,5})x(\d{1,5})(?::([<>]?[uif][248])(?:/(\d{1,3}))?)?(?::(\d{1,12}))?", text)
         if match is None:
-            raise UserError(f"--raw {text}: no such layout", legal=LEGAL_RAW)
+            raise UserError(f"--raw {text}: is not a layout", legal=LEGAL_RAW)
         width, height, kind, step, offset = match.groups()
         refuse_pixels(f"--raw {text}", int(width), int(height))
         kind = kind or "u2"
@@ -149,11 +149,11 @@ class RawLoader:
         return {"": np.ndarray((size // frame, self.height, self.width), kind, content, strides=strides)}
 
     def refuse_doubtful(self, path: Path, frames: np.ndarray) -> int:
-        """Return the bytes left over after the frames. Raises UserError where neighbours differ as no surface's do."""
+        """Return the bytes left over after the frames. Raises UserError where neighbours differ too much."""
         rough = _apart(frames[0][:, 1:], frames[0][:, :-1])
         if not rough < NEIGHBOURS:
             what = f"in this layout the median pixel differs from its neighbour by {100 * rough:.3g} %"
-            raise UserError(f"{path}: {what}: the layout is another", legal=LEGAL_RAW, fix=raw_layout_of(path).fix)
+            raise UserError(f"{path}: {what}: this layout is wrong", legal=LEGAL_RAW, fix=raw_layout_of(path).fix)
         return (path.stat().st_size - self.offset) % (self.width * self.height * self.step)
 
 
@@ -231,7 +231,7 @@ def _refuse_other_planes(name: str, key: str, frames: np.ndarray, left_over: int
         more = f" and {left_over} bytes more" * bool(left_over)
         what = f"{name}: {len(frames)} planes{more}; the median pixel differs by"
         what += f" {100 * worst:.3g} % from plane to plane: depth beside x and y, colour, brightness or confidence?"
-        fix = f"choose the plane with the depth by its number from 0: --array {key}:N"
+        fix = f"choose the plane that holds depth by its number from 0: --array {key}:N"
         raise UserError(what, legal="frames of one scene, or one plane", fix=fix)
 
 
@@ -245,7 +245,7 @@ def _stack(path: Path, load: ArraysLoader, asked: Asked) -> Stack:
     if array.ndim == 4 and 1 in array.shape[1::2]:  # (n, 1, h, w) or (n, h, w, 1), as networks take images
         array = array.squeeze(axis=1 if array.shape[1] == 1 else 3)
     if _frames_are_last(array):
-        note = f"{name} {array.shape}: the frames are taken to lie along the last axis"
+        note = f"{name} {array.shape}: the frames are assumed to lie along the last axis"
         array = np.moveaxis(array, -1, 0)
     has_points, shape, organised = _axes(name, array.shape, asked.lens)
     refuse_pixels(name, shape[2], shape[1])
@@ -301,7 +301,7 @@ def _named_array(name: str, arrays: Arrays, usual: Sequence[str], asked: str | N
     if number:
         array = np.moveaxis(array, -1, 0) if _is_deep(array) and array.shape[2] != 3 else array
         if not number.isdigit() or array.ndim < 3 or int(number) >= len(array):
-            raise UserError(f"--array {asked}: no such part of {name} {array.shape}", legal="NAME, or NAME:0 and up")
+            raise UserError(f"--array {asked}: no such part of {name} {array.shape}", legal="NAME, or NAME:0 onwards")
         array, name = array[int(number)], f"{name if key else name + ': '}:{number}"
     refuse_narrow(name, array.dtype)
     return name, array
@@ -319,8 +319,8 @@ def _axes(name: str, shape: tuple[int, ...], lens: Lens | None) -> tuple[bool, t
     n, *grid = (1, 1, *(shape[:-1] if has_points else shape))[-3:]
     is_table = len(shape) == 2 and min(shape) < FEWEST_ROWS
     if (len(shape) == 4 and not has_points) or len(shape) not in (2, 3, 4) or is_table:
-        fix = "of points in rows with more numbers, save x, y and z alone: array[:, :3]" if is_table else None
-        raise UserError(f"{name}: axes {shape} are no capture's", legal=LEGAL_AXES, fix=fix)
+        fix = "if rows hold more numbers than x, y and z, save only these: array[:, :3]" if is_table else None
+        raise UserError(f"{name}: a shape of {shape} is not a capture", legal=LEGAL_AXES, fix=fix)
     return has_points, (n, grid[0], grid[1]), True
 
 
@@ -337,18 +337,18 @@ def _open_height_map(path: Path, load: ArraysLoader, asked: Asked) -> Recording:
     pitch_m = float(match.group(1)) * UNITS_M[match.group(2)] if match else math.nan
     if not 1e-7 <= pitch_m <= 1:
         legal = "the distance between pixels with its unit, for instance 0.5mm, 200um or 0.001m"
-        raise UserError(f"--pitch {asked.pitch}: no such length", legal=legal)
+        raise UserError(f"--pitch {asked.pitch}: is not a length", legal=legal)
     name, heights = _map_in(path, load, asked.array)
     known = heights[np.isfinite(heights)].astype(np.float64)
     if known.size == 0:
-        raise UserError(f"{name}: not one finite height", legal="numbers; NaN where there is none")
+        raise UserError(f"{name}: has no finite height", legal="numbers, and NaN where there is no height")
     relief = float(np.ptp(np.quantile(known, (0.01, 0.99))))
     height, width = heights.shape
     side_m = min(height, width) * pitch_m
     plausible = (UNITS_M[u] for u in ("mm", "m", "um") if RELIEF[0] <= relief * UNITS_M[u] / side_m < RELIEF[1])
     scale_m = next(plausible, None) if asked.scale_m is None else asked.scale_m
     if scale_m is None:
-        what = f"{name}: nothing tells the unit of its heights: they span {relief:.4g} over {1e3 * side_m:.4g} mm"
+        what = f"{name}: the unit of its heights is not stated: they span {relief:.4g} over {1e3 * side_m:.4g} mm"
         raise UserError(what, fix="state it: --unit mm, --unit m or --unit um")
     is_down = name.rpartition(" ")[2].partition(":")[0].lower() in DOWN_NAMES
     direction = "grow away from the viewer, as its name says" if is_down else "grow towards the viewer: holes are low"
@@ -385,6 +385,6 @@ def _map_in(path: Path, load: ArraysLoader, array: str | None) -> tuple[str, np.
         raise UserError(what, legal="one map: different maps are not averaged", fix=fix)
     if values.ndim != 2 or min(values.shape) < 2:
         legal = "(h, w), or (n, h, w) with --array NAME:NUMBER"
-        raise UserError(f"{name}: axes {values.shape} are no height map's", legal=legal)
+        raise UserError(f"{name}: a shape of {values.shape} is not a height map", legal=legal)
     refuse_pixels(name, values.shape[1], values.shape[0])
     return name, values

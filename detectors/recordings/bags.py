@@ -81,8 +81,8 @@ class Bag:
 
     def _readable(self) -> AbstractContextManager[None]:
         mend = f"rosbag reindex {self.path}" if self._is_ros1 else "ros2 bag reindex, or mcap recover"
-        what = f"{', '.join(map(str, self.files))}: is truncated or damaged, or is no bag"
-        return damage_told(what, LEGAL_BAG, f"copy it again; of a recording that was cut off: {mend}")
+        what = f"{', '.join(map(str, self.files))}: is truncated or damaged, or is not a bag"
+        return damage_told(what, LEGAL_BAG, f"copy it again; if the recording was cut off, run: {mend}")
 
     @contextmanager
     def _opened(self) -> Iterator[Reader | Ros1Reader]:
@@ -127,16 +127,16 @@ def find_bag(path: Path) -> Bag:
         what = f"{path}: has no {METADATA} (the recorder writes it when it stops), but {', '.join(held)}"
         raise UserError(what, legal=LEGAL_BAG, fix="name that file itself, or run: ros2 bag reindex")
     fix = "copy it again, name the .db3 or .mcap itself, or run: ros2 bag reindex"
-    with damage_told(f"{metadata}: is no description of a ROS 2 bag, or is cut off", LEGAL_BAG, fix):
+    with damage_told(f"{metadata}: is not a description of a ROS 2 bag, or is cut off", LEGAL_BAG, fix):
         told = read_yaml(metadata).data["rosbag2_bagfile_information"]
         files = tuple(path / Path(name).name for name in told["relative_file_paths"])
         mode = str(told.get("compression_mode") or "none").lower()
     if mode == "file":
         fix = f"unpack it (zstd -d {files[0] if files else path}) and name the unpacked file"
-        raise UserError(f"{path}: its files are compressed whole", legal=LEGAL_BAG, fix=fix)
+        raise UserError(f"{path}: its files are compressed as a whole", legal=LEGAL_BAG, fix=fix)
     absent = [file.name for file in files if not (file.is_file() and file.suffix.lower() in BAG_SUFFIXES)]
     if absent or not files:
-        what = f"{METADATA} names {', '.join(absent) or 'no file'}, which is not there, or of no kind that is read"
+        what = f"{METADATA} names {', '.join(absent) or 'no file'}, which is missing or is not a file that can be read"
         raise UserError(f"{path}: {what}", legal=LEGAL_BAG, fix="copy the whole folder again")
     return Bag(path, files, metadata)
 
@@ -183,8 +183,8 @@ def _open_clouds(bag: Bag, topic: str, asked: Asked) -> Recording:
             what = f"clouds of {width} x {height} points, but the lens is of {lens.width} x {lens.height}"
             raise UserError(f"{bag.path}: {what}")
         if (off := _off_ray_px(lens, first)) > RAY_TOLERANCE_PX:
-            what = f"the named lens is not that of these points: they lie up to {off:.2g} pixels beside its rays"
-            fix = "leave --intrinsics out: the points are used as they stand"
+            what = f"the named lens does not fit these points: they lie up to {off:.2g} pixels beside its rays"
+            fix = "leave --intrinsics out: the points are then used as they are stored"
             raise UserError(f"{bag.path}: {what}", fix=fix)
     elif height == 1:
         note = NO_GRID
@@ -289,13 +289,13 @@ def _lens_of_images(bag: Bag, topic: str, shape: tuple[int, ...]) -> Lens:
             return lens
         why.append(f"{info} {lens}")
     told = "; ".join(why) or f"no CameraInfo lies beside {topic} (the bag's: {', '.join(every) or 'none'})"
-    what = f"{bag.path}: {told}: nothing says which lens took these depth images, and without it they are no points"
+    what = f"{bag.path}: {told}: the lens of these depth images is unknown; without it they give no points"
     fix = f"pass --intrinsics FILE{', or the rectified topic by --topic' if why else ''}"
     raise UserError(what, legal=LEGAL_LENS, fix=fix)
 
 
 def lens_of_info(message: Any, shape: tuple[int, ...], is_rectified: bool = False) -> Lens | str:
-    """Return the lens of a CameraInfo for images of a shape (h, w), or why it is none of theirs. A rectified image has
+    """Return the lens of a CameraInfo for images of a shape (h, w), or why it does not fit. A rectified image has
     the lens P and no distortion. K and P are of the whole sensor: binning and the region of interest are taken off."""
     d, k, p = (np.asarray(getattr(message, key, getattr(message, key.upper(), ())), float) for key in ("d", "k", "p"))
     d = np.zeros(0) if is_rectified or not d.any() else d
@@ -306,10 +306,10 @@ def lens_of_info(message: Any, shape: tuple[int, ...], is_rectified: bool = Fals
     if (height // down, width // across) != tuple(shape):
         return f"is for images of {width // across} x {height // down} pixels, not {shape[1]} x {shape[0]}"
     if d.size and (model.lower() not in KNOWN_MODELS or d.size not in (4, 5, 8, 12, 14) or d[8:].any()):
-        return f"has the distortion model {model or '(none)'} with {d.size} numbers, which is not read"
+        return f"has the distortion model {model or '(none)'} with {d.size} numbers, which is not supported"
     fx, fy, cx, cy = p[[0, 5, 2, 6]] if is_rectified and p.size == 12 and p[0] > 0 else k[[0, 4, 2, 5]]
     if not np.isfinite([*d, fx, fy, cx, cy]).all() or not (fx > 0 and fy > 0):
-        return f"states the focal length {fx:g}, {fy:g}, as of a camera that is not calibrated"
+        return f"states the focal length {fx:g}, {fy:g}, as an uncalibrated camera does"
     # pixel positions count from the first pixel's centre, which lies half a pixel inside
     cx, cy = (cx - roi.x_offset + 0.5) / across - 0.5, (cy - roi.y_offset + 0.5) / down - 0.5
     distortion = tuple(float(x) for x in np.pad(d[:8], (0, 8 - min(d.size, 8))))

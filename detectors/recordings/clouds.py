@@ -121,7 +121,7 @@ def _ply_header(path: Path, content: bytes) -> tuple[int, int, int]:
     """Return width, height (1 without a grid) and the least number of bytes of the file that the header promises."""
     end = re.search(rb"end_header\r?\n", content)
     if not content.startswith(b"ply") or end is None:
-        raise UserError(f"{path}: is no PLY, or its header is cut off", legal=LEGAL_CLOUD)
+        raise UserError(f"{path}: is not a PLY file, or its header is cut off", legal=LEGAL_CLOUD)
     lines = content[: end.start()].decode("latin1").split("\n")
     points, bytes_each, element, names = 0, 0, "", list[str]()
     for words in (line.split() for line in lines if line.strip()):
@@ -146,13 +146,13 @@ def _pcd_header(path: Path, content: bytes) -> tuple[int, int, int]:
     """Return the same of a PCD."""
     end = re.search(rb"^DATA\s+(\w+)\s*?\r?\n", content, re.MULTILINE)
     if end is None:
-        raise UserError(f"{path}: is no PCD, or its header is cut off", legal=LEGAL_CLOUD)
+        raise UserError(f"{path}: is not a PCD file, or its header is cut off", legal=LEGAL_CLOUD)
     lines = content[: end.start()].decode("latin1").split("\n")
     fields = {words[0]: words[1:] for line in lines if (words := line.split()) and not line.startswith("#")}
 
     def count(text: str) -> int:
         if not COUNT.fullmatch(text):
-            raise ValueError(f"{text[:20]!r} is no count")
+            raise ValueError(f"{text[:20]!r} is not a count")
         return int(text)
 
     with damage_told(f"{path}: its PCD header cannot be read", LEGAL_CLOUD):
@@ -180,7 +180,7 @@ def _pcd_header(path: Path, content: bytes) -> tuple[int, int, int]:
     return width, height, end.end() + least
 
 
-LEGAL_LIST = "a point a line: x y z [intensity] [red green blue], apart by blanks, tabs, commas or semicolons"
+LEGAL_LIST = "one point per line: x y z [intensity] [red green blue], separated by blanks, tabs, commas or semicolons"
 MOST_COLUMNS = 20
 HEAD_LINES = 200  # lines within which the numbers must begin
 COLUMNS = {
@@ -234,8 +234,8 @@ def _table(path: Path, content: bytes, skipped: int, line: str) -> np.ndarray:
     if 3 <= values.shape[1] <= MOST_COLUMNS:
         return values
     is_image = values.shape[1] > MOST_COLUMNS
-    fix = "of an image of depth: save it by numpy.save('depth.npy', ..), then name depth.npy" if is_image else None
-    raise UserError(f"{path}: {values.shape[1]} numbers in a line are no point", legal=LEGAL_LIST, fix=fix)
+    fix = "if it is a depth image, save it by numpy.save('depth.npy', ..), then name depth.npy" if is_image else None
+    raise UserError(f"{path}: {values.shape[1]} numbers in a line are not a point", legal=LEGAL_LIST, fix=fix)
 
 
 def _columns(path: Path, values: np.ndarray, line: str) -> dict[str, np.ndarray]:

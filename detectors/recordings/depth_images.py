@@ -40,7 +40,7 @@ def read_picture(path: Path, flags: int) -> np.ndarray:
 
 
 def decoded(name: str, content: bytes, flags: int) -> np.ndarray:
-    """Return the same of a file's content."""
+    """Decode a file's content as `read_picture` does."""
     refuse_pixels(name, *_header(name, content).size)
     with damage_told(f"{name}: cannot be decoded", LEGAL_PICTURE):
         picture = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
@@ -62,7 +62,7 @@ def refuse_broken_png(name: str, content: bytes) -> None:
 def _header(name: str, content: bytes) -> ImageFile.ImageFile:
     """Read a picture's header alone, as the kind that its first bytes say."""
     kind = PngImagePlugin.PngImageFile if content.startswith(PNG_SIGNATURE) else JpegImagePlugin.JpegImageFile
-    what = f"{name}: cannot be decoded: it begins neither as PNG nor as JPEG does, or is truncated"
+    what = f"{name}: cannot be decoded: it is neither PNG nor JPEG, or it is truncated"
     with damage_told(what, LEGAL_PICTURE):
         return kind(io.BytesIO(content))
 
@@ -80,7 +80,7 @@ NOT_DEPTH = re.compile(
 
 
 def open_depth_folder(folder: Path, asked: Asked) -> Recording:
-    """Open a folder of depth PNGs. Raises UserError where none is in it, or their lens is not known."""
+    """Open a folder of depth PNGs. Raises UserError where it has none, or their lens is unknown."""
     inner = folder / "depth"
     depths = depth_files(inner if inner.is_dir() else folder)
     root = folder if inner.is_dir() or folder.name != "depth" else folder.parent
@@ -122,7 +122,7 @@ def open_depth_list(
     first = next((path for path in colours if path), None)
     if first is not None and (found := _colour(first).shape)[:2] != (height, width):
         colours = ()
-        notes = [f"colour pictures of {found[1]} x {found[0]} pixels do not lie on the depth pixels and are not used"]
+        notes = [f"colour pictures of {found[1]} x {found[0]} pixels are not aligned with the depth and are not used"]
     if not any(lens.distortion):
         notes.append("no lens distortion is stated; the images are taken as undistorted")
     scale_m = asked.scale_m or UNITS_M["tum" if is_tum else "mm"]
@@ -146,13 +146,13 @@ def shown(folder: Path) -> list[Path]:
 
 
 def depth_files(folder: Path) -> tuple[Path, ...]:
-    """Return a folder's depth pictures in the order of their numbers, without masks. Raises UserError where none is."""
+    """Return a folder's depth pictures by their numbers, without masks. Raises UserError where there is none."""
     pictures = [path for path in shown(folder) if path.suffix.lower() == ".png"]
     numbered = [path for path in pictures if NUMBER.fullmatch(path.stem)]
     # a 16-bit infrared picture looks like depth
     chosen = depth_named(pictures, numbered or [path for path in pictures if png_kind(path)[2:] == (16, 0)])
     if not chosen:
-        raise UserError(f"{folder}: no depth picture in it ({len(pictures)} PNG files)", legal=LEGAL_PNG)
+        raise UserError(f"{folder}: contains no depth picture ({len(pictures)} PNG files)", legal=LEGAL_PNG)
     return chosen
 
 
@@ -169,7 +169,7 @@ def depth_named(paths: Sequence[Path], others: Sequence[Path]) -> tuple[Path, ..
 
 
 def png_kind(path: Path) -> tuple[int, int, int, int]:
-    """Return (width, height, bits, colour type) of a PNG. Raises UserError where it is none, or too large."""
+    """Return (width, height, bits, colour type) of a PNG. Raises UserError where it is no PNG, or too large."""
     with damage_told(f"{path}: cannot be read", LEGAL_PNG), path.open("rb") as file:
         head = file.read(26)
     if len(head) < 26 or head[:8] != PNG_SIGNATURE or head[12:16] != b"IHDR":
@@ -191,7 +191,7 @@ def _depth_size(path: Path) -> tuple[int, int]:
     width, height, bits, kind = png_kind(path)
     if (bits, kind) != (16, 0):
         channels = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}.get(kind, f"type {kind}")
-        what = f"{path}: {bits} bits a channel, {channels}: a picture or a mask, not a depth image"
+        what = f"{path}: {bits} bits per channel, {channels}: a picture or a mask, not a depth image"
         raise UserError(what, legal=LEGAL_PNG, fix="export the depth itself; a preview scaled to 0..255 has lost it")
     return width, height
 

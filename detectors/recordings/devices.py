@@ -154,7 +154,7 @@ def _refuse_truncated(path: Path) -> None:
         head = file.read(4096)
     at = head.find(SEGMENT_ID) + len(SEGMENT_ID)
     if at < len(SEGMENT_ID) or at >= len(head) or head[at] == 0:
-        raise UserError(f"{path}: is no Matroska file, or is truncated", legal=LEGAL_MKV, fix="copy or record it again")
+        raise UserError(f"{path}: is truncated, or is not Matroska", legal=LEGAL_MKV, fix="copy or record it again")
     length = 9 - head[at].bit_length()
     bits = 7 * length
     size = int.from_bytes(head[at : at + length], "big") & ((1 << bits) - 1)
@@ -206,7 +206,7 @@ def _scaled(name: str, k: np.ndarray, colour: tuple[int, int], size: tuple[int, 
     fx, fy, cx, cy = float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2])
     good = np.isfinite(k).all() and 0.1 < across * fx / size[0] < 100 and abs(across / down - 1) < 0.02
     if not good or not (0 < cx < colour[0] and 0 < cy < colour[1] and fy > 0):
-        what = f"fx {fx:g}, cx {cx:g}, cy {cy:g} of {colour[0]} x {colour[1]} pixels is no lens of {size} pixels"
+        what = f"fx {fx:g}, cx {cx:g}, cy {cy:g} of {colour[0]} x {colour[1]} pixels is not a lens of {size} pixels"
         raise UserError(f"{name}: {what}", fix="pass --intrinsics FILE with the lens of the depth pictures")
     # positions count from the first pixel's centre
     return Lens(*size, fx * across, fy * down, (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5)
@@ -252,7 +252,7 @@ def open_stray(folder: Path, asked: Asked) -> Recording:
             raise UserError(f"{matrix}: holds no 3 x 3 matrix", legal=LEGAL_STRAY, fix="pass --intrinsics FILE")
         across = next((w for w in COLOUR_WIDTHS if abs(2 * k[0, 2] - w) < 0.05 * w), None)
         if across is None:
-            what = f"cx = {k[0, 2]:g} is the centre of no picture of ARKit"
+            what = f"cx = {k[0, 2]:g} is not the centre of any ARKit picture"
             raise UserError(f"{matrix}: {what}", legal=LEGAL_STRAY, fix="pass --intrinsics FILE")
         return _scaled(str(matrix), k, (across, across * 3 // 4), (width, height))
 
@@ -285,7 +285,7 @@ def open_r3d(path: Path, asked: Asked) -> Recording:
     with _archive(path) as archive:
         if "metadata" not in archive.namelist() or not _depth_names(archive):
             held = ", ".join(archive.namelist()[:6]) or "nothing"
-            raise UserError(f"{path}: holds no capture of Record3D ({held[:200]})", legal=LEGAL_R3D)
+            raise UserError(f"{path}: contains no Record3D capture ({held[:200]})", legal=LEGAL_R3D)
         content = _content(path, archive, "metadata")
     with damage_told(f"{path}: its metadata cannot be read", LEGAL_R3D):
         told = strict_json(content)
@@ -310,7 +310,7 @@ def open_r3d(path: Path, asked: Asked) -> Recording:
 
 
 def _archive(path: Path) -> zipfile.ZipFile:
-    with damage_told(f"{path}: is no archive of Record3D, or is cut off", LEGAL_R3D):
+    with damage_told(f"{path}: is not a Record3D archive, or is cut off", LEGAL_R3D):
         return zipfile.ZipFile(path)
 
 

@@ -1,4 +1,4 @@
-"""Stored numbers as distances: which of them mean "no return", what one of them is in metres, and who says so."""
+"""Stored numbers as distances: codes that mean "no return", the depth unit in metres, and its origin."""
 
 from __future__ import annotations
 
@@ -65,17 +65,17 @@ def frame_of(
     for code in no_return_codes(stored_z[reason == Reason.VALID]):
         coded = stored_z == code
         reason[coded] = Reason.NO_RETURN
-        notes.append(f"{code:.10g} taken as no return, {100 * coded.mean():.2g} % of pixels")
+        notes.append(f"{code:.10g} is read as no return, {100 * coded.mean():.2g} % of pixels")
     valid = reason == Reason.VALID
     behind = (stored_z < 0) & valid
     turned = valid.any() and behind.sum() > TURNED_SHARE * valid.sum()
     if turned:
         share = f"z is negative in {100 * behind.sum() / valid.sum():.3g} % of the points"
-        notes.append(f"{share}: turned by half a turn about x (y up and z back became y down and z forward)")
+        notes.append(f"{share}: the cloud was turned by 180 degrees about x, to y down and z forward")
         behind = ~behind & valid
     elif behind.sum() > max((0.5 if stored.ndim == 2 else 1 - TURNED_SHARE) * valid.sum(), SHARED_CODE):
         what = f"{name}: {100 * behind.sum() / valid.sum():.0f} % of the points lie behind the camera (z below 0)"
-        fix = "turn and move the cloud (of y up and z back: negate y and z; of x forward and z up: take -y, -z, x)"
+        fix = "transform the cloud (from y up, z back: negate y and z; from x forward, z up: take -y, -z, x)"
         raise UserError(what, legal=CAMERA_FRAME, fix=fix)
     reason[behind] = Reason.OUT_OF_RANGE
     xy_m = None
@@ -151,7 +151,7 @@ QUARTER_SIZES = {(1024, 768): 20.0, (640, 480): 2.0, (1280, 720): 2.0, (1920, 10
 
 
 class Unit(NamedTuple):
-    """Metres in one stored number, and who says so. ``warning``: why to doubt it, "" for no doubt."""
+    """Metres in one stored number, and the origin of this unit. ``warning``: why to doubt it, "" for no doubt."""
 
     scale_m: float
     origin: str
@@ -247,7 +247,7 @@ def refuse_implausible(frame: Frame, scale_m: float) -> None:
         return
     in_each = {unit: median_m / scale_m * metres for unit, metres in UNITS_M.items()}
     fitting = [f"--unit {unit} (then {m:.3g} m)" for unit, m in in_each.items() if NEAREST_M <= m <= FARTHEST_M]
-    what = f"{frame.name}: the median distance would be {median_m:.4g} m, which speaks for a wrong unit"
+    what = f"{frame.name}: the median distance would be {median_m:.4g} m, which suggests a wrong unit"
     fix = "pass " + " or ".join(fitting) if fitting else f"state the unit with --unit: {LEGAL_UNITS}"
     raise UserError(what, legal=f"a median between {NEAREST_M:g} m and {FARTHEST_M:g} m", fix=fix)
 
@@ -257,7 +257,7 @@ def refuse_far_aside(frame: Frame) -> None:
     across_m = np.zeros(1) if frame.xy_m is None else np.hypot(*np.moveaxis(frame.xy_m, -1, 0))
     if (aside := float(np.nanmedian(across_m / frame.z_m))) > FARTHEST_ASIDE:
         what = f"{frame.name}: half of the points lie more than {math.degrees(math.atan(aside)):.0f} degrees"
-        what += " off the camera's axis: the cloud stands in another frame, or z is in another unit than x and y"
+        what += " off the camera's axis: the cloud is in another frame, or z has another unit than x and y"
         raise UserError(what, legal=CAMERA_FRAME, fix="move the cloud into the frame of the camera that took it")
 
 
@@ -271,7 +271,7 @@ def ray_lengths_doubt(z_m: np.ndarray, slopes: np.ndarray) -> str:
         bends = [_bend(inverse), _bend(inverse * np.sqrt(1.0 + (slopes**2).sum(axis=-1)))]
     if not bends[0] > RAYS_TELL * bends[1]:
         return ""
-    what = f"the numbers look like lengths along the rays, not like z: read so, surfaces are {bends[0] / bends[1]:.0f}"
+    what = f"the numbers look like lengths along the rays, not z: as lengths, surfaces are {bends[0] / bends[1]:.0f}"
     return f"{what} times as flat. Places and sizes are then wrong: store z, the length times the ray's cosine"
 
 

@@ -37,10 +37,10 @@ class ColourCamera(NamedTuple):
 
 
 def parse_calibration(name: str, content: bytes) -> dict[str, Any]:
-    """Parse the calibration's JSON (a trailing zero byte is the recorder's). Raises UserError where it is none."""
+    """Parse the calibration's JSON (a trailing zero byte is the recorder's). Raises UserError for any other content."""
     refuse_bytes(name, len(content), TEXT_BYTES)
     legal = "the JSON that k4arecorder attaches: CalibrationInformation with its Cameras"
-    with damage_told(f"{name}: is no Azure Kinect calibration", legal, OWN_LENS):
+    with damage_told(f"{name}: is not an Azure Kinect calibration", legal, OWN_LENS):
         cameras = strict_json(content.rstrip(b"\0"))["CalibrationInformation"]["Cameras"]
         return {camera["Purpose"].removeprefix("CALIBRATION_CameraPurpose"): camera for camera in cameras}
 
@@ -51,7 +51,7 @@ def depth_lens(name: str, cameras: dict[str, Any], mode: str) -> Lens:
         raise UserError(f"{name}: depth mode {mode} has no depth image", legal=", ".join(DEPTH_MODES))
     camera, numbers = _camera(name, cameras, "Depth")
     if (camera["SensorWidth"], camera["SensorHeight"]) != (1024, 1024):
-        raise UserError(f"{name}: calibration of a sensor that is not 1024 x 1024, an Azure Kinect's")
+        raise UserError(f"{name}: the calibrated sensor is not 1024 x 1024, as an Azure Kinect's is")
     return _lens(name, numbers, DEPTH_MODES[mode])
 
 
@@ -97,7 +97,7 @@ def _camera(name: str, cameras: dict[str, Any], purpose: str) -> tuple[dict[str,
 def _lens(name: str, parameters: list[float], mode: Mode) -> Lens:
     cx, cy, fx, fy, k1, k2, k3, k4, k5, k6, _, _, p2, p1 = parameters
     if not (fx > 0 and fy > 0):
-        raise UserError(f"{name}: focal length {fx:g}, {fy:g}", legal="above 0")
+        raise UserError(f"{name}: the focal length is {fx:g}, {fy:g}", legal="above 0")
     (across, down), (left, top), image = mode
     centre = cx * across - left - 0.5, cy * down - top - 0.5
     return Lens(*image, fx * across, fy * down, *centre, (k1, k2, p1, p2, k3, k4, k5, k6))
@@ -155,7 +155,7 @@ def lens_for(
     if file is not None:
         lens = read_lens(file, width, height)
     if lens is None:
-        what = f"{name}: nothing says which lens took these depth images, and without it they are no points"
+        what = f"{name}: the lens of these depth images is unknown; without it they give no points"
         fix = f"pass --intrinsics FILE, or the name of a camera whose nominal lens is good enough{hint}"
         raise UserError(what, legal=LEGAL_LENS, fix=fix)
     modes = (lens, *lens.others) if isinstance(lens, OtherLens) else (lens,)
@@ -181,7 +181,7 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
     data = _the_lens(path, data, (width, height))
     across, down = _size(data) or stated or (width, height)
     if not isinstance(across, int) or not isinstance(down, int):
-        raise UserError(f"{path}: the lens' width and height are no whole numbers", legal=LEGAL_LENS)
+        raise UserError(f"{path}: the lens' width and height are not whole numbers", legal=LEGAL_LENS)
     if across * height != down * width:
         what = f"{path}: is for images of {across} x {down} pixels, but the depth images have {width} x {height}"
         raise UserError(what, fix="give the lens of the depth images (or of the colour camera they are aligned to)")
@@ -191,25 +191,25 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
     # no lens of these images has a mirrored or normalised focal length, or a centre far outside
     is_near = -width < cx < 2 * width and -height < cy < 2 * height
     if not (is_near and 0.1 * width < fx < 100 * width and 0.1 * width < fy < 100 * width):
-        what = f"focal length {fx:g}, {fy:g} or principal point {cx:g}, {cy:g} of no {width} x {height} image"
+        what = f"focal length {fx:g}, {fy:g} or principal point {cx:g}, {cy:g} is impossible for {width} x {height}"
         fix = "multiply a normalised focal length by the image's width"
         raise UserError(f"{path}: {what}", legal="pixels, from the centre of the first one", fix=fix)
     numbers = (width, height, fx, fy, cx, cy, _distortion(path, data))
     if (across, down) != (width, height):
         warning = f"{path.name} is the lens of images of {across} x {down} pixels; it is scaled to {width} x {height},"
-        warning += " which is right unless the smaller image is cut out of the larger"
+        warning += " which is right unless the smaller image is a crop of the larger"
         return OtherLens(*numbers, warning=warning)
     if max(abs((cx + 0.5) / width - 0.5), abs((cy + 0.5) / height - 0.5)) <= FAR_OFF:
         return Lens(*numbers)
     warning = (
         f"{path.name} has its principal point at {cx:.5g}, {cy:.5g}, far from the middle of {width} x {height} pixels:"
     )
-    warning += " unless the images are cut out of larger ones, it is the lens of another size, and all sizes are wrong"
+    warning += " unless the images are crops of larger images, the lens is for another size, and all sizes are wrong"
     return OtherLens(*numbers, warning=warning)
 
 
 def parsed_lens(path: Path) -> dict[str, Any]:
-    """Return the file's mapping; of bare numbers, these by name. Raises UserError on what is no JSON or YAML."""
+    """Return the file's mapping; of bare numbers, these by name. Raises UserError where it is neither JSON nor YAML."""
     if not path.exists():
         raise UserError(f"{path}: no such file", legal=LEGAL_LENS)
     with damage_told(f"{path}: cannot be read", LEGAL_LENS, "give another file"):
@@ -235,7 +235,7 @@ def parsed_lens(path: Path) -> dict[str, Any]:
             first, at = error.problems[0], error.problems[0].place
             raise UserError(f"{at.head if at else path}: {first.message}", legal=LEGAL_LENS) from error
     if not isinstance(data, dict):
-        raise UserError(f"{path}: holds no names with values", legal=LEGAL_LENS)
+        raise UserError(f"{path}: contains no keys with values", legal=LEGAL_LENS)
     return data
 
 
@@ -260,7 +260,7 @@ def _the_lens(path: Path, data: dict[str, Any], size: tuple[int, int]) -> dict[s
         raise UserError(f"{path}: holds no lens (its keys: {keys})", legal=LEGAL_LENS)
     if len({_focal_and_centre(path, each) for _, each in found}) > 1:
         names = ", ".join(name for name, _ in found[:9])
-        fix = "write the one of these images to a file of its own"
+        fix = "write the lens of these images to a file of its own"
         raise UserError(f"{path}: holds {len(found)} different lenses ({names})", legal=LEGAL_LENS, fix=fix)
     return found[0][1]
 
@@ -298,7 +298,7 @@ def _distortion(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
         given = data if key is None else data[key]
         unknown = [] if key is None else sorted(map(str, set(given) - set(DISTORTION_NAMES)))
         if unknown:
-            raise UserError(f"{path}: {key} has {', '.join(unknown)}", legal=", ".join(DISTORTION_NAMES))
+            raise UserError(f"{path}: {key} has unknown names: {', '.join(unknown)}", legal=", ".join(DISTORTION_NAMES))
         numbers = tuple(_number(path, name, given.get(name, 0.0)) for name in DISTORTION_NAMES)
     else:
         numbers = _numbers(path, key, data[key], None)
@@ -317,7 +317,7 @@ def _numbers(path: Path, key: str, value: Any, count: int | None) -> tuple[float
     if isinstance(value, list) and value and all(isinstance(row, list) for row in value):
         value = [x for row in value for x in row]
     if not isinstance(value, list) or (count is not None and len(value) != count):
-        raise UserError(f"{path}: {key} is no list of {count or 'any'} numbers", legal=LEGAL_LENS)
+        raise UserError(f"{path}: {key} is not a list of {count or 'any'} numbers", legal=LEGAL_LENS)
     return tuple(_number(path, key, x) for x in value)
 
 

@@ -35,11 +35,11 @@ def encoding_of(message: Any) -> str:
 
 
 def stored_depth(name: str, message: Any) -> np.ndarray:
-    """Return the stored numbers (h, w), uint16 or float32. Raises UserError where there is no or less depth."""
+    """Return the stored numbers (h, w), uint16 or float32. Raises UserError where depth is missing or cut off."""
     encoding = encoding_of(message)
     if encoding not in DEPTH_NUMBERS:
         what = encoding or getattr(message, "format", "")
-        raise UserError(f"{name}: holds {what[:60]!r} pictures, no depth", legal=LEGAL_IMAGE)
+        raise UserError(f"{name}: holds {what[:60]!r} pictures, not depth", legal=LEGAL_IMAGE)
     if hasattr(message, "format"):
         return _unpacked(name, encoding, bytes(message.data))
     kind = np.dtype((">" if message.is_bigendian else "<") + DEPTH_NUMBERS[encoding])
@@ -70,7 +70,7 @@ def _unpacked(name: str, encoding: str, data: bytes) -> np.ndarray:
     else:
         stored = _rvl(name, content)
     if stored.ndim != 2 or stored.dtype != np.uint16:
-        raise UserError(f"{name}: its picture is no 16-bit grey one", legal=LEGAL_IMAGE)
+        raise UserError(f"{name}: its picture is not a 16-bit grey image", legal=LEGAL_IMAGE)
     if encoding != "32FC1":
         return stored
     with np.errstate(divide="ignore"):

@@ -1,4 +1,4 @@
-"""Recognise a capture by what it is, and open it."""
+"""Recognise the format of a capture, and open it."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def open_capture(paths: Sequence[Path], *, unit: str | None = None, **statements
     `recording.Asked`. Raises UserError for every fault of the files."""
     paths = [Path(path) for path in paths]
     if not paths:
-        raise UserError("no capture named", legal=LEGAL_FORMATS)
+        raise UserError("no capture is named", legal=LEGAL_FORMATS)
     for path in paths:
         if not path.is_file() and not path.is_dir():
             odd = path.exists() and "is neither a file nor a folder, but a device or a pipe"
@@ -63,7 +63,7 @@ def open_capture(paths: Sequence[Path], *, unit: str | None = None, **statements
     first, *second = islice(recording.frames(), 2)
     given, doubts = recording.lens, [said.warning]
     if second and np.array_equal(first.z_m, second[0].z_m, equal_nan=True):
-        doubts += ["the first two frames are equal: repeated frames lower no noise, and count as more than they are"]
+        doubts += ["the first two frames are equal: repeated frames do not lower noise, but are counted as if they did"]
     if recording.slopes is not None and first.xy_m is None:
         doubts += [ray_lengths_doubt(first.z_m, recording.slopes)]
     notes, warnings = [*recording.notes, *first.notes], [*recording.warnings, *doubts]
@@ -114,7 +114,7 @@ def _opened(paths: list[Path], asked: Asked) -> Recording:
     elif is_single and asked.raw is not None:
         opener = open_arrays
     if asked.topic is not None and opener is not open_bag:
-        raise UserError(f"{path}: is no ROS bag, so it has no topic {asked.topic}", fix="leave out --topic")
+        raise UserError(f"{path}: is not a ROS bag, so it has no topic {asked.topic}", fix="leave out --topic")
     unused = next((name for name in ("array", "pitch", "raw") if getattr(asked, name) is not None), None)
     if unused and opener is not open_arrays:
         legal = f"{', '.join(LOADERS)}, or bare numbers with --raw"
@@ -122,7 +122,7 @@ def _opened(paths: list[Path], asked: Asked) -> Recording:
     if opener is not None:
         return opener(path, asked)
     if any(each.is_dir() for each in paths):
-        raise UserError(f"{len(paths)} paths with folders among them", legal=LEGAL_FORMATS, fix="name one folder alone")
+        raise UserError(f"{len(paths)} paths that include folders", legal=LEGAL_FORMATS, fix="name one folder alone")
     if suffix in LISTS and not others:
         return LISTS[suffix](paths, asked, path.name if is_single else f"{path.name} .. {paths[-1].name}")
     if not is_single:
@@ -130,7 +130,7 @@ def _opened(paths: list[Path], asked: Asked) -> Recording:
     if suffix in (".bin", ".raw", ".dat"):
         raise raw_layout_of(path)
     fix = CONVERT.get(suffix, "").replace("FILE", str(path)) or None
-    raise UserError(f"{path}: files of the kind '{suffix}' are not read", legal=LEGAL_FORMATS, fix=fix)
+    raise UserError(f"{path}: files of the type '{suffix}' are not read", legal=LEGAL_FORMATS, fix=fix)
 
 
 def _open_folder(folder: Path, asked: Asked) -> Recording:
@@ -143,7 +143,7 @@ def _open_folder(folder: Path, asked: Asked) -> Recording:
         if clouds:
             recording = open_clouds(clouds, asked, folder.name)
             beside = sum(path.suffix.lower() in (".png", *LOADERS) for path in inside)
-            note = f"{beside} pictures or arrays beside the {suffix} files are not read" if beside else ""
+            note = f"{beside} pictures or arrays beside the {suffix} files are ignored" if beside else ""
             return replace(recording, notes=(*recording.notes, note))
     pictures = [path for path in inside if path.suffix.lower() == ".png"]
     arrays = [path for path in inside if path.suffix.lower() in LOADERS]
@@ -159,6 +159,6 @@ def _open_folder(folder: Path, asked: Asked) -> Recording:
     held = ", ".join(path.name for path in inside[:HELD]) + (", .." if len(inside) > HELD else "")
     known = (p.suffix.lower() in FILES if p.is_file() else is_bag(p) or (p / "depth").is_dir() for p in inside)
     captures = [path for path, is_known in zip(inside, known, strict=True) if is_known]
-    what = f"no capture in it; it holds {held}" if held else "is empty"
+    what = f"contains no capture; it holds {held}" if held else "is empty"
     fix = f"name {'one of ' * (len(captures) > 1)}{', '.join(map(str, captures[:HELD]))}" if captures else None
     raise UserError(f"{folder}: {what}", legal=LEGAL_FORMATS, fix=fix)

@@ -19,19 +19,19 @@ from harness.vocabulary.geometry import Frame, Lens, Reason, Region
 
 ROUND_TRIP_PX = 0.1
 """A pixel whose ray does not come back to it within this has no direction that the lens model can give."""
-NO_GRID = "the cloud has no pixel grid; it is treated as single points"
+NO_GRID = "the cloud has no pixel grid; it is treated as unorganised points"
 
 
 @contextmanager
 def damage_told(what: str, legal: str, fix: str = "copy or export it again") -> Iterator[None]:
-    """Turn what a library raises on a damaged file into a UserError that begins with ``what``; limit its memory."""
+    """Turn a library's exception on a damaged file into a UserError that begins with ``what``; limit its memory."""
     try:
         with limited_memory():
             yield
     except UserError:
         raise
     except Exception as error:
-        why = "there is not memory enough for what it states" if isinstance(error, MemoryError) else str(error)
+        why = "there is not enough memory for the size that it states" if isinstance(error, MemoryError) else str(error)
         raise UserError(f"{what} ({(why or type(error).__name__)[:200]})", legal=legal, fix=fix) from error
 
 
@@ -83,7 +83,7 @@ class Recording:
         """Return a recording of the first frame's size and step. Raises UserError without a frame."""
         first = next(read(), None)
         if first is None:
-            raise UserError(f"{name}: no frame in it", legal="at least one frame", fix="copy or record it again")
+            raise UserError(f"{name}: contains no frame", legal="at least one frame", fix="copy or record it again")
         step_m = scale_m if is_whole else rounding_step_m(first.z_m)
         return cls(name, read, first.z_m.shape, scale_m, step_m, **more)
 
@@ -94,7 +94,7 @@ class Recording:
 
     @property
     def unit_text(self) -> str:
-        """The depth unit and who says so, as programs print it."""
+        """The depth unit and its origin, as programs print it."""
         return f"depth unit {1e3 * self.scale_m:.4g} mm, from {self.unit_from}"
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Boards of a data set: which there are, and the files of each; and how programs read them again.
+"""Boards of a data set: their plan, the files of each, and reading them again.
 
 Every board is one average of frames of one unit of a camera. Splits have boards of their own, ``validation`` and
 ``test`` those of a study of the same experiment. Not included: several views, real captures."""
@@ -92,7 +92,7 @@ def samples_of(experiment: Experiment, boards: int, cache: Path) -> list[Sample]
         source, seed, study = point.config.simulated, point.config.seed, point.config.study
         if source.views or not isinstance(source.target, DrawnTargetConfig):
             fix = "take one with `target: {name: drawn, ...}`, such as detection_limit"
-            raise UserError(f"{experiment.config.name}: has no random boards, each seen in a single view", fix=fix)
+            raise UserError(f"{experiment.config.name}: has no random boards that are seen in one view", fix=fix)
         for split, role, share in SPLITS:
             for number in range(round(share * boards)):
                 units: tuple[CameraConfig, ...] = ()

@@ -1,7 +1,7 @@
 """Jobs on a cluster by dask.distributed: each dask worker is a node that runs the local engine inside.
 
 The driver calls the nodes through the scheduler with bundles of jobs, two at a time for each; dask neither queues nor
-retries them. When a node dies, its jobs go to others; a job that `TRIES` nodes had as they died counts as crashed."""
+retries them. When a node dies, its jobs go to others; a job that ran on `TRIES` nodes as they died has crashed."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Bundle:
 
 @dataclass(frozen=True)
 class NodeFacts:
-    """A node's own account. ``digests``: of installed code by stage; ``sees``: content of the file it was asked for."""
+    """A node's facts. ``digests``: of installed code by stage; ``sees``: content of the file it was asked for."""
 
     python: str
     digests: Mapping[Stage, str]
@@ -210,7 +210,7 @@ class ClusterEngine:
             with contextlib.suppress(OSError):
                 there = set(self._client.scheduler_info(n_workers=-1)["workers"])
         if there is None:
-            fix = "start it again; finished trials are kept, and the same command goes on"
+            fix = "start it again; finished trials are kept, and the same command continues"
             raise UserError(f"the scheduler at {self._scheduler} is gone", fix=fix)
         for address in there - self._asked:
             self._asked.add(address)
@@ -253,13 +253,13 @@ class ClusterEngine:
             self._refuse(address, UserError(f"{where} cannot run tofpod: {type(said).__name__}: {said}", fix=fix))
         elif isinstance(said, BaseException):
             # it died meanwhile, or the network failed: no sign of another installation
-            self._tell_once(f"{where} did not say what it is ({type(said).__name__}: {said}); it is not used")
+            self._tell_once(f"{where} did not state its version ({type(said).__name__}: {said}); it is not used")
         elif said.python.split(".")[:2] != list(platform.python_version_tuple()[:2]):
             message = f"{where} runs Python {said.python}, this machine {platform.python_version()}"
             self._refuse(address, UserError(message, fix="use the same Python on all"))
         elif said.digests.get("trials") != self._digests.get("trials"):
             message = f"{where} runs another version of tofpod, of a plug-in, or of numpy, scipy, numba or OpenCV"
-            fix = "install the same there, and start its workers again: they keep the code that they began with"
+            fix = "install the same there, and start its workers again: they keep the code that they loaded"
             self._refuse(address, UserError(f"{message} than this machine", fix=fix))
         elif said.sees != self._nonce:
             message = f"{where} does not see {self._probe.parent}, where this machine keeps renders"
@@ -308,7 +308,7 @@ class ClusterEngine:
         elif lacking:
             self._tell_once(f"waiting for a {lacking} at {self._scheduler}, at most {WAIT_FOR_NODES_S:.0f} s")
             if time.monotonic() - self._lacking_since > WAIT_FOR_NODES_S:
-                raise UserError(f"no {lacking} came to {self._scheduler} within {WAIT_FOR_NODES_S:.0f} s", fix=fix)
+                raise UserError(f"no {lacking} connected to {self._scheduler} within {WAIT_FOR_NODES_S:.0f} s", fix=fix)
 
     def _tell_once(self, message: str) -> None:
         if message not in self._told:
@@ -389,7 +389,7 @@ def examine(code: Mapping[Stage, Code], probe: str, dask_worker: Any) -> NodeFac
 
 
 def drop(driver: str) -> None:
-    """End all jobs of a driver, which waits for them no longer."""
+    """End all jobs of a driver that no longer waits for them."""
     for answers in _awaited.pop(driver, ()):
         for engine in _engines.values():
             engine.drop(answers)

@@ -1,4 +1,4 @@
-"""The progress of a sweep, and what there is to do before it runs."""
+"""The progress of a sweep, and its amount of work before it runs."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def progress_display(
 
 
 def dry_run(experiment: Experiment, out: Path, options: EngineOptions) -> int:
-    """Say what a sweep, or a shard of it, consists of; nothing is written."""
+    """Print the work of a sweep, or of a shard of it; nothing is written."""
     name, folder, points = experiment.config.name, experiment.folder(out), many(len(experiment.points), "point")
     if isinstance(experiment.config.source, CaptureSource):
         print(f"{name}: valid; {points} of a real capture; results: {folder}")

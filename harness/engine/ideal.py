@@ -43,7 +43,7 @@ def ideal_of_set_ups(plan: SweepPlan, engine: JobEngine, calls_per_m2: float) ->
             raise RuntimeError(bug)
         wrong = [failure.in_short for failure in lost] + [end.why for end in ends.values() if end.state != "done"]
         if wrong:
-            raise UserError(f"the ideal observer lacks a board: {wrong[0]}", fix="mend that, and run it again")
+            raise UserError(f"the ideal observer lacks a board: {wrong[0]}", fix="correct the cause, and run it again")
         views = [ends[job.name].value for job in jobs]
         by_frames = {frames: ideal_damages([view[frames] for view in views], calls_per_m2) for frames in views[0]}
         for point in group.points:

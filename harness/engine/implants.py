@@ -1,6 +1,6 @@
 """A study on recorded frames: virtual damage at random places of scans of an undamaged part, judged as boards are.
 
-A placement is what a board is to a simulated study: some damages at once, in one group of recorded frames. Placements
+A placement takes the part of a simulated board: some damages at once, in one group of recorded frames. Placements
 of one recording share its surface and fixed pattern, and where there are few frames its noise."""
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Judging:
 
 
 class Scan:
-    """A recording of an undamaged part, its surface, what is judged of it. Raises UserError without either."""
+    """A recording of an undamaged part, its surface and judged area. Raises UserError where either is missing."""
 
     def __init__(self, recording: Recording, judging: Judging) -> None:
         if recording.lens is None or recording.slopes is None or recording.projection != "central":
@@ -124,7 +124,7 @@ class Scan:
         return np.asarray(np.degrees(np.arccos(np.clip(np.abs(along), 0, 1))))
 
     def rim_px(self, family: DrawnTargetConfig) -> float:
-        """Return how far inside of what is judged a damage's centre lies at least, whatever the damage's size."""
+        """Return how far inside the judged area a damage's centre lies at least, whatever the damage's size."""
         return family.damage.widest_mm * MM / 2 / self.pitch_m + BEYOND_PX + self.reach_px
 
     def left_out(self, family: DrawnTargetConfig) -> str:
@@ -135,8 +135,8 @@ class Scan:
         steep = [float(np.quantile(self.angle_deg[part & known], 0.99)) for part in (inner, self.judged)]
         if steep[1] - steep[0] < TELLING_DEG:
             return ""
-        inside = f"the inner {100 * (inner & known).sum() / known.sum():.0f} % of what is judged"
-        rim = f"the limit says nothing of the rim, seen at up to {steep[1]:.0f} degrees, where more is missed"
+        inside = f"the inner {100 * (inner & known).sum() / known.sum():.0f} % of the judged area"
+        rim = f"the limit says nothing about the rim, seen at up to {steep[1]:.0f} degrees, where more is missed"
         return f"{self.recording.name}: damage is placed on {inside}, seen at up to {steep[0]:.0f} degrees; {rim}"
 
     def averaged(self, frames: Sequence[Frame]) -> Cloud:
@@ -206,7 +206,7 @@ def placements(
         empty = 0 if placed.damages else empty + 1
         if empty > MOST_EMPTY:
             fix = "smaller --diameters, a larger --crop, or a camera nearer to the part"
-            raise UserError(f"{scan.recording.name}: no place for the damage on what is judged of it", fix=fix)
+            raise UserError(f"{scan.recording.name}: the judged area has no room for the damage", fix=fix)
         implants = []
         for damage in placed.damages:
             spot = scan.place(*damage.centre_m, 0.0)
@@ -241,7 +241,7 @@ def judge_scans(
         groups = [(scan, slice(k, k + count)) for scan in scans for k in range(0, len(scan.frames) - count + 1, count)]
         if not groups:
             longest = max(len(scan.frames) for scan in scans)
-            raise UserError(f"--frames {count}: no recording has so many", legal=f"1 to {longest}")
+            raise UserError(f"--frames {count}: no recording has that many frames", legal=f"1 to {longest}")
         setting, judged = (groups[::2], groups[1::2]) if len(groups) > 1 else (groups, groups)
         if len(groups) == 1:
             warnings.append(f"{count} frames: one average sets the threshold, shows the false calls and is damaged too")

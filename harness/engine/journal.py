@@ -1,7 +1,7 @@
 """The journal of a sweep: how each trial ended, appended to segment files, so that the same command resumes.
 
 Each process that writes has a segment of its own: shards may share a folder, and journals merge by appending. A segment
-begins with its version; every further line is an entry with a checksum. A torn or altered line counts as not there."""
+begins with its version; every further line is an entry with a checksum. A torn or altered line is ignored."""
 
 from __future__ import annotations
 
@@ -106,15 +106,15 @@ class Journal:
         self._read_to[self._own.name] = start + len(line)
 
     def sync(self) -> None:
-        """Have what this process wrote on the disk, so that a power failure does not lose it."""
+        """Flush this process's entries to the disk, so that a power failure does not lose them."""
         if self._own is not None:
             with suppress(OSError), open_plain(self._own, os.O_RDONLY) as file:
                 os.fsync(file.fileno())
 
     def refresh(self) -> None:
-        """Read what other processes have appended since."""
+        """Read the entries that other processes have appended since."""
         if self.folder.is_symlink():
-            raise UserError(f"{self.folder}: is a link, and a journal is not read through one", fix="remove the link")
+            raise UserError(f"{self.folder}: is a link; a journal is not read through a link", fix="remove the link")
         self._is_read = True
         with suppress(FileNotFoundError, NotADirectoryError):
             for name in sorted(filter(SEGMENT_NAME.fullmatch, os.listdir(self.folder))):

@@ -57,7 +57,7 @@ def judge(
     hole_free: bool,
     learned: str | None = None,
 ) -> JudgedCloud:
-    """Judge a detector on a cloud; without threshold only the quiet one is found. ``learned``: a file."""
+    """Judge a detector on a cloud; without a threshold, find the quiet threshold only. ``learned``: a file."""
     cloud = known.cloud
     detector = detector_for(known, detector_name, settings_json, hole_free=hole_free, learned=learned)
     evidence = detector.analyse(cloud)

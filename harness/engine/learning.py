@@ -1,6 +1,6 @@
 """Hole-free boards on which a detector (`detectors.interface.Calibratable`) learns before its threshold is set.
 
-What it has learned stands in the journal, for resuming and shards, and in a file of that name, which trials read."""
+The learned state is stored in the journal, for resuming and shards, and in a file of that name, which trials read."""
 
 from __future__ import annotations
 

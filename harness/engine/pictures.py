@@ -1,4 +1,4 @@
-"""A report's pictures, drawn again from their seeds: the first damaged repeat; of a study damages about the limit."""
+"""A report's pictures, drawn again from their seeds: the first damaged repeat; of a study, damages near the limit."""
 
 from __future__ import annotations
 
@@ -205,7 +205,7 @@ def shown_in(plan: SweepPlan, limits: Sequence[SetUpLimit]) -> Iterator[ShownDam
 
 
 def study_example(shown: ShownDamage, thresholds: Mapping[str, float]) -> StudyExample:
-    """Return the picture of a damage; its board's view is there. The run is repeated as it was."""
+    """Return the picture of a damage, whose board is rendered. The run is repeated exactly."""
     group, batch, point, limit, where, row, half_m = shown
     seen = limit.record.inspected
     (task,) = (task for _, task in group.trials(batch, thresholds) if task.repeat == int(seen.repeat[row]))

@@ -48,7 +48,7 @@ if CAN_FORK:
 
 @dataclass(eq=False)
 class Answers:
-    """The queue in which somebody awaits the ends of jobs, or the error that ends all. ``is_dropped``: nobody does."""
+    """The queue for the ends of jobs, or for the error that ends all. ``is_dropped``: nobody reads it any more."""
 
     ended: queue.SimpleQueue[tuple[Job, Ended] | UserError] = field(default_factory=queue.SimpleQueue)
     is_dropped: bool = False
@@ -121,7 +121,7 @@ class LocalEngine:
             self._state.notify_all()
 
     def drop(self, answers: Answers) -> None:
-        """End the jobs whose end nobody awaits any more."""
+        """End the jobs whose results are no longer wanted."""
         with self._state:
             answers.is_dropped = True
             for worker in self._workers:
@@ -130,7 +130,7 @@ class LocalEngine:
         answers.ended.put(UserError("nobody awaits these jobs any more"))
 
     def next_job(self, worker: _Worker) -> tuple[Job, Limits, Answers] | None:
-        """Wait for the next job of a worker, whose process ends when it is idle for long; None when all is over."""
+        """Wait for a worker's next job; its process ends when it is idle for long. None when there are no more."""
         waiting = self._waiting[worker.stage]
         with self._state:
             worker.holds = None
@@ -238,10 +238,10 @@ class _Worker(threading.Thread):
             return "the process that it forks from has died"
         self._process.join(timeout=1.0)
         code = self._process.exitcode
-        why = f"its process ended itself with code {code}"
+        why = f"its process exited with code {code}"
         if code is not None and code < 0:
             name = signal.Signals(-code).name if -code in signal.valid_signals() else f"signal {-code}"
-            by = ": by hand, or by the system as memory ran out" if name == "SIGKILL" else ""
+            by = ": by a user, or by the system because memory ran out" if name == "SIGKILL" else ""
             why = f"its process was ended by {name}{by}"
         said = self._said.read_text()[-TRACEBACK_CHARACTERS:] if self._said.exists() else ""
         return why + (f"\n{said}" if said else "")
@@ -252,7 +252,7 @@ class _Worker(threading.Thread):
             process.kill()
 
     def end(self) -> None:
-        """End the process, whatever it does; by its own thread."""
+        """End the process, whatever it is doing; called by its own thread."""
         if self._process is not None:
             self._process.kill()
             self._process.join(timeout=1.0)
@@ -299,7 +299,7 @@ def _starting() -> Iterator[None]:
 def serve(
     pipe: Connection[Any, Any], name: str, stage: Stage, said: str, code: Code | None, environment: dict[str, str]
 ) -> None:
-    """Carry out jobs until the driver closes the pipe. What kills this process stands in the file ``said``."""
+    """Carry out jobs until the driver closes the pipe. The file ``said`` holds the reason if this process is killed."""
     os.environ.clear()
     os.environ.update(environment | ONE_THREAD)
     words = _prepare(said)

@@ -63,7 +63,7 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
                 outcome = run_plan(plan, journal, engine, report, shard=options.shard, retry_failed=retry)
             if not options.shard.is_whole:
                 done = outcome.trials
-                counts = f"{done.done} trials done, {done.found} found, {done.failed} not ended well"
+                counts = f"{done.done} trials done, {done.found} found, {done.failed} failed"
                 print(f"shard {options.shard}: {counts}")
                 _tell_failures(outcome)
                 print(f"journal: {folder / 'journal'}")
@@ -84,7 +84,7 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
         if options.cache_limit_gb is not None:
             trim_cache(cache, round(options.cache_limit_gb * 1e9), keep=[job.path for job in plan.renders])
     except KeyboardInterrupt:
-        print(f"\ninterrupted; finished trials are kept. To go on:\n  {command}", file=sys.stderr)
+        print(f"\ninterrupted; finished trials are kept. To continue:\n  {command}", file=sys.stderr)
         return 130
     point_to(folder)
     show([*(f"warning: {text}" for text in provenance["warnings"]), *shown])
@@ -171,7 +171,7 @@ def _nothing_to_report(experiment: Experiment, outcome: Outcome) -> int:
     own = [failure for failure in outcome.failures if failure.state != "skipped"]
     why = own[0].why if len({failure.in_short for failure in own}) == 1 else _reasons(outcome)
     what = "trial was judged" if outcome.finished else "trial succeeded"
-    again = "once that is mended, run the same command with --retry-failed: it runs these trials again"
+    again = "once the cause is corrected, run the same command with --retry-failed: it runs these trials again"
     is_old = own and not outcome.trials.done and "to do:" not in why
     raise UserError(f"no {what} of {name}: {why}", fix=again if is_old else None)
 
@@ -192,7 +192,7 @@ def _tell_failures(outcome: Outcome) -> None:
     if counts := _counts(outcome):
         said = ", ".join(f"{count} {state}" for state, count in counts.items())
         again = "the same command, with --retry-failed, runs them again"
-        again = again if set(counts) - {"skipped"} else "the same command runs again what was skipped"
+        again = again if set(counts) - {"skipped"} else "the same command runs what was skipped"
         print(f"{said}: {_reasons(outcome)}\n{again}", file=sys.stderr)
 
 
@@ -353,8 +353,8 @@ def without_limit(
         own = [one for one in failed.get(point.digest, ()) if one.state != "skipped"]
         causes = [one.in_short for one in own]
         causes = causes or [one.in_short for one in outcome.failures if one.what == f"threshold of {point.label}"]
-        why = Counter([*causes, "its trials did not end"]).most_common(1)[0][0]
+        why = Counter([*causes, "its trials did not finish"]).most_common(1)[0][0]
         if own and all(one.state == "failed" and not one.is_bug for one in own):
-            why = f"the camera sees nothing of the board here that could be judged ({why})"
+            why = f"the camera sees no part of the board that can be judged ({why})"
         said.setdefault(why, []).append(in_words(point.label))
     return [f"no limit for {'; '.join(labels)}: {why}" for why, labels in said.items()]

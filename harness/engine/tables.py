@@ -27,7 +27,7 @@ UNKNOWN = np.iinfo(np.int32).min  # stands among whole numbers for a value that 
 
 
 def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> trials.ResultTables:
-    """Collect records into tables in a fixed order; every axis but frames is a column, but of a study's own."""
+    """Collect records into tables in a fixed order; every axis but frames is a column, except those of a study."""
     parts: dict[str, list[dict[str, Any]]] = {name: [] for name in (*RECORDED, *OF_STUDY)}
     grids: dict[tuple[float, ...], np.ndarray] = {}
     probes: list[dict[str, Any]] = []

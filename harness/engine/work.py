@@ -1,5 +1,5 @@
-"""The seam between what is to be done and what does it: jobs go in, each comes back once with how it ended, whatever it
-did; one part of a sweep (`--shard 3/10`); and the options of every program that runs an experiment."""
+"""The interface between plans and engines: jobs go in, and each comes back exactly once with how it
+ended; one part of a sweep (`--shard 3/10`); and the options of every program that runs an experiment."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class StageCounts:
 
     @property
     def over(self) -> int:
-        """All that need no more work."""
+        """The number that need no more work."""
         return self.done + self.found + self.failed
 
 
@@ -124,14 +124,14 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of a job: ``seconds`` of time, ``memory_mb`` of its worker's memory; None: as much as it likes."""
+    """Limits of a job: ``seconds`` of time, ``memory_mb`` of its worker's memory; None: no limit."""
 
     seconds: float | None = None
     memory_mb: int | None = None
 
 
 def attempt(job: Job, worker: str) -> Ended:
-    """Run a job here; whatever it raises is how it ended. What ends the process is the engine's to notice."""
+    """Run a job here; an exception becomes its end. The engine has to notice if the process dies."""
     with contextlib.suppress(OSError):  # count the peak of memory anew (Linux)
         Path("/proc/self/clear_refs").write_text("5")
     began = time.monotonic()
@@ -144,7 +144,7 @@ def attempt(job: Job, worker: str) -> Ended:
         why, ends_all = str(mistake), isinstance(mistake, DiskFull)
     except MemoryError as error:
         where = "".join(traceback.format_exception(error))[-TRACEBACK_CHARACTERS:]
-        why = f"out of memory ({str(error) or 'no more'}), of what its process may have (--memory-limit)\n{where}"
+        why = f"out of memory ({str(error) or 'no more'}): its process has a limit (--memory-limit)\n{where}"
     except Exception as error:
         why, is_bug = "".join(traceback.format_exception(error))[-TRACEBACK_CHARACTERS:], True
     seconds, peak_mb = time.monotonic() - began, 0.0
@@ -176,23 +176,23 @@ class Shard:
         found = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
         shard = cls(int(found[1]), int(found[2])) if found else None
         if shard is None or not 1 <= shard.number <= shard.count <= MOST:
-            raise UserError(f"--shard {text!r}: is no part of a whole", legal=f"1/10 to 10/10, for up to {MOST} parts")
+            raise UserError(f"--shard {text!r}: is not a part", legal=f"1/10 to 10/10, for up to {MOST} parts")
         return shard
 
     @property
     def is_whole(self) -> bool:
-        """Return whether there is no other part."""
+        """Return whether this part is the whole sweep."""
         return self.count == 1
 
     def __str__(self) -> str:
         return f"{self.number}/{self.count}"
 
     def part(self, total: int) -> range:
-        """Return this shard's part of ``total`` things in a row; the parts of all shards are all, each once."""
+        """Return this shard's range of ``total`` items; the ranges of all shards cover each item exactly once."""
         return range((self.number - 1) * total // self.count, self.number * total // self.count)
 
     def rotated(self, things: Sequence[T]) -> list[T]:
-        """Return all things, beginning at this shard's own place."""
+        """Return all items, beginning at this shard's own place."""
         start = self.part(len(things)).start
         return [*things[start:], *things[:start]]
 
@@ -217,10 +217,10 @@ def _held(path: Path, *, shared: bool) -> Iterator[None]:
     with opened_lock(path) as file:
         answer = lock(file, shared=shared, wait=False)
         if answer == "busy":
-            said = f"{path.parent}: another sweep is at work in this folder"
+            said = f"{path.parent}: another sweep is running in this folder"
             raise UserError(said, fix="wait for it, or name another folder with --out")
         if answer == "no locks":
-            print(f"{path.parent}: cannot be locked on this system: start no second sweep in it", file=sys.stderr)
+            print(f"{path.parent}: cannot be locked on this system: do not start a second sweep in it", file=sys.stderr)
         yield
 
 
@@ -267,30 +267,30 @@ def code_of(detectors: Iterable[str]) -> dict[Stage, Code]:
 
 
 def add_engine_options(parser: argparse.ArgumentParser) -> None:
-    """Add them, in a group of their own."""
-    add = parser.add_argument_group("how it is run").add_argument
+    """Add these options, in a group of their own."""
+    add = parser.add_argument_group("execution").add_argument
     processes = "processes, or workers of a cluster (default: 2)"
     add("--jobs", type=whole_number(4096), default=2, metavar="N", help=processes)
     add("--serial", action="store_true", help="run everything in this process, for a debugger; without limits")
     help = "run on a Dask cluster: tcp://host:8786, or jobqueue:slurm and the like as your Dask configuration has it"
     add("--scheduler", metavar="ADDRESS", help=help)
-    add("--shard", metavar="K/N", help="run the k-th of n parts only, such as 3/10; python -m harness.merge joins them")
-    add("--retry-failed", action="store_true", help="run again what failed, crashed or timed out before")
+    add("--shard", metavar="K/N", help="run part K of N only, such as 3/10; python -m harness.merge joins them")
+    add("--retry-failed", action="store_true", help="run again the trials that failed, crashed or timed out before")
     for name, unit, default, meaning in (
-        ("--time-limit", "SECONDS", 900.0, "that one trial or render may take"),
-        ("--memory-limit", "GB", 4.0, "that a trial's process may take, on a cluster too"),
-        ("--cache-limit", "GB", 20.0, "of stored renders; the longest unused go first"),
+        ("--time-limit", "SECONDS", 900.0, "time that one trial or render may take"),
+        ("--memory-limit", "GB", 4.0, "memory that a trial's process may use, also on a cluster"),
+        ("--cache-limit", "GB", 20.0, "size of all stored renders; the least recently used are removed first"),
     ):
         add(name, type=_positive, default=default, metavar=unit, help=f"{meaning} (default: {default:g})")
 
 
 def engine_options(options: argparse.Namespace) -> EngineOptions:
-    """Return the options that were given. Raises UserError where they make no sense."""
+    """Return the options that were given. Raises UserError where they contradict each other."""
     if options.serial and options.scheduler is not None:
         raise UserError("--serial and --scheduler: ask for different engines", fix="leave one of them out")
     if options.memory_limit < LEAST_MEMORY_GB:
         legal = f"{LEAST_MEMORY_GB:g} GB or more; 1 GB is enough for most trials"
-        said = f"--memory-limit {options.memory_limit:g}: a process needs more than that to begin with"
+        said = f"--memory-limit {options.memory_limit:g}: a process needs more than that to start"
         raise UserError(said, legal=legal)
     limits = Limits(options.time_limit, round(1000 * options.memory_limit))
     shard = WHOLE if options.shard is None else Shard.of(options.shard)

@@ -63,9 +63,9 @@ def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Proble
     boards_at = source.place_of(("threshold", "calibrate", "boards"))
     if config.study is None and drawn:
         fix = "add for instance study: {boards: 60, hole_free_boards: 60}, or choose target: {name: thesis}"
-        yield Problem("a family of boards is for a study", source.place_of(TARGET), fix=fix)
+        yield Problem("a family of boards needs a study", source.place_of(TARGET), fix=fix)
     elif config.study is None and calibrate is not None and calibrate.boards is not None:
-        yield Problem("only a study has boards to draw", boards_at, fix="write `repeats` in its place")
+        yield Problem("only a study draws boards", boards_at, fix="write `repeats` in its place")
     elif config.study is not None and not isinstance(target, DrawnTargetConfig):
         fix = "write source.target: {name: drawn}"
         yield Problem("a study needs a family of boards", source.place_of(TARGET), fix=fix)
@@ -73,7 +73,7 @@ def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Proble
         return
     if config.sensitivity is not None:
         fix = "sweep the key, or run the study once for each value with --set"
-        yield Problem("a study takes no sensitivity", source.key_place_of(("sensitivity",)), fix=fix)
+        yield Problem("a study cannot have a sensitivity", source.key_place_of(("sensitivity",)), fix=fix)
     # what is a hit and which rate of false calls is wanted are the study's rules, the same for all its set-ups
     for path in config.sweep:
         if path.split(".")[0] == "matching" or path == "threshold" or path.startswith("threshold.calibrate"):

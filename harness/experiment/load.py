@@ -1,4 +1,4 @@
-"""Loading an experiment from a YAML file and ``--set`` overrides, or telling everything that is wrong with it."""
+"""Loading an experiment from a YAML file and ``--set`` overrides, with all of its mistakes reported at once."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def load_experiment(path: Path, overrides: Sequence[str] = (), calibration: Path
     # a file that a result folder holds states its version; a file that is written by hand states none
     found = stamp_of(written.text, STAMP_KIND)
     if found is not None:
-        again = "take the experiment that it was made from, or remove the first line and mend what is refused then"
+        again = "use the experiment that it was made from, or remove the first line and correct what is then refused"
         check_version(found, EXPERIMENT_VERSION, path, "an experiment", again=again)
     source, problems = overridden(written, overrides, declared_of)
     source = _with_absolute_paths(source, path.resolve().parent)
@@ -116,6 +116,6 @@ def lens_numbers(recording: Path, cameras: Iterable[str]) -> dict[str, Any]:
         if (nominal.width, nominal.height) != (lens.width, lens.height):
             legal = f"{nominal.width} x {nominal.height}, as {name} has"
             fix = "name a recording of the same camera in the same mode, or choose another source.camera.name"
-            said = f"{recording}: the calibration is of {lens.width} x {lens.height} pixels"
+            said = f"{recording}: the calibration is for {lens.width} x {lens.height} pixels"
             raise UserError(said, legal=legal, fix=fix)
     return numbers_of_lens(lens)

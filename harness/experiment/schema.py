@@ -1,7 +1,7 @@
-"""The keys of an experiment's YAML, and its points: all that decides their numbers, and the digests that name them.
+"""The keys of an experiment's YAML, and its points: what decides their numbers, and the digests that name them.
 
 Ranges of single fields are here; what concerns several together is in `checks`. A digest covers content that can change
-a number and nothing else: not the name, the number of repeats, or what the other points are. So adding a value to an
+a number and nothing else: not the name, the number of repeats, or the other points. So adding a value to an
 axis leaves every other point, its seeds and its finished trials as they were."""
 
 from __future__ import annotations
@@ -224,7 +224,7 @@ def splices_of(data: Any) -> shape.Splices:
 
 
 def declared_of(data: Any) -> shape.Declared:
-    """Return what ``data`` is meant to fill, the settings of the detector that it names included."""
+    """Return the declaration for ``data``, including the settings of the detector that it names."""
     return shape.Declared(ExperimentConfig, data, splices_of(data))
 
 

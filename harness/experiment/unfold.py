@@ -38,7 +38,7 @@ def key_path(text: str) -> KeyPath:
 def set_path(data: Any, path: KeyPath, value: Any, declared: shape.Declared | None = None, above: KeyPath = ()) -> Any:
     """Return a copy of ``data`` with the value at ``path`` replaced or added. With ``declared``, a mapping missing on
     the way is filled with its defaults, and a new kind of a mapping (``merge.kind``) leaves out what only the former
-    has. ``above``: where ``data`` stands. Raises PathError where the way is barred."""
+    has. ``above``: where ``data`` stands. Raises PathError where the path cannot be followed."""
     if not path:
         return value
     key, rest = _index(data, path[0], above), path[1:]
@@ -82,12 +82,12 @@ def path_problem(path: KeyPath, declared: shape.Declared, place: Place | None) -
 
 
 def overridden(source: Source, overrides: Sequence[str], declared_of: shape.DeclaredOf) -> tuple[Source, list[Problem]]:
-    """Return the source with every legal ``path=value`` applied in order, and what is wrong with the others."""
+    """Return the source with every legal ``path=value`` applied in order, and the problems of the others."""
     problems: list[Problem] = []
     parts = [(text, *text.partition("=")[::2], Place(OPTION, 0, 1, text, max(1, text.find("=")))) for text in overrides]
     for text, name, written, place in parts:
         if not name.strip() or not written.strip():
-            fix = "write null for nothing" if "=" in text and name.strip() else None
+            fix = "write null for no value" if "=" in text and name.strip() else None
             problems.append(Problem("not of the form path=value", place, "capture.frames=10", fix=fix))
             continue
         path, declared = key_path(name.strip()), declared_of(source.data)

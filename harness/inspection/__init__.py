@@ -1,3 +1,3 @@
-"""The work of `harness.detect`: from captures and arguments to findings, told and written."""
+"""The work of `harness.detect`: from captures and arguments to findings, printed and written."""
 
 from __future__ import annotations

@@ -37,16 +37,16 @@ READING = ("unit", "topic", "array", "pitch", "raw")  # options that `open_captu
 
 def add_reading(add: Callable[..., Any]) -> None:
     """Add the options that say how captures are read, by a parser's or a group's ``add_argument``."""
-    add("--unit", help="of the stored distances: mm, m, cm, um, in, tum (5000/m) or N/m; default: as the data say")
-    add("--intrinsics", metavar="FILE|CAMERA", help="lens of the depth pixels: a file, or a camera's nominal one")
-    add("--topic", help="of a ROS bag: the topic with the depth images or clouds (default: the only one)")
-    add("--array", metavar="NAME[:NUMBER]", help="of a .npz, .mat or .npy: the array, and which of several maps in it")
+    add("--unit", help="unit of stored distances: mm, m, cm, um, in, tum (5000/m) or N/m; default: from the data")
+    add("--intrinsics", metavar="FILE|CAMERA", help="lens of the depth pixels: a file, or a camera (nominal lens)")
+    add("--topic", help="topic of a ROS bag with depth images or clouds (default: the only one)")
+    add("--array", metavar="NAME[:NUMBER]", help="name of the array in a .npz, .mat or .npy, and number of the map")
     add("--pitch", metavar="LENGTH", help="the array is a height map with this distance between pixels, such as 0.5mm")
-    add("--raw", metavar="LAYOUT", help="of a file of bare numbers: WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]], 640x480:u2")
+    add("--raw", metavar="LAYOUT", help="layout of bare numbers: WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]], 640x480:u2")
 
 
 def reading_of(options: argparse.Namespace) -> dict[str, Any]:
-    """Return what `add_reading`'s options state but the lens, for `opened`."""
+    """Return the values of `add_reading`'s options except the lens, for `opened`."""
     return {name: getattr(options, name) for name in READING}
 
 
@@ -66,13 +66,13 @@ def refuse_misfits(arguments: argparse.Namespace, paths: list[Path]) -> None:
         return
     if len(paths) < 2:
         fix = "name the other views, or leave out --register"
-        raise UserError(f"{len(paths)} view to register: there is nothing to register it to", fix=fix)
+        raise UserError(f"{len(paths)} view cannot be registered: there is no other view", fix=fix)
     refuse_repeats(paths)
     if arguments.register == "nominal" and arguments.poses is None:
-        raise UserError("--register nominal takes the poses as they are, and there are none", fix="give --poses FILE")
+        raise UserError("--register nominal uses the stated poses, and none are stated", fix="give --poses FILE")
     if arguments.quiet_capture is not None:
         what = "--quiet-capture is one cloud, and its noise is not that of a cloud merged from several views"
-        raise UserError(what, fix="give a threshold that is silent on undamaged views as --threshold")
+        raise UserError(what, fix="state with --threshold a value at which undamaged views have no finding")
 
 
 def refuse_repeats(paths: Sequence[Path]) -> None:
@@ -81,7 +81,7 @@ def refuse_repeats(paths: Sequence[Path]) -> None:
     for path, place in zip(paths, places, strict=True):
         if places.count(place) > 1:
             legal = "captures from different places, each named once"
-            raise UserError(f"{path}: is named twice; the same noise counted twice would pass for less", legal=legal)
+            raise UserError(f"{path}: is named twice; counting the same noise twice would understate it", legal=legal)
 
 
 def detector_of(
@@ -96,11 +96,11 @@ def detector_of(
         # of several views --crop is the mapping's, and so is --target
         settings["crop"] = crop_from_text(crop, arguments.target if crop == arguments.crop else None)
     elif arguments.target is not None:
-        raise UserError(f"--target {arguments.target}: detector {arguments.detector} has no crop that could take it")
+        raise UserError(f"--target {arguments.target}: detector {arguments.detector} has no crop to choose it")
     reference = getattr(arguments, "reference", None)
     if reference is not None:
         if "surface" not in known.model_fields:
-            raise UserError(f"--reference {reference}: detector {arguments.detector} has no surface that it could be")
+            raise UserError(f"--reference {reference}: detector {arguments.detector} has no surface setting")
         settings["surface"] = {"shape": "mesh", "reference": {"file": str(reference)}}
     elif "surface" in known.model_fields and not any(each.startswith(STATED_SURFACE) for each in assignments):
         settings["surface"] = {"shape": "auto"}
@@ -111,7 +111,7 @@ def detector_of(
 
 
 def mapping_of(arguments: argparse.Namespace) -> MappingConfig:
-    """Return the settings from views to one cloud. Raises UserError where they are not legal, every problem at once."""
+    """Return the settings that merge views to one cloud. Raises UserError with every problem at once."""
     from detectors.mapping.settings import MappingConfig
     from harness.vocabulary.declaration.diagnose import settings_of
 
@@ -131,7 +131,7 @@ def crop_from_text(text: str, target: int | None = None) -> dict[str, Any]:
     """Return the crop's declaration from text, with the automatic crop's candidate. Raises UserError."""
     kind, _, values = text.partition(":")
     if target is not None and text != "auto":
-        what = f"--target {target}: chooses among what --crop auto finds, and --crop {text} is another crop"
+        what = f"--target {target}: chooses among what --crop auto finds, but --crop {text} is another crop"
         raise UserError(what, fix="leave out one of the two")
     try:
         numbers = [float(value) for value in values.split(",")] if values else []
@@ -154,7 +154,7 @@ def assign(settings: dict[str, Any], assignment: str) -> None:
     """Put one KEY=VALUE into nested settings; the value is JSON where it can be, else text. UserError without one."""
     path, equals, text = assignment.partition("=")
     if not (path and equals):
-        raise UserError(f"--set {assignment}: no value", legal="KEY=VALUE, for instance surface.degree=5")
+        raise UserError(f"--set {assignment}: has no value", legal="KEY=VALUE, for instance surface.degree=5")
     try:
         value = json.loads(text)
     except (ValueError, RecursionError):
@@ -215,7 +215,7 @@ def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
         with np.errstate(over="ignore", invalid="ignore"):
             is_rigid = np.allclose(turn @ turn.T, np.eye(3), atol=RIGID_WITHIN) and np.linalg.det(turn) > 0
         if not (is_rigid and np.isfinite(pose).all() and np.array_equal(pose[3], [0, 0, 0, 1])):
-            raise UserError(f"{path}: pose {number} is no rigid 4x4 transform", legal=LEGAL_POSES)
+            raise UserError(f"{path}: pose {number} is not a rigid 4x4 transform", legal=LEGAL_POSES)
         if number:
             with np.errstate(over="ignore", invalid="ignore"):
                 from_first.append(invert(poses[0]) @ pose)
@@ -252,7 +252,7 @@ def _from_lines(path: Path, text: str) -> list[np.ndarray]:
             except ValueError:
                 shift = []
             if len(shift) != 3 or not abs(np.linalg.norm([x, y, z, w]) - 1) < RIGID_WITHIN:
-                raise UserError(f"{path}:{number}: is no pose", legal=LEGAL_POSES)
+                raise UserError(f"{path}:{number}: is not a pose", legal=LEGAL_POSES)
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = Rotation.from_quat([x, y, z, w]).as_matrix(), shift
             poses.append(pose)

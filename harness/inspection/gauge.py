@@ -69,21 +69,21 @@ class Gauge(Config):
 
 
 def read_gauge(path: Path) -> Gauge:
-    """Read the truth file of `harness.gauge`. Raises UserError where it cannot be read or is none."""
+    """Read the truth file of `harness.gauge`. Raises UserError where it cannot be read or is another file."""
     legal = "the gauge.json that python -m harness.gauge wrote"
     try:
         data = strict_json(bounded_bytes(path, RECORD_BYTES))
     except (OSError, ValueError) as error:
         raise UserError(f"--gauge {path}: cannot be read ({error})", legal=legal) from error
     if not isinstance(data, dict) or "gauge_version" not in data:
-        raise UserError(f"--gauge {path}: is no truth file of a gauge", legal=legal)
+        raise UserError(f"--gauge {path}: is not the truth file of a gauge", legal=legal)
     check_version(data.pop("gauge_version"), GAUGE_VERSION, path, "a gauge")
     return settings_of(Gauge, data, f"--gauge {path}")
 
 
 @dataclass(frozen=True)
 class GaugeRow:
-    """A hole in a capture. ``found`` "NA": not all around it was judged; ``offset_mm`` and ``score`` of the hit.
+    """A hole in a capture. ``found`` "NA": it was not judged all around; ``offset_mm`` and ``score`` of the hit.
     ``counted``: detector with its version, its threshold in units of score, and the hit radius, mm."""
 
     board: str
@@ -155,13 +155,13 @@ def seen_on(gauge: Gauge, judged: Judged, detector: str, threshold: float) -> Ga
         T_camera_board = kabsch(on_board, in_camera, np.ones(len(marks)))
         apart_m = np.linalg.norm(transform_points(T_camera_board, on_board) - in_camera, axis=-1)
         fit_mm = float(np.sqrt((apart_m**2).mean())) / MM
-        notes.append(f"{board.name}: {len(marks)} marks, {fit_mm:.2f} mm from where the board has them")
+        notes.append(f"{board.name}: {len(marks)} marks, {fit_mm:.2f} mm (rms) from their places on the board")
         if fit_mm > WORST_FIT_MM:
             doubt = f"its marks are {fit_mm:.1f} mm off: was it printed at 100 %, and is it flat?"
             warnings.append(f"{board.name}: {doubt}")
         own, beside = _matched(board, counted, judged, invert(T_camera_board))
         if unjudged := [str(row.hole.id) for row in own if row.found == "NA"]:
-            told = "is not judged all around, as near the edge of what is judged: it counts neither as hit nor as miss"
+            told = "is too near the edge of the judged area: it counts neither as a hit nor as a miss"
             warnings.append(f"{board.name}: hole {', '.join(unjudged)} {told}")
         rows += own
         calls += beside

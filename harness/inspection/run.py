@@ -1,4 +1,4 @@
-"""`harness.detect` step by step: one capture, or several views that become one cloud, judged and told in one way."""
+"""`harness.detect` step by step: one capture, or several views that become one cloud, judged and reported alike."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ OPEN_MM, FILTER_PX = 75.0, 3.0
 
 
 def refuse_thresholds(arguments: argparse.Namespace) -> None:
-    """Raise UserError where several arguments set the threshold, or where its value is none."""
+    """Raise UserError where several arguments set the threshold, or its value is not legal."""
     given = [f"--{name.replace('_', '-')}" for name in THRESHOLDS if getattr(arguments, name) is not None]
     if len(given) > 1:
         raise UserError(f"{' and '.join(given)} set the threshold", fix="give one of them")
@@ -108,11 +108,11 @@ def threshold_of(
     notes = {**evidence.notes, "own_null": {name: getattr(own, name) for name in names}}
     told = f"{own.peaks} peaks towards the camera"
     if own.objects:
-        told += f"; beside objects, tags and edges in the picture ({own.objects} places), where more are to be expected"
+        told += f"; expect more beside objects, tags and edges in the picture ({own.objects} places)"
     if not cloud.organised:
         told += "; objects on the target were not looked for"
     if own.rim_pixels:
-        told += f"; {own.rim_pixels} pixels along the rim mix in what lies behind it and are not judged"
+        told += f"; {own.rim_pixels} pixels along the rim are mixed with the background and are not judged"
     if own.doubts:
         k = max(DEFAULT_K, own.threshold) if math.isfinite(own.threshold) else DEFAULT_K
         warnings = tuple(f"the capture cannot set its own threshold, {k:.3g} is used: {why}" for why in own.doubts)
@@ -298,7 +298,7 @@ def _merged(
             if number:
                 by_marks = register_by_marks(reference, each)
                 if by_marks.failure:
-                    print(f"note: {each.view.name} starts from where {reference.view.name} stands: {by_marks.failure}")
+                    print(f"note: {each.view.name} starts from the pose of {reference.view.name}: {by_marks.failure}")
                 else:
                     guess = by_marks.T_reference_view
             prepared[number] = replace(each, view=replace(each.view, T_reference_view_guess=guess))

@@ -1,4 +1,4 @@
-"""The results as text on the terminal, as facts for the JSON, and as a scene that turns in the browser."""
+"""The results as text on the terminal, as facts for the JSON, and as a 3-D scene for the browser."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def print_warnings(warnings: Iterable[str]) -> None:
 
 
 def print_notes(notes: Iterable[str]) -> None:
-    """Print a line for each thing that is good to know."""
+    """Print a line for each fact that helps to read the numbers."""
     for note in notes:
         print(f"note: {note}")
 
@@ -54,7 +54,7 @@ def print_capture(recording: Recording, cloud: Cloud, name: str, kept: np.ndarra
     print(recording.unit_text)
     print_notes(recording.notes)
     if cloud.noise_reach_px > WIDEST_NATIVE_PX:
-        why = "the depth was upsampled, aligned to another camera or smoothed; sizes are taken with that blur"
+        why = "the depth was upsampled, aligned to another camera or smoothed; sizes are measured with that blur"
         print(f"note: {cloud.noise_reach_px:.0f} pixels share their noise: {why}")
     for left in cloud.left_out:
         print(f"left out: {left.name}: {left.why}")
@@ -66,7 +66,7 @@ def print_marks(prepared: PreparedView) -> None:
     marks = prepared.marks
     doubts = "; ".join(sorted({mark.doubt for mark in marks.marks if mark.doubt}))
     in_doubt = f"; in doubt: {doubts}" if doubts else ""
-    print(f"marks: {len(marks.trusted)} of {len(marks.marks)} to be relied on{in_doubt}")
+    print(f"marks: {len(marks.trusted)} of {len(marks.marks)} are reliable{in_doubt}")
     print_notes(filter(None, (*marks.notes, marks.problem)))
 
 

@@ -1,1 +1,1 @@
-"""The user's own camera: what its static captures tell, the camera file that repeats it, its page and certificate."""
+"""The user's own camera: measurement from static captures, a camera file that reproduces it, page and certificate."""

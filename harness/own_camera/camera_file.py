@@ -1,7 +1,7 @@
-"""The camera file that repeats what captures show: a known camera's model refitted, or an empirical camera.
+"""The camera file that reproduces the captures: a known camera's model refitted, or an empirical camera.
 
-A refitted model takes the unit's lens, gain, fixed pattern, displaced frames and, where the captures tell it, the gate
-of faint pixels; all else stays the known camera's. The surfaces have one albedo, which is stated and not measured."""
+A refitted model takes the unit's lens, gain, fixed pattern, displaced frames and, where the captures show it, the gate
+of faint pixels; all other numbers are those of the known camera. The surfaces' albedo is stated and not measured."""
 
 from __future__ import annotations
 
@@ -50,18 +50,18 @@ STEPS, CLOSE, FARTHEST, FEW_FRAMES = 5, 0.01, 100.0, 12
 """Steps of the gain's fit, the relative error at which it ends, the largest change, and frames of a step."""
 EDGE_SHARE = 2.56
 """Width of a blurred edge between a tenth and nine tenths of its step, in deviations of the Gaussian."""
-NOT_TOLD = "not told by the captures"
+NOT_TOLD = "not determined by the captures"
 
 
 def opened_as(camera: str | None, paths: Sequence[Path], intrinsics: str | None, **reading: Any) -> Recording:
-    """Open a capture; without a lens anywhere, the nominal one of the ``camera`` that took it counts."""
+    """Open a capture; without a lens anywhere, the nominal lens of ``camera`` is used."""
     try:
         return opened(paths, intrinsics, **reading)
     except UserError:
         if camera is None or intrinsics is not None:
             raise
         recording = opened(paths, None, lens=load_camera(camera).nominal_lens, **reading)
-        note = f"the capture names no lens; the nominal one of {camera} counts"
+        note = f"the capture names no lens; the nominal lens of {camera} is used"
         return replace(recording, notes=(*recording.notes, note))
 
 
@@ -72,11 +72,11 @@ def camera_of_size(lens: Lens) -> str:
     known = [name for name in fitting if not guessed_precision(load_camera(name))]
     if len(known or fitting) == 1:
         return (known or fitting)[0]
-    wrong, size = f"{lens.width} x {lens.height} pixels", "record the camera's own depth images, not ones aligned to a"
+    wrong, size = f"{lens.width} x {lens.height} pixels", "record the camera's own depth images, not aligned to a"
     raise UserError(
         f"several cameras have {wrong}: {', '.join(fitting)}" if fitting else f"no simulated camera has {wrong}",
         legal=", ".join(f"{name} {own.width} x {own.height}" for name, own in sizes.items()),
-        fix="name the one that took it with --camera" if fitting else f"{size} colour camera or of another mode",
+        fix="name the camera that took it with --camera" if fitting else f"{size} colour camera or of another mode",
     )
 
 
@@ -162,7 +162,7 @@ def _empirical(found: Characteristics, albedo: float, source: str) -> Iterator[S
     for key, value, error in zip(("range_exponent", "brightness_exponent"), law.exponents, law.errors, strict=True):
         told = (f"standard error {error:.2g}; {source}", "O") if np.isfinite(error) else (f"assumed: {NOT_TOLD}", "M")
         yield Stated("noise", key, value, *told)
-    doubt = "not told without a flat surface" if pattern is None else "; ".join((source, *pattern.field.warnings))
+    doubt = "not determined without a flat surface" if pattern is None else "; ".join((source, *pattern.field.warnings))
     yield Stated("fixed_pattern", "deviation_mm", 0.0 if pattern is None else pattern.field.rms_m / MM, doubt)
     shared = np.ones((2, 1)) if found.pattern_correlation is None else found.pattern_correlation
     for section, both, said in (("noise", found.correlation, source), ("fixed_pattern", shared, doubt)):

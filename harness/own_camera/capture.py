@@ -23,7 +23,7 @@ def run_capture(options: argparse.Namespace, command: str) -> int:
     """Compare, print, write capture.html, the tables and provenance.json. Returns 0. Raises UserError for what cannot
     be read or simulated: too few frames, another size, no plane, no lens."""
     if len(options.camera) > 1:
-        raise UserError("--capture: one camera took it", fix="give --camera once, or not at all")
+        raise UserError("--capture: a capture comes from one camera", fix="give --camera once, or not at all")
     if not 0 < options.albedo <= 1:
         raise UserError(f"--albedo {options.albedo:g}", legal="above 0 and up to 1")
     first = slice(options.frames) if options.frames else None
@@ -42,7 +42,7 @@ def run_capture(options: argparse.Namespace, command: str) -> int:
     twin = characteristics(simulated(camera, found, options.albedo))
     rows = beside(found, twin, None)
     ratios = ", ".join(f"{row.ratio:.2f} ({row.where})" for row in rows if row.figure == "temporal noise")
-    answer = f"Simulated noise of a pixel, in parts of the measured: {ratios}. Albedo {options.albedo:g} is assumed."
+    answer = f"Ratio of simulated to measured noise of a pixel: {ratios}. Albedo {options.albedo:g} is assumed."
     title = f"{capture.name} beside the simulated {camera.title}"
     facts = {"camera": name, "files": [str(path) for path in recording.files], "notes": recording.notes}
     sources = {MEASURED: found, SIMULATED: twin}

@@ -1,4 +1,4 @@
-"""Two pages to file or to send: what was measured of one unit, in the terms of the standards, and what that is worth.
+"""Two pages to file or to send: the measurements of one unit, in the terms of the standards, and their validity.
 
 The terms are those of VDI/VDE 2634 part 2 and ISO 10360-13 (optical 3D measuring systems), and of MIL-HDBK-1823A, ASTM
 E2862 and E3023 (probability of detection). Figures are in their manner: neither their artefacts nor their procedures
@@ -111,14 +111,14 @@ def write_certificate(
     surfaces = list(of_surfaces(found))
     share = "The camera's figures are measured."
     if study is not None:
-        implanted = "Of the detection limits the frames are measured and the damage is simulated."
+        implanted = "For the detection limits, the frames are measured and the damage is simulated."
         share += f" {implanted if study.name == 'implant' else 'The detection limits are simulated.'}"
     answer = f"{many(found.frames, 'frame')} in {many(len(found.captures), 'capture')}, {len(found.jumps_m)} displaced."
     for one in found.surfaces[:1]:
         recorded = next(int(capture.kept.sum()) for capture in found.captures if capture.name == one.capture)
         lod_mm = level_of_detection_mm(found, (one.temporal.value * MM) ** 2, frames := min(recorded, LOD_FRAMES[-1]))
         noise = f"A pixel's noise is {one.temporal.value:.3g} mm at {one.distance_m:.2f} m"
-        lod = f"the mean of {many(frames, 'recorded frame')} tells a change of {lod_mm:.3g} mm (LoD95)"
+        lod = f"the mean of {many(frames, 'recorded frame')} shows a change of {lod_mm:.3g} mm (LoD95)"
         answer = f"{noise}; {lod}. {answer}"
     body = [PRINTED, heading("Unit"), bullets(f"{key}: {value}" for key, value in about.items())]
     body += [heading("Measured"), FLAT_SURFACES.grid(surfaces).html(), note(OF_SURFACES), CERTIFIED.grid(rows).html()]

@@ -1,8 +1,8 @@
-"""Characteristics that static captures of a depth camera tell: noise, correlation, dropouts, whole frames, edges.
+"""Characteristics of a depth camera, measured on static captures: noise, correlation, dropouts, whole frames, edges.
 
 Flat surfaces are found in each capture; where there is none, every pixel with a steady range counts, and neither angle
-nor fixed pattern nor edges are told. Temporal noise is that of single pixels about their own mean, each frame's
-displacement taken off. Not told: errors that all frames and all pixels share, and noise slower than the capture."""
+nor fixed pattern nor edges are measured. Temporal noise is that of single pixels about their own mean, each frame's
+displacement subtracted. Not measured: errors that all frames and pixels share, and noise slower than the capture."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def read_still(recording: Recording, used: np.ndarray | None = None) -> StillCap
     has too few frames, no grid of pixels, no lens, another size than ``used``, or where nothing in it varies."""
     name, lens, slopes = recording.name, recording.lens, recording.slopes
     if not recording.organised or lens is None or slopes is None:
-        what = f"{name}: points without a pixel grid and a lens do not tell a camera's noise"
+        what = f"{name}: points without a pixel grid and a lens do not show a camera's noise"
         raise UserError(what, legal="depth images with a lens", fix="name a lens with --intrinsics")
     frames = [frame for frame in islice(recording.frames(), MOST_FRAMES) if np.isfinite(frame.z_m).any()]
     if len(frames) < LEAST_FRAMES:
@@ -407,7 +407,7 @@ def edge_of(captures: Sequence[StillCapture]) -> EdgeFigures | None:
 
 @dataclass(frozen=True)
 class Characteristics:
-    """All that captures of one camera tell. ``correlation`` (2, lags): of the noise along x and y;
+    """The results of all captures of one camera. ``correlation`` (2, lags): of the noise along x and y;
     ``pattern_correlation`` likewise of the fixed pattern, None where that is not told."""
 
     captures: tuple[StillCapture, ...]
@@ -442,24 +442,24 @@ class Characteristics:
 
     @cached_property
     def doubts(self) -> tuple[str, ...]:
-        """Full sentences on what these captures cannot tell, or tell wrongly."""
+        """Full sentences on what these captures cannot show, or show wrongly."""
         said, law, first = [], self.law, self.captures[0]
         if not self.surfaces:
-            said.append("no flat surface was found: angle, plane fit, fill rate, fixed pattern and edges are not told")
+            said.append("no flat surface was found: angle, plane fit, fill rate, fixed pattern and edges are unknown")
         if np.isnan(law.errors[0]):
             near, far = law.range_m.min(), law.range_m.max()
-            said.append(f"surfaces between {near:.2f} and {far:.2f} m do not tell how the noise grows with range: the"
+            said.append(f"surfaces between {near:.2f} and {far:.2f} m do not show how the noise grows with range: the"
                         f" power {law.exponents[0]:g} is assumed")  # fmt: skip
         if not self.has_amplitude:
-            said.append("no amplitude is recorded: noise and dropouts of darker surfaces are not told")
+            said.append("no amplitude is recorded: noise and dropouts of darker surfaces are unknown")
         if np.isnan(law.errors[1]):
-            said.append("brightness hardly varies, or only together with range: how noise depends on it is not told,"
+            said.append("brightness hardly varies, or only together with range: how noise depends on it is unknown,"
                         f" and the power -{law.exponents[1]:g} is assumed")  # fmt: skip
         noise, sigma_m = first.noise_m[:, first.steady], float(np.sqrt(np.nanmedian(first.variance_m2[first.steady])))
         alike = float(np.nanmean(noise[1:] * noise[:-1]) / np.nanmean(noise**2)) + 1 / len(noise)
         if alike > SLOW:
             said.append(f"successive frames share their noise (correlation {alike:.2f}): they were averaged over time"
-                        " or repeated, and single frames are noisier than told")  # fmt: skip
+                        " or repeated, and single frames are noisier than stated")  # fmt: skip
         reach = int(np.argmax([*(self.correlation.max(axis=0) < 0.1), True]))
         if reach > WIDE_PX:
             said.append(f"neighbours share their noise over {reach} pixels: the depth was upsampled, aligned to another"
@@ -482,7 +482,7 @@ def characteristics(
     part shape from fixed pattern. Raises UserError for different cameras, and where too few pixels hold still."""
     first = captures[0]
     if other := next((one for one in captures if one.lens != first.lens), None):
-        raise UserError(f"{other.name}: is of another lens than {first.name}", legal="captures of one camera")
+        raise UserError(f"{other.name}: has another lens than {first.name}", legal="captures of one camera")
     cells = tuple(cell for capture in captures for cell in cells_of(capture))
     if not cells:
         what = f"{first.name}: nowhere {LEAST_BIN_PX} pixels at like range, angle and brightness that hold still"

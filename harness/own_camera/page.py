@@ -1,4 +1,4 @@
-"""The page of one's own camera: what its captures show beside what its camera file simulates, with the data files."""
+"""The page of the user's camera: measured figures beside those simulated from its camera file, with the data files."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SHOWN = (RANGE, ANGLE, AMPLITUDE, NEIGHBOURS, PATTERN, SPECTRUM, OF_PATTERN, FRA
 FREQUENCIES = np.linspace(0, 0.5, 41)
 SHOWN_LAGS, SHOWN_PATTERN_LAGS = (1, 2, 3, 5), (1, 3, 5, 10)
 CAPTION = (
-    "The surfaces that were found; temporal noise against range, angle and amplitude, each dot of pixels where all "
+    "The surfaces that were found; temporal noise against range, angle and amplitude, each dot for pixels where all "
     "three are alike; correlation of noise and of fixed pattern between neighbours along x and y, and their spectra, "
     "where white noise would be 1; displacement of whole frames; dropouts. The camera file's simulation is orange."
 )
@@ -58,7 +58,7 @@ def own_figures(found: Characteristics) -> Iterator[Told]:
 
 
 def shared_figures(found: Characteristics) -> Iterator[Told]:
-    """Yield the figures that are of no single surface."""
+    """Yield the figures that do not belong to a single surface."""
     for axis, name in enumerate("xy"):
         for lag in SHOWN_LAGS:
             alike = float(found.correlation[axis, lag])
@@ -185,6 +185,6 @@ def _draw(canvas: Figure, found: Characteristics, curves: list[dict[str, Any]]) 
         x, y = diagram.split(" against ")[::-1]
         axis.set(xlabel=x, ylabel=y, yscale="log" if diagram in (SPECTRUM, OF_PATTERN) else "linear")
         if not own:
-            axis.text(0.5, 0.5, "not told by the captures", transform=axis.transAxes, ha="center", color=GREY)
+            axis.text(0.5, 0.5, "not determined by the captures", transform=axis.transAxes, ha="center", color=GREY)
     axes[1].legend(fontsize=8)
     axes[1].set(ylim=(0, None))
