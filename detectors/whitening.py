@@ -134,8 +134,9 @@ def _blurred(image: np.ndarray) -> np.ndarray:
 
 def transformed(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Return the spectrum of an image (r, c), zero beyond, on a grid of even sides, as `cv2.dft` packs it."""
-    beyond = shape[0] - image.shape[0], 0, shape[1] - image.shape[1]
-    return np.asarray(cv2.dft(cv2.copyMakeBorder(image, 0, *beyond, cv2.BORDER_CONSTANT)))
+    padded = np.zeros(shape, np.float32)
+    padded[: image.shape[0], : image.shape[1]] = image
+    return np.asarray(cv2.dft(padded))
 
 
 def packed(half: np.ndarray) -> np.ndarray:
