@@ -122,7 +122,9 @@ def main(options: argparse.Namespace, command: str) -> int:
         told = f"{added} of {many(options.suggest, 'pose')} suggested: no other pose adds to what is covered"
         warnings.insert(0, told)
     if goals:
-        word = "Cheapest" if goals[0]["reached"] else "The goal is not reached; nearest"
+        word = f"Least time of capture ({goals[0]['capture_s']:.0f} s)"
+        if not goals[0]["reached"]:
+            word = f"{100 * options.share:g} % of the face is not reached; nearest to it"
         frames = many(goals[0]["frames"], "frame")
         said = f"{word}: {goals[0]['camera']}, {frames}, {goals[0]['distance_m']:g} m. {said}"
     config, scene = one.point.config, scene_of(patches, limits_mm, one.found)

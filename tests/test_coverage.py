@@ -179,6 +179,6 @@ def test_limits_of_ten_patches_agree_with_full_studies(tmp_path: Path) -> None:
         near = np.argsort(np.linalg.norm(survey.patches.points_m[:, :2] - np.array(place) * 1e-3, axis=1))[:9]
         predicted.append(float(np.median(limits_mm[near])))
     ratio = np.array(predicted) / np.array(list(studied.values()))
-    # the program says that a single patch's limit may be wrong by a third
-    assert np.abs(np.log(ratio)).max() < np.log(1.5), dict(zip(studied, ratio, strict=True))
+    # the program says that a single patch's limit may be wrong by 40 %
+    assert np.abs(np.log(ratio)).max() < np.log(1.45), dict(zip(studied, ratio, strict=True))
     assert np.sqrt(np.mean(np.log(ratio) ** 2)) < np.log(1.2)

@@ -88,7 +88,7 @@ class Findable:
             f"Learnt from {self.damages} damages: the detector's signal is proportional to the {self.size_of} to the "
             f"power {self.coefficients[1]:.2g}, and scatters by {100 * self.scatter:.0f} % where the face is seen "
             f"frontally, by {100 * self.scatter * 2**self.growth:.0f} % at 60°. The limit of a single patch may be "
-            "wrong by a third."
+            "wrong by 40 %."
         )
 
     @property
