@@ -15,7 +15,7 @@ from harness.engine.plan import batch_of, plan_of
 from harness.engine.run import render_missing
 from harness.engine.trial import TrialTask, run_trial
 from harness.engine.work import EngineOptions, engine_of
-from harness.evaluation.coverage import Findable, Inspections, Patches, Seen, findable, in_turn
+from harness.evaluation.coverage import Findable, Patches, ScoredDamage, Seen, findable, in_turn
 from harness.evaluation.pod.hit_miss import fit_hit_miss
 from harness.experiment.load import load_experiment
 from harness.tables.coverage import COVERAGE_TABLES
@@ -30,14 +30,14 @@ def signal_m(size_mm: np.ndarray, seen: Seen) -> np.ndarray:
     return np.asarray(1e-3 * size_mm**1.5 * np.exp(2.0 * seen.cosine - seen.cosine**2) / seen.range_m)
 
 
-def inspections(count: int, looks: int = 4) -> Inspections:
+def inspections(count: int, looks: int = 4) -> ScoredDamage:
     """Damages of `signal_m`, with a logarithmic scatter of `SCATTER` over the cosine of the angle."""
     rng, damage = np.random.default_rng(3), np.repeat(np.arange(count), looks)
     size_mm, cosine, range_m = rng.uniform(0.5, 8, count), rng.uniform(0.4, 1, count), rng.uniform(0.6, 0.9, count)
     seen = Seen(rng.uniform(1e-3, 3e-3, count)[damage], cosine[damage], range_m[damage])
     size_mm, noise = size_mm[damage], rng.standard_normal(len(damage)) * SCATTER / seen.cosine
     score = signal_m(size_mm, seen) / seen.deviation_m * np.exp(noise)
-    return Inspections("depth", damage, size_mm, seen, np.where(score > THRESHOLD, score, np.nan))
+    return ScoredDamage("depth", damage, size_mm, seen, np.where(score > THRESHOLD, score, np.nan))
 
 
 def test_a_patch_has_the_size_whose_signal_is_needed() -> None:

@@ -23,7 +23,7 @@ from harness.engine.run import carried_out, render_missing, run_plan
 from harness.engine.setup import load_set_up
 from harness.engine.trial import PointTask, TrialTask, cloud_of
 from harness.engine.work import Job, JobEngine
-from harness.evaluation.coverage import Findable, Inspections, Patches, Seen, findable
+from harness.evaluation.coverage import Findable, Patches, ScoredDamage, Seen, findable
 from harness.experiment.schema import Experiment, ExperimentConfig, Point, SimulatedSource
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, rotate_vectors, transform_points
@@ -159,7 +159,7 @@ def _each(
 
 def _inspections(
     boards: Sequence[Any], point: Point, scores: Mapping[tuple[str, int, int, str], Sequence[float]]
-) -> Inspections:
+) -> ScoredDamage:
     """All inspections of the damages of boards (`_board_seen`)."""
     facts = list[tuple[float, ...]]()
     for number, damages in boards:
@@ -172,7 +172,7 @@ def _inspections(
     of, plan_mm, depth_mm, *seen, score = np.array(facts).T
     size_of = boards[0][1][0][0].size_of
     word, size_mm = ("depth", depth_mm) if np.ptp(plan_mm) < SAME_MM < np.ptp(depth_mm) else (size_of, plan_mm)
-    return Inspections(word, of, size_mm, Seen(*seen), score)
+    return ScoredDamage(word, of, size_mm, Seen(*seen), score)
 
 
 def _unit_m(batch: Batch, point: PointTask, seed: int) -> np.ndarray:

@@ -53,7 +53,7 @@ class Seen:
 
 
 @dataclass(frozen=True, eq=False)
-class Inspections:
+class ScoredDamage:
     """Inspections of damage, (n,) each: the ``damage``'s number, its ``size_mm`` of what ``size_of`` names, how it is
     ``seen``, and its ``score``: the lowest threshold at which it is found no more, NaN where it was missed at the
     threshold in use, infinite where it was found by missing returns alone."""
@@ -119,7 +119,7 @@ def _design(size_mm: np.ndarray, cosine: np.ndarray, range_m: np.ndarray) -> np.
     return np.column_stack([np.ones(len(size_mm)), np.log(size_mm), cosine, cosine**2, np.log(range_m)])
 
 
-def findable(some: Inspections, threshold: float) -> Findable:
+def findable(some: ScoredDamage, threshold: float) -> Findable:
     """Learn from the inspections of damage where the detector judges. Raises UserError where these do not suffice."""
     judged = np.isfinite(some.seen.deviation_m) & (some.seen.cosine > 0)
     damages, of = len(np.unique(some.damage[judged])), len(np.unique(some.damage))
