@@ -152,7 +152,7 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
     text, scale_m = name, None
     if wavelength is not None:
         scale_m = 0.5 * wavelength * cells.side_m / cells.side
-        text += f", which takes shallow damage wider than {scale_m / MM:.0f} mm for shape"
+        text += f", which absorbs shallow damage wider than {scale_m / MM:.0f} mm"
     if unseen.mean() > 0.001:
         steep = f"seen at more than {STEEPEST_DEG:g} degrees" + " or at an edge of the mesh" * (config.shape == "mesh")
         text += f"; {100 * unseen.mean():.1f} % of the target, {steep}, is not judged"
@@ -358,7 +358,7 @@ def _misfit(cells: _Cells, fit: Fit, name: str) -> tuple[str, dict[str, Any]]:
     share = float(beyond.sum() / max(enough.sum(), 1))
     text = f"the surface does not fit here: {name} leaves {1e3 * rms_m:.2g} mm rms at scales above"
     text += f" {STRUCTURE_CELLS * cells.side_m / MM:.2g} mm, where the noise of a pixel is {1e3 * pixel:.2g} mm, on"
-    text += f" {100 * share:.0f} % of the target; findings there may be its shape"
+    text += f" {100 * share:.0f} % of the target; findings there may be due to its shape"
     notes = {"misfit_share": share, "misfit_rms_m": rms_m, "local_noise_m": pixel}
     return (text if share >= MISFIT_FROM else ""), notes
 

@@ -172,11 +172,11 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
             opening = surfaces.own[back].sum() / max(surfaces.filled[front].sum(), 1)
             return _probability(0.5 / max(opening, 1e-6)), "a surface is seen through a large opening of another"
         if ours.part >= SURROUNDED and ours.behind_m <= it.extent_m[1]:
-            why = f"a thing that covers {covered} lies on a larger surface, or is fixed before it"
+            why = f"an object that covers {covered} lies on a larger surface or close to it"
             return _probability(it.weight / LYING_WEIGHT), why
         if other.cut_off < CUT_OFF:
             ratio = it.extent_m[0] * it.extent_m[1] / max(other.extent_m[0] * other.extent_m[1], 1e-12)
-            why = f"a thing that covers {covered} stands before a surface that is seen whole"
+            why = f"an object that covers {covered} stands in front of a surface whose outline is whole"
             return _probability(ratio / OBSTACLE_AREA), why
         return _probability(it.weight / STANDING_WEIGHT), f"the nearer surface covers only {covered}"
 
@@ -343,11 +343,11 @@ def crop(cloud: Cloud, config: AnyCrop) -> np.ndarray:
         unit = "; the cloud looks as if its unit were not the metre" if z1 > 50_000 or z1 < 5 else ""
         what = f"the crop box ({asked} mm) holds none of the cloud's {len(points)} points{unit}"
         fix = "change crop.x_mm, crop.y_mm, crop.z_mm, or use crop.kind: auto"
-        raise UserError(what, legal=f"limits that meet the cloud: {extent}", fix=fix)
+        raise UserError(what, legal=f"limits that contain points of the cloud: {extent}", fix=fix)
     seen = cloud.region
     where = f"columns {seen.col0} to {seen.col1 - 1}, rows {seen.row0} to {seen.row1 - 1}"
     what = f"the crop ({config.kind}, inset {config.inset_px} px) leaves none of the cloud's {len(points)} points"
-    legal = f"a crop that meets the cloud: {where}; {extent}"
+    legal = f"a crop that contains points of the cloud: {where}; {extent}"
     raise UserError(what, legal=legal, fix="change the crop or lower crop.inset_px")
 
 

@@ -113,7 +113,7 @@ def flattened(cloud: Cloud, mask: np.ndarray, name: str, T_first_camera: np.ndar
     a pixel grid, and where the frames are too few to tell their noise or the pixels to fit a surface."""
     noise_m2 = average_variance_m2(cloud, mask)
     if not cloud.organised or noise_m2 is None:
-        what = f"{name}: {cloud.n_frames} frame{'s' * (cloud.n_frames != 1)}, whose noise cannot be told"
+        what = f"{name}: {cloud.n_frames} frame{'s' * (cloud.n_frames != 1)}: too few to estimate the noise"
         raise UserError(what, legal=f"depth images, {LEAST_FRAMES} frames or more", fix="record 50 frames or more")
     points = cloud.points_m[mask]
     slopes = points[:, :2] / points[:, 2:]
@@ -248,7 +248,7 @@ def _with_doubts(found: Separated) -> Separated:
     said, captures, field, rms_m = [], found.captures, found.field, found.field.rms_m
     if len(captures) == 1 or not _moved(captures):
         told = "one capture" if len(captures) == 1 else "nothing shows that the camera moved between the captures"
-        told += ": the surface's own shape cannot be told from the pattern, and the surface is taken to be flat"
+        told += ": the surface's shape cannot be separated from the pattern and is assumed to be flat"
         said.append(f"{told} (move the camera by {LEAST_SHIFT_M / MM:.0f} mm; if along the surface, state --poses)")
     parts = ((found.in_time, "from the first captures to the last"), (found.in_range, "with distance"))
     known = [(part, apart) for part, apart in parts if part is not None and part.difference_m > SURE * part.noise_m]
@@ -257,7 +257,7 @@ def _with_doubts(found: Separated) -> Separated:
     variance_m2 = field.variance_m2 + 0.75 * max((part.excess_m for part, _ in changes), default=0.0) ** 2
     if changes:
         told = " and ".join(f"{apart} by {part.excess_m / MM:.2g} mm" for part, apart in changes)
-        also = "" if found.separated else ", or the surface is not flat (state --poses to part the two)"
+        also = "" if found.separated else ", or the surface is not flat (state --poses to separate the two)"
         said.append(f"the pattern, {rms_m / MM:.2g} mm, is not stable: it changes {told} beyond its noise{also}")
     return replace(found, field=replace(field, variance_m2=variance_m2, warnings=tuple(said)))
 

@@ -80,7 +80,7 @@ def doubts(cloud: Cloud, field: FlatField, name: str | Path) -> tuple[str, ...]:
     known = np.isfinite(field.error_m[cloud.region.within(field.lens.whole)])
     share = float(known[cloud.valid].mean()) if cloud.valid.any() else 1.0
     if share < WELL_COVERED:
-        said.append(f"the flat field {name} knows {100 * share:.0f} % of the valid pixels; the others stay as they are")
+        said.append(f"the flat field {name} covers {100 * share:.0f} % of the valid pixels; others are not corrected")
     distance_m = float(np.median(cloud.points_m[cloud.valid][:, 2])) if cloud.valid.any() else np.nan
     near, far = field.distances_m
     if distance_m * NEAR_ENOUGH < near or distance_m > far * NEAR_ENOUGH:
@@ -92,12 +92,12 @@ def doubts(cloud: Cloud, field: FlatField, name: str | Path) -> tuple[str, ...]:
 def _refuse_other(cloud: Cloud, field: FlatField) -> None:
     """Raise UserError where the cloud cannot be of the camera and mode of the flat field."""
     if not cloud.organised or cloud.projection != "central":
-        what = "a flat field corrects a camera's own pixels, and this cloud has no grid of them"
+        what = "a flat field corrects a camera's own pixels, and this cloud has no pixel grid"
         raise UserError(what, fix="leave out the flat field, or name the capture's depth images")
     lens, (height, width) = field.lens, cloud.valid.shape
     own = (width, height) if cloud.lens is None else (cloud.lens.width, cloud.lens.height)
     if own != (lens.width, lens.height):
-        what = f"the flat field is of {lens.width} x {lens.height} pixels, the capture of {own[0]} x {own[1]}"
+        what = f"the flat field has {lens.width} x {lens.height} pixels, the capture has {own[0]} x {own[1]}"
         raise UserError(what, legal="the same camera in the same mode", fix=AGAIN)
     if cloud.lens is not None:
         pairs = [(getattr(cloud.lens, name), getattr(lens, name)) for name in ("fx", "fy", "cx", "cy")]
@@ -140,5 +140,5 @@ def load_flat_field(path: Path) -> FlatField:
             raise ValueError("its arrays do not belong together")
     except (KeyError, ValueError, TypeError) as error:
         why = f"it has no {error}" if isinstance(error, KeyError) else str(error)[:200]
-        raise UserError(f"{path}: is no flat field ({why})", legal="a file of harness.flatfield", fix=AGAIN) from error
+        raise UserError(f"{path}: not a flat field ({why})", legal="a file of harness.flatfield", fix=AGAIN) from error
     return FlatField(error_m, variance_m2, lens, (near, far), tuple(told))

@@ -143,7 +143,7 @@ class LocalDetector:
         in metres of the narrowest filter at a typical point; and what a unit of score is, in words."""
         signed, widths, typical_m = _scored(residual_m, weights, rounding_m2)
         text = f"the local noise of means over {widths[0]} to {widths[-1]} pixels"
-        return signed, typical_m, f"{text}, {1e3 * typical_m:.3g} mm of the narrowest at a typical point"
+        return signed, typical_m, f"{text}, {1e3 * typical_m:.3g} mm for the narrowest at a typical point"
 
     def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
         """Return peaks of the score with the pixels above the threshold that belong to each, strongest first. The

@@ -129,7 +129,7 @@ class MatchedDetector(LocalDetector):
         values, unit_m, known = _in_deviations(residual_m, weights, rounding_m2)
         signed, narrowest = _judged(values, known, self._covariance)
         depth_m = narrowest * float(np.median(unit_m[known]))
-        text = f"the deviation of matched filters on whitened noise, {1e3 * depth_m:.3g} mm of the narrowest"
+        text = f"the deviation of matched filters on whitened noise, {1e3 * depth_m:.3g} mm for the narrowest"
         return signed, depth_m, text
 
     def correlation(self, evidence: Evidence) -> np.ndarray:

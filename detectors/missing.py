@@ -173,7 +173,7 @@ def measure_missing(cloud: Cloud, evidence: Evidence, detection: Detection) -> M
     rows, columns = np.nonzero(area)
     placed = _surface_at(cloud, evidence, area)
     if placed is None:
-        raise ValueError("the detection is none that `missing_returns` made of this cloud")
+        raise ValueError("`missing_returns` did not make this detection from this cloud")
     centre, pixel_m2 = placed
     u, v = float(columns.mean()) + cloud.region.col0, float(rows.mean()) + cloud.region.row0
     diameter_m = 2.0 * float(np.sqrt(len(rows) * pixel_m2 / np.pi))

@@ -40,7 +40,7 @@ def front_of(reference: ReferenceConfig) -> tuple[np.ndarray, np.ndarray]:
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     if not (normals[:, 2] > 0).any():
         fix = "state its front, or turn its faces outwards"
-        raise UserError(f"{reference.file}: nothing of it faces {reference.front}", fix=fix)
+        raise UserError(f"{reference.file}: no triangle of it faces {reference.front}", fix=fix)
     return corners, normals
 
 

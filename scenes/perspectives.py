@@ -31,7 +31,7 @@ def check_in_view(config: TargetConfig, optics: Optics) -> None:
         seen_region(config, optics)
         if len(centres):
             message = f"none of the target's {len(centres)} damages is in view of {optics.title}"
-            legal = "one damage or more in view; those out of view are not counted as targets"
+            legal = "at least one damage in view; damage out of view is not counted as a target"
             raise UserError(message, legal=legal, fix="change target.pose, or move the damage")
     range_m = face[..., 2] if optics.limits_along == "axis" else np.sqrt((face**2).sum(axis=-1))
     if range_m.max() < optics.nearest_m or range_m.min() > optics.farthest_m:
@@ -62,7 +62,7 @@ def _face_before_lens(config: TargetConfig, steps: int) -> np.ndarray:
     if nearest_m <= NEAREST_M:
         legal = f"all of the face at least {NEAREST_M:g} m in front of the camera"
         fix = "raise target.pose.distance_m (or target.distance_m) or lower its tilt"
-        raise UserError(f"the target reaches to {nearest_m:.3f} m before the lens", legal=legal, fix=fix)
+        raise UserError(f"the target's nearest point is {nearest_m:.3f} m in front of the lens", legal=legal, fix=fix)
     return face
 
 

@@ -105,7 +105,7 @@ def test_a_camera_like_another_states_only_what_differs(tmp_path):
     ("text", "wanted"),
     [
         ("name: own\ntitle: t\nlike: azure_kinect_nfv\n", "azure_kinect_nfov"),
-        ("name: own\ntitle: t\nlike: own.yaml\n", "own.yaml:3:7: `like` leads on"),
+        ("name: own\ntitle: t\nlike: own.yaml\n", "own.yaml:3:7: `like` chains"),
         ("name: own\ntitle: t\nlike: [a]\n", "own.yaml:3:7: `like` is not the name of a camera"),
         (OWN + "photons: {signal_electrons: {value: -1.0, tag: M, source: guess}}\n", "own.yaml:4:"),
         (OWN + "lens: {fx: {value: 1.0, tag: M, source: guess}}\n", "unknown key `fx` in `lens`"),

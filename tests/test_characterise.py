@@ -210,7 +210,7 @@ def test_real_walls(shared_data, tmp_path, capsys):
         assert len(noise) == 2 and noise["ratio"].between(0.85, 1.15).all()
         shape = rows[rows["figure"].isin(["plane-fit rms, one frame", "plane-fit rms, average", "fill rate"])]
         assert len(shape) == 6 and shape["ratio"].between(0.9, 1.1).all()
-    assert "the surface's own shape cannot be told" in capsys.readouterr().out
+    assert "the surface's shape cannot be separated" in capsys.readouterr().out
     emitter = read_camera(tmp_path / "my_camera.yaml").emitter
     assert emitter.mask_slopes.tag == "O" and len(emitter.mask_slopes.value) > 6  # the wall's corner lies outside six
 

@@ -82,7 +82,7 @@ def test_update_writes_the_baseline_and_says_what_changes(program, capsys):
     [
         (json.dumps({"record_version": 0}), "is a record of version 0"),
         ('{"record_version": 1}', "is damaged: name: "),
-        ("<<<<<<< HEAD", "is no JSON"),
+        ("<<<<<<< HEAD", "is not JSON"),
     ],
 )
 def test_a_baseline_that_cannot_be_read_is_written_anew_by_update_alone(program, capsys, content, why):

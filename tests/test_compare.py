@@ -484,7 +484,7 @@ def test_nothing_paired_is_said_with_what_there_is(tmp_path, capsys):
 def test_the_program_names_a_users_mistakes(tmp_path, capsys):
     (tmp_path / "old.json").write_text(json.dumps({"record_version": 0}))
     (tmp_path / "no.json").write_text("[]")
-    for name, word in (("none", "cannot be read"), ("old.json", "version 0"), ("no.json", "no study's record")):
+    for name, word in (("none", "cannot be read"), ("old.json", "version 0"), ("no.json", "not the record of a study")):
         assert compare.main([str(tmp_path / name), str(tmp_path)]) == 2
         assert word in capsys.readouterr().err
 

@@ -116,7 +116,7 @@ def test_a_goal_out_of_reach_says_what_it_would_take(capsys: pytest.CaptureFixtu
     assert "no plan listed is sure to show the 7.2 mm" in said["recommendation"]
     (high,) = (one["high"] for one in said["plans"] if one["recommended"])
     wanted = 60 * ((high - 7) / 0.2) ** 2
-    (number,) = (note.split("some ")[1].split()[0] for note in said["notes"] if "would be needed" in note)
+    (number,) = (note.split("needs about ")[1].split()[0] for note in said["notes"] if "needs about" in note)
     assert int(number) == pytest.approx(wanted, rel=0.051)
 
 
@@ -124,10 +124,10 @@ def test_every_question_on_the_terminal(capsys: pytest.CaptureFixture[str]) -> N
     others = ["--false-calls-per-m2", "1", "--board-m2", "0.25", "--unit", "furlong"]
     assert main([*TOLD, *FEW, "--studies", "10", *others]) == 0
     printed = capsys.readouterr().out
-    assert "are worth 8 targets" in printed
+    assert "count as 8 targets" in printed
     assert "a90/95 (furlong)" in printed
-    assert "needs 4 hole-free boards of 0.25 m2" in printed
-    assert "no false call on 2.996 m2, which is 12 other boards" in printed
+    assert "needs at least 4 hole-free boards of 0.25 m2" in printed
+    assert "no false call may occur on 2.996 m2, which is 12 other boards" in printed
     assert printed.rstrip().splitlines()[-1].startswith("Make 60 targets, ")
     assert next(line for line in printed.splitlines() if line.startswith("* ")).split()[1] == "60"
 
@@ -174,12 +174,12 @@ def test_the_guess_from_a_study(study: Path, capsys: pytest.CaptureFixture[str])
     ("arguments", "message"),
     [
         (["--a50", "7", "--a90", "5", "--sizes", "2", "12"], "0 < a50 < a90"),
-        (["--a50", "5", "--a90", "5", "--sizes", "2", "12"], "has to grow with size"),
+        (["--a50", "5", "--a90", "5", "--sizes", "2", "12"], "must grow with size"),
         (["--a50", "nan", "--a90", "5", "--sizes", "2", "12"], "0 < a50 < a90"),
         (["--a50", "5", "--a90", "7", "--sizes", "12", "2"], "FROM < TO"),
         (["--a50", "5", "--a90", "7", "--sizes", "6", "12"], "do not hold a50 = 5"),
         (["--a50", "5", "--a90", "7", "--sizes", "0", "12", "--log"], "FROM above 0"),
-        (["--a90", "7"], "--a50, --sizes: not told"),
+        (["--a90", "7"], "--a50, --sizes: not stated"),
         ([*TOLD, "--targets", "60", "9"], "--targets 9"),
         ([*TOLD, "--targets", "20000"], "10 to 10000"),
         ([*TOLD, "--studies", "1"], "--studies 1"),

@@ -86,4 +86,4 @@ def test_a_repeat_of_rows_changes_counts_not_means() -> None:
 def test_too_few_trials_to_find_anything_are_told():
     assert [status_of(*(float(bound) for bound in wilson(n, n))) for n in (3, 4)] == ["undecided", "found"]
     assert found_rule(4) == FOUND_RULE
-    assert "With 3 of them no hole can count as either" in found_rule(3)
+    assert "3 repeats are too few for either" in found_rule(3)

@@ -151,12 +151,12 @@ def test_a_pattern_that_drifts_or_depends_on_distance_is_told_with_its_size(trut
 @pytest.mark.parametrize("poses", [True, False])
 def test_one_place_cannot_part_surface_and_pattern(shifts, poses):
     warnings = found(wall(0.0), poses=poses, shifts=shifts).field.warnings
-    assert "the surface is taken to be flat" in warnings[0]
+    assert "is assumed to be flat" in warnings[0]
 
 
 def test_few_frames_cannot_tell_their_noise():
     cloud = replace(capture(0, wall(0.0)), n_frames=2)
-    with pytest.raises(UserError, match="2 frames, whose noise cannot be told"):
+    with pytest.raises(UserError, match="2 frames: too few to estimate the noise"):
         flattened(cloud, cloud.valid, "short")
 
 
@@ -192,7 +192,7 @@ def test_pixels_without_a_pattern_stay_and_are_told():
     assert made.mean_variance_m2[:, :40].mean() > 10 * made.mean_variance_m2[:, 40:].mean()
     assert doubts(cloud, holed, "unit.npz") == (
         "the flat field unit.npz: it drifts",
-        "the flat field unit.npz knows 75 % of the valid pixels; the others stay as they are",
+        "the flat field unit.npz covers 75 % of the valid pixels; others are not corrected",
     )
     far = doubts(capture(9, wall(0.0), (1.5, 0.0, 0.0)), field, "unit.npz")
     assert far == ("the flat field unit.npz was measured at 0.55 to 1.00 m, this capture is at 1.50 m",)
@@ -202,9 +202,9 @@ def test_pixels_without_a_pattern_stay_and_are_told():
     ("changes", "message"),
     [
         ({"lens": replace(LENS, fx=300.0)}, "is not that of the flat field"),
-        ({"lens": replace(LENS, width=320, height=256)}, "of 160 x 128 pixels, the capture of 320 x 256"),
-        ({"organised": False}, "no grid of them"),
-        ({"projection": "parallel"}, "no grid of them"),
+        ({"lens": replace(LENS, width=320, height=256)}, "has 160 x 128 pixels, the capture has 320 x 256"),
+        ({"organised": False}, "no pixel grid"),
+        ({"projection": "parallel"}, "no pixel grid"),
     ],
 )
 def test_another_camera_s_cloud_is_refused(changes, message):
@@ -230,8 +230,8 @@ def test_a_file_holds_what_was_saved_and_others_are_refused(tmp_path):
         ({"version": np.array(1.5)}, "states the version"),
         ({"error_m": np.zeros((3, 3))}, "do not belong together"),
         ({"variance_m2": -np.ones((128, 160))}, "do not belong together"),
-        ({"lens": np.array([160.0, 128.0])}, "is no flat field"),
-        ({"lens": np.full(14, np.nan)}, "is no flat field"),
+        ({"lens": np.array([160.0, 128.0])}, "not a flat field"),
+        ({"lens": np.full(14, np.nan)}, "not a flat field"),
         ({"warnings": np.array("[1]")}, "do not belong together"),
         ({"error_m": np.array([{}])}, "cannot be read as arrays"),
     ):
@@ -325,7 +325,7 @@ def test_a_real_unit_s_pattern_is_stable_within_a_capture(shared_data, tmp_path,
         (walls / path.name).symlink_to(path)
     unit = tmp_path / "unit.npz"
     assert flatfield.main([str(walls), "--intrinsics", "azure_kinect_nfov", "--out", str(unit)]) == 0
-    assert "the surface is taken to be flat" in capsys.readouterr().out.splitlines()[0]
+    assert "is assumed to be flat" in capsys.readouterr().out.splitlines()[0]
     told = json.loads(unit.with_suffix(".json").read_text())
     figures = {row["figure"]: row["value"] for row in told["figures"]}
     assert figures["pattern"] > 2 * figures["noise of the map"]

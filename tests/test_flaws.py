@@ -124,7 +124,7 @@ def test_outline_tells_inside_from_outside() -> None:
     [
         ([{**SLOT, "depth_mm": 12.0}], "not less than the board's thickness"),
         ([{**SLOT, "centre_mm": [140.0, 0.0]}], "leaves the board"),
-        ([{**CHIP, "centre_mm": [0.0, 50.0]}], "50 mm off the edge that angle_deg names"),
+        ([{**CHIP, "centre_mm": [0.0, 50.0]}], "50 mm away from the edge that angle_deg names"),
         ([SLOT, {**SLOT, "angle_deg": -30.0}], "meet"),
         ([{**CHIP, "length_mm": 320.0}], "leaves the board"),
     ],
@@ -321,9 +321,9 @@ def test_meshes_that_cannot_be_used_are_refused_with_the_place(tmp_path: Path) -
     (tmp_path / "no.stl").write_text("no mesh")
     for file, said in (
         (opened, r"open.stl: open edges: \d+, the first at \("),
-        (tmp_path / "part.step", "no triangles"),
+        (tmp_path / "part.step", "not triangles"),
         (tmp_path / "absent.stl", "cannot be read"),
-        (tmp_path / "no.stl", "no mesh|are open"),
+        (tmp_path / "no.stl", r"not a (readable )?mesh|are open"),
     ):
         with pytest.raises(UserError, match=said):
             target_from_data({"name": "mesh", "file": str(file)}).declare()

@@ -110,7 +110,7 @@ def test_holes_that_show_a_backing_of_another_colour_are_no_marks(backing):
     marks = find_marks(cloud, everywhere(cloud), ColourMarks())
     assert (marks.problem, len(marks.trusted)) == ("", 4)
     np.testing.assert_allclose(on_board_m(marks, T), EXPECTED, atol=1e-3)
-    assert any("taken for holes" in note for note in marks.notes)
+    assert any("count as holes" in note for note in marks.notes)
 
 
 @pytest.mark.parametrize(

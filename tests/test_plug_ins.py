@@ -187,7 +187,7 @@ def test_a_number_that_a_packages_camera_has_not_is_told_with_its_file(acme_came
     ("name", "target", "why"),
     [
         ("other", "acme_cameras:TEXT", "needs a file called other.yaml"),
-        ("acme", "acme_cameras:NUMBER", "the path of a YAML file is wanted, not int"),
+        ("acme", "acme_cameras:NUMBER", "it must be the path of a YAML file, not int"),
         ("nope", "acme_cameras:NOPE", "AttributeError"),
     ],
 )

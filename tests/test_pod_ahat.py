@@ -229,7 +229,7 @@ def test_a_broken_assumption_is_seen(assumption: str) -> None:
         ({"size": [0.0, *range(1, 12)], "log_size": True}, "no logarithm"),
         ({"signal": -np.arange(12.0), "left": None, "log_signal": True}, "no logarithm"),
         ({"signal": [np.nan, *range(11)]}, "not finite"),
-        ({"signal": np.arange(11.0)}, "one of each a row"),
+        ({"signal": np.arange(11.0)}, "each row needs one of each"),
         ({"signal": [3, 1, 4, 1, 5, 9, 2, 6, 5, 3, 5, 8][::-1]}, "does not grow"),
         ({"signal": 2 + np.arange(12.0)}, "exactly on a line"),
         ({"signal": np.full(12, 6.1)}, "do not vary: all 12 between the limits are 6.1"),

@@ -85,5 +85,5 @@ def test_studies_far_from_the_rise_demonstrate_nothing() -> None:
 def test_mistakes_of_the_user() -> None:
     with pytest.raises(UserError, match="area above 0"):
         false_call_rate(1, 0.0)
-    with pytest.raises(UserError, match="no numbers"):
+    with pytest.raises(UserError, match="highest score is a number"):
         threshold_for_rate([np.nan, 1.0], 1.0, 1.0)

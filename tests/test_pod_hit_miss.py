@@ -212,7 +212,7 @@ def test_repeats_that_all_agree_say_no_more_than_one_inspection(seed: int) -> No
 def test_a_target_with_two_sizes_is_refused() -> None:
     with pytest.raises(UserError, match="target b has more than one size"):
         fit_hit_miss([1, 2, 3, 4], [0, 1, 0, 1], inspections=["a", "b", "b", "c"])
-    with pytest.raises(UserError, match="3 identities of targets for 4 rows"):
+    with pytest.raises(UserError, match="3 target names for 4 rows"):
         fit_hit_miss([1, 2, 3, 4], [0, 1, 0, 1], inspections=["a", "b", "c"])
 
 

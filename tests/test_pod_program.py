@@ -136,7 +136,7 @@ def test_what_is_not_demonstrated_is_said(tmp_path: Path, capsys: pytest.Capture
     assert limit["size"] is None
     assert not limit["demonstrated"]
     assert limit["why"]
-    assert "a90/95 is not demonstrated: a chance that does not grow with size fits too" in capsys.readouterr().out
+    assert "a90/95 is not demonstrated: a constant probability is not rejected" in capsys.readouterr().out
     assert "not demonstrated" in (tmp_path / "pod.html").read_text()
 
 
@@ -162,7 +162,7 @@ def test_a_ceiling_that_the_data_ask_for(tmp_path: Path, capsys: pytest.CaptureF
     ceiling = next(one for one in stated(tmp_path)["tests"] if one["test"].startswith("a ceiling"))
     assert ceiling["p"] < 0.01
     said = capsys.readouterr().out
-    assert "warning: the curve has no floor or ceiling, and the data speak for " in said.partition(str(file))[0]
+    assert "warning: the curve has no floor or ceiling, and the data suggest " in said.partition(str(file))[0]
     assert "warning: the curve has no floor or ceiling" in (tmp_path / "pod.html").read_text()
 
 
@@ -350,7 +350,7 @@ def test_inspectors_in_columns_with_gaps(tmp_path: Path, capsys: pytest.CaptureF
     wide = table(tmp_path / "wide.csv", size=SIZES, A=first, B=second)
     read = read_inspections(wide, "size", ["A", "B"])
     assert (len(read.size), read.targets) == (118, 60)
-    assert read.notes == ("2 of 120 inspections state no result: left out",)
+    assert read.notes == ("2 of 120 inspections state no result and are left out",)
     assert read.response[:60].tolist() == first.tolist()
     assert main([str(wide), "--size", "size", "--hit", "A", "--hit", "B", "--out", str(tmp_path)]) == 0
     assert "2 of 120 inspections state no result" in capsys.readouterr().out
@@ -437,7 +437,7 @@ def test_a_folder_a_missing_file_and_no_table(tmp_path: Path, capsys: pytest.Cap
     for name, said in (
         ("none.csv", "no such file"),
         (".", "is a directory"),
-        ("zeros.csv", "no text"),
+        ("zeros.csv", "not a text file"),
         ("broken.xlsx", excel),
     ):
         assert main([str(tmp_path / name), *HIT, "--out", str(tmp_path / "out")]) == 2

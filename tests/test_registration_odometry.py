@@ -40,7 +40,7 @@ def test_after_a_view_that_shows_nothing_it_is_lost_for_good():
     made[2] = replace(made[2], inside=nothing)
     found = register_by_odometry(made)
     assert [bool(each.failure) for each in found] == [False, True, True]
-    assert all("lost its way at view 2" in each.failure for each in found[1:])
+    assert all("failed at view 2" in each.failure for each in found[1:])
 
 
 def test_distortion_is_taken_out():

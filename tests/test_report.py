@@ -160,7 +160,7 @@ def test_little_data_still_make_a_page() -> None:
     page = report_html(few, [], About({}, "", "Averaging", True))
     assert "With one frame the camera finds 0 of 11 holes, with 1–11 undecided. Of 8 claims, 8 are undecided" in page
     assert "The one repeat is" in page
-    assert "No data for this figure were kept." in page
+    assert "No data for this figure were stored." in page
     assert "not recorded" in page
     nothing = dataclasses.replace(few, holes=pd.DataFrame(), runs=few.runs[:0], probes=few.probes[:0])
     assert "No trial of the main experiment finished" in report_html(

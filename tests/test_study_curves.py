@@ -226,7 +226,7 @@ class TestSurface:
 
     def test_a_chance_that_falls_with_diameter_has_none(self):
         surface, why = surface_of(self.drawn(lambda a, d: 3.0 - 2.0 * a + 0.5 * d))
-        assert surface is None and why == "the chance of detection does not grow with diameter"
+        assert surface is None and why == "the probability of detection does not grow with diameter"
 
     def test_a_chance_that_falls_with_depth_is_said(self):
         surface, _ = surface_of(self.drawn(lambda a, d: -3.0 + 4.0 * a - 2.0 * d), draws=50)

@@ -95,7 +95,7 @@ def test_what_is_not_demonstrated_is_written_out(nothing_found: SetUpLimit) -> N
 
 
 def test_the_answer_is_without_statistics(two: list[SetUpLimit]) -> None:
-    why = "not demonstrated: a chance that does not grow with size fits too (ratio 1.79 <= 3.84)"
+    why = "not demonstrated: a constant probability is not rejected (ratio 1.79 <= 3.84)"
     limit = replace(two[0], a90_95=replace(two[0].a90_95, value=np.inf, why=why))
     said = limit_sentence(limit)
     assert said.startswith("1 frame: a90/95 is not demonstrated: the hits do not grow clearly with diameter; ")

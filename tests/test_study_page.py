@@ -253,7 +253,7 @@ def test_the_depths_that_are_drawn_stand_in_their_file(whole: StudyResult) -> No
 @pytest.mark.usefixtures("unsaved")
 def test_depths_without_a_surface_say_why() -> None:
     page = html(judged(small(SetUp(a50_mm=60.0), depths_mm=(2.0, 10.0))))
-    assert "No surface: every damage fared alike" in section(page, "Size and depth")
+    assert "No surface: all damages had the same outcome" in section(page, "Size and depth")
 
 
 @pytest.fixture(scope="module")

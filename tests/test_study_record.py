@@ -101,13 +101,13 @@ def test_written_and_read_it_is_the_same(tmp_path):
             'inspected.signal.1 (set-up main, frames 5): Input should be a valid number, not "',
         ),
         ((*TABLE, "hole"), MISSING, "set_ups.1.inspected.hole (set-up main, frames 5): "),
-        ((*TABLE, "hole", 1), "1", "the same inspection stands there twice"),
+        ((*TABLE, "hole", 1), "1", "the same inspection occurs twice"),
         ((*TABLE, "board", 0), 10**30, "inspected.board.0"),
         (TABLE, EMPTY, "inspected.hole"),
         ((*SECOND, "unflawed", "area_m2", 0), 0.0, "unflawed.area_m2.0"),
         ((*SECOND, "unflawed", "calls", 0), -1, "greater than or equal to 0, not -1"),
         ((*SECOND, "frames"), 0, "set_ups.1.frames"),
-        ((*SECOND, "frames"), 1, "set-up 'main' with frames 1 stands there twice"),
+        ((*SECOND, "frames"), 1, "set-up 'main' with frames 1 occurs twice"),
         ((*SECOND, "threshold"), None, "Input should be a valid number, not null"),
         ((*SECOND, "axes"), [1], "set_ups.1.axes"),
         (SECOND, 7, "set_ups.1: "),
@@ -137,4 +137,4 @@ def test_several_mistakes_are_counted(tmp_path):
 def test_what_is_no_json_is_told_what_to_do(tmp_path, content):
     (tmp_path / "no.json").write_bytes(content)
     mistake = refusal(tmp_path / "no.json")
-    assert "is no JSON" in mistake.message and mistake.fix and mistake.legal
+    assert "is not JSON" in mistake.message and mistake.fix and mistake.legal

@@ -140,7 +140,7 @@ class TestValidity:
         assert "29th smallest size" in section(result, "Departures from MIL-HDBK-1823A")
 
     def test_kinds_are_named_unless_they_were_swept(self, result):
-        missing = "What is not in it"
+        missing = "What is not included"
         assert "all are holes with a flat bottom" in section(result, missing)
         assert "one unit" in section(result, missing)
         swept = {**FACTS, "sweep": {"source.target.damage.kind": ["blind", "dent"], "source.camera.unit_seed": [1, 2]}}

@@ -271,8 +271,8 @@ def _reach_px(drawn: DrawnTargetConfig, pose: Any, optics: Any) -> np.ndarray:
 def test_a_board_too_full_is_refused_with_numbers() -> None:
     full = family(damage={**THROUGH, "per_board": 60})
     message = (
-        r"a board of 304\.8 x 203\.2 mm is too full for 60 damages whose centres are 40 mm apart and 21 mm off its "
-        r"edge: (\d+) found a place on the 262\.8 x 161\.2 mm that are left"
+        r"a board of 304\.8 x 203\.2 mm is too small for 60 damages with centres 40 mm apart and 21 mm from its "
+        r"edge: only (\d+) fit on the 262\.8 x 161\.2 mm that are left"
     )
     with pytest.raises(UserError, match=message) as refused:
         full.declare()

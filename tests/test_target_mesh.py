@@ -386,7 +386,7 @@ def test_an_image_is_the_albedo_of_the_face(tmp_path: Path) -> None:
     assert board.texture_850[5, 5] / board.texture_850[30, 50] == pytest.approx(1 / half, rel=1e-5)
     assert board.texture_rgb[30, 50] == pytest.approx(board.texture_850[30, 50] * np.array([1.0, 0.5, 0.5]), rel=1e-5)
     (tmp_path / "face.png").write_text("no image")
-    with pytest.raises(UserError, match="is no image"):
+    with pytest.raises(UserError, match="is not a readable image"):
         build_target(target(material=MaterialConfig.from_data(material)))
 
 

@@ -38,7 +38,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ),
     ({"holes": [hole(3, 10, 146, 0)]}, r"hole 3 \(diameter 10 mm at \(146, 0\) mm\): leaves the board .* by 1 mm"),
     ({"holes": [hole(3, 10, 0, -45)]}, r"hole 3 .* leaves the board \(300 x 100 mm, centred on \(0, 0\)\) by 0 mm"),
-    ({"holes": [hole(4, 10, 400, 0)]}, r"hole 4 .* its centre is off the board \(300 x 100 mm"),
+    ({"holes": [hole(4, 10, 400, 0)]}, r"hole 4 .* its centre is outside the board \(300 x 100 mm"),
     ({"holes": [hole(5, 10, 0, 0, 12)]}, r"hole 5 .* depth 12 mm is not less than the board's thickness 12 mm"),
     ({"holes": [hole(5, 10, 0, 0, 13)]}, r"hole 5 .* depth 13 mm is not less than the board's thickness 12 mm"),
     ({"dents": [dent(6, 60, 12)]}, r"dent 6 .* depth 12 mm is not less than the board's thickness 12 mm"),
@@ -88,7 +88,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"board": round_board("cylinder", 190), "holes": [hole(8, 96, 0, 0)]}, r"hole 8 .* too wide for a face bent"),
     (
         {"pose": {"distance_m": 0.15, "tilt_y_deg": 60}},
-        r"nearest point is 0.0201 m before the lens; the limit is 0.05 m",
+        r"nearest point is 0.0201 m in front of the lens; the limit is 0.05 m",
     ),
     ({"room": {"floor_below_lens_m": 0.05}}, r"reaches 0.05 m below the lens, through the floor at 0.05 m"),
     ({"room": {"back_wall_distance_m": 0.71}}, r"reach 0.712 m, beyond the back wall at 0.71 m"),
@@ -180,5 +180,5 @@ def test_a_face_that_needs_too_many_cells() -> None:
     config = target_from_data(
         {"name": "custom", "board": {"width_mm": 5000, "height_mm": 5000, "thickness_mm": 12, "shape": shape}}
     ).declare()
-    with pytest.raises(UserError, match="cells to be followed within 2 um"):
+    with pytest.raises(UserError, match="cells for an error below 2 um"):
         build_target(config)

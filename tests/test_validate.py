@@ -266,7 +266,7 @@ def test_the_program_from_beginning_to_end(tmp_path, capsys, monkeypatch):
 
     figures.write_text(GOOD.replace("source: a filter", "source: a filter\n    fails: it did once"))
     assert main(options) == 0
-    assert "neighbours passes: take `fails` off its entry" in capsys.readouterr().err
+    assert "neighbours passes: remove `fails` from its entry" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -93,7 +93,7 @@ def test_a_studys_record(tmp_path, version, told):
         read_record(tmp_path)
     del data["record_version"]
     (tmp_path / "study.json").write_text(json.dumps(data))
-    with pytest.raises(UserError, match="is no study's record"):
+    with pytest.raises(UserError, match="is not the record of a study"):
         read_record(tmp_path)
 
 

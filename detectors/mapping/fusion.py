@@ -292,7 +292,7 @@ def _registration_variance(
 
 def _notes(views: Sequence[placing.ChosenView], found: SurfaceMap) -> tuple[str, ...]:
     between = found.between
-    notes = ["one view: errors fixed for a view (pattern, wiggling) cannot be told, its variance has none"]
+    notes = ["one view: its variance excludes errors that are constant within a view (pattern, wiggling)"]
     if len(views) > 1:
         notes = [
             f"fixed pattern {1e3 * np.sqrt(between.pattern_m2):.3f} mm over {between.length_px:.1f} px of the sensor,"
@@ -300,7 +300,7 @@ def _notes(views: Sequence[placing.ChosenView], found: SurfaceMap) -> tuple[str,
         ]
     without = [view.name for view in views if not view.known_covariance]
     if without:
-        notes.append(f"registered without a covariance, so counted among those differences: {', '.join(without)}")
+        notes.append(f"views without a covariance count among those differences: {', '.join(without)}")
     if found.rejected:
         notes.append(f"{found.rejected} of {int(found.seen_by.sum()) + found.rejected} observations were outliers")
     return tuple(notes)

@@ -197,7 +197,7 @@ def merge(views: Sequence[PreparedView], registrations: Sequence[Registration], 
             chosen.append(view)
     if not chosen:
         legal = "at least one view that is registered and holds points of the target"
-        fix = "mend the views or their crop, or choose another way to register"
+        fix = "correct the views or their crop, or choose another registration method"
         raise UserError(f"no view is left to merge: {'; '.join(left_out)}", legal=legal, fix=fix)
     T_reference_cloud, surface_map, notes = np.eye(4), None, tuple[str, ...]()
     if isinstance(config, GridMerge):

@@ -218,7 +218,7 @@ def find_marks(cloud: Cloud, inside: np.ndarray, config: RedMarks | ColourMarks 
     shows: a set on which no registration can rest says so in its ``problem``."""
     none = MarkSet((), np.zeros(0, dtype=np.int64))
     if cloud.rgb is None:
-        return replace(none, problem="the capture has no colour, by which marks are found")
+        return replace(none, problem="the capture has no colour, which is needed to find marks")
     if int(inside.sum()) < LEAST_TARGET:
         return replace(none, problem=f"{int(inside.sum())} pixels of the target, too few to know its colour")
     if not cloud.organised and not isinstance(config, RedMarks):
@@ -235,7 +235,7 @@ def find_marks(cloud: Cloud, inside: np.ndarray, config: RedMarks | ColourMarks 
         missing = f"no pixel's red exceeds {limit:.0f}, the target's mean {mean:.0f} and {config.deviations:g} standard"
         missing += f" deviations of {spread:.0f}"
         if not cloud.organised:
-            return MarkSet((), np.flatnonzero(coloured), "marks need a pixel grid, which this cloud has not")
+            return MarkSet((), np.flatnonzero(coloured), "marks need a pixel grid, which this cloud does not have")
         return _marks(cloud, inside, coloured, "" if coloured.any() else missing)
     # by lightness where chromaticity gives too few marks or hardly any contrast, if that does better: black and white
     # have the light's own chromaticity, and black hardly any
@@ -299,13 +299,13 @@ def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str)
     for vivid, found in groups:
         doubt = ""
         if vivid < WEAK_SHARE * max(enough, default=0.0):
-            doubt = "its colour hardly stands apart beside the others'"
+            doubt = "its colour contrast is weak beside that of the others"
         elif enough and sum(not mark.doubt for mark in found) < LEAST_MARKS:
-            doubt = f"no {LEAST_MARKS} marks have its colour, as they have another"
+            doubt = f"fewer than {LEAST_MARKS} marks have its colour; enough have another"
         marks += [replace(mark, doubt=mark.doubt or doubt) for mark in found]
     marks.sort(key=lambda mark: int(mark.pixels[0]))
     holes = len(spots) - len(marks)
-    notes = (f"{holes} spots of another colour lie behind the surface: taken for holes, not marks",) if holes else ()
+    notes = (f"{holes} spots of another colour lie behind the surface and count as holes, not marks",) if holes else ()
     return MarkSet(tuple(marks), np.flatnonzero(coloured), problem_of(marks, missing), notes)
 
 
@@ -318,10 +318,10 @@ def _mark(spot: Spot, usual_m: np.ndarray | None, n_target: int) -> Mark:
     elif (share := len(pixels) / n_target) > LARGEST_SHARE:
         doubt = f"{100 * share:.0f} % of the target: a part of it rather than a mark"
     elif -spot.behind_m > max(RAISED_SHARE * sizes_m[1], BEHIND_SIGMAS * spot.behind_sigma_m):
-        doubt = f"it stands {-spot.behind_m / MM:.0f} mm before the surface"
+        doubt = f"it stands {-spot.behind_m / MM:.0f} mm in front of the surface"
     elif usual_m is not None:
         unlike = np.abs(sizes_m - usual_m) > UNLIKE_SHARE * usual_m + UNLIKE_PIXELS * spot.pitch_m
         (length, breadth, _), (usual_length, usual_breadth, _) = sizes_m / MM, usual_m / MM
         if unlike.any():
-            doubt = f"unlike the others: {length:.0f} x {breadth:.0f} mm, they {usual_length:.0f} x {usual_breadth:.0f}"
+            doubt = f"unlike the others: {length:.0f} x {breadth:.0f} mm, not {usual_length:.0f} x {usual_breadth:.0f}"
     return Mark(spot.centre_m, spot.covariance_m2, spot.normal, pixels, spot.area_m2, doubt=doubt)

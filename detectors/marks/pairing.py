@@ -121,8 +121,8 @@ def pair_marks(reference: Sequence[Mark], view: Sequence[Mark], T_reference_view
     solutions = _solutions(theirs, ours) if swapped else _solutions(ours, theirs)
     if not solutions:
         least = max(LEAST_MARKS, min(len(reference), len(view)) // 2 + 1)
-        what = f"the distances between the marks fit nowhere: of {counts} no {least} lie alike"
-        return Pairing(NO_PAIRS, f"{what}; other targets, or other things taken for marks")
+        what = f"of {counts}, no {least} have matching distances"
+        return Pairing(NO_PAIRS, f"{what}: the targets differ, or something else was taken for marks")
     away = np.zeros(len(solutions))
     if T_reference_view_guess is not None:
         placed = [transform_points(T if swapped else invert(T), theirs.places) for _, T, _ in solutions]

@@ -53,8 +53,8 @@ def register_by_marks(reference: PreparedView, view: PreparedView) -> registered
     freedom = 3 * len(ours) - 6
     residual = float(np.sqrt((placement.residuals_m**2).sum(axis=1).mean()))
     if not problem and gammaincc(freedom / 2, _placed(ours, theirs, SHARED_M).chi2 / 2) < REFUSE_BELOW:
-        problem = f"the marks do not fit: {residual / MM:.1f} mm left over {len(ours)} marks, more than noise and"
-        problem += f" {SHARED_M / MM:.0f} mm of each view's own error explain; other targets, or a mark that moved"
+        problem = f"the marks do not fit: {residual / MM:.1f} mm remain over {len(ours)} marks, more than noise and"
+        problem += f" {SHARED_M / MM:.0f} mm of each view's own error explain; the targets differ, or a mark moved"
     covariance = placement.covariance
     if gammaincc(freedom / 2, placement.chi2 / 2) < WIDEN_BELOW:
         ratio = float(np.sqrt(placement.chi2 / freedom))
@@ -244,7 +244,7 @@ def _adjust(views: Sequence[PreparedView], marked: Sequence[registered.Registrat
     covariance = np.linalg.inv(state.equations(data)[0])
     T_reference_surface = invert(T_surface_reference)
     both = np.kron(np.eye(2), T_reference_surface[:3, :3])
-    note = f"each view's own smooth error is {state.shared_m / MM:.2f} mm a term of a cubic; the covariance holds it"
+    note = f"each view's smooth error is {state.shared_m / MM:.2f} mm per term of a cubic; the covariance includes it"
     lost = "" if converged else f"did not converge in {steps} steps of the joint adjustment"
     adjusted = []
     for v, found in enumerate(marked, start=1):

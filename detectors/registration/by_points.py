@@ -255,7 +255,7 @@ def posterior_moments(
 
 DEPTH_DIFFERENCE_M = 0.03
 """Largest difference in depth of a pair of pixels (Open3D's own default)."""
-DRIFTS = "no covariance: what Open3D's odometry gives counts its pairs, and does not know how far it slid"
+DRIFTS = "no covariance: that of Open3D's odometry counts its pairs and ignores how far it slid"
 
 
 def register_by_odometry(views: Sequence[PreparedView]) -> list[registered.Registration]:
@@ -283,7 +283,7 @@ def register_by_odometry(views: Sequence[PreparedView]) -> list[registered.Regis
                 pairs = round(float(information[5, 5])) if success and np.isfinite(step).all() else 0
                 pixels = max(int(np.count_nonzero(np.asarray(image.depth))) for image in (now, before))
                 if pairs < registered.MIN_OVERLAP * pixels:
-                    lost = f"odometry lost its way at {view.view.name}: {pairs} pixels match the view before it"
+                    lost = f"odometry failed at {view.view.name}: only {pairs} pixels match the view before it"
             if lost:
                 found.append(registered.failed(view, "odometry", None, lost))
                 continue

@@ -177,7 +177,7 @@ def clouds_of(
         thinned(each.mark_points_m if points == "marks" else each.points_m, MAX_POINTS) for each in (reference, view)
     )
     guess = guess_of(reference, view)
-    notes = () if guess is not None else ("no guess: started from the reference's own place",)
+    notes = () if guess is not None else ("no guess: registration started from the reference's pose",)
     few = ""
     if min(len(fixed), len(moving)) < 3:
         few = f"too few points of the {'fiducial colour' if points == 'marks' else 'target'}: {len(fixed)} in the"

@@ -182,7 +182,7 @@ def threshold_for_rate(
     if not (area_m2 > 0 and rate_per_m2 > 0):
         raise UserError(f"area {area_m2:g} m2, wanted rate {rate_per_m2:g} per m2", legal="both above 0")
     if np.any(np.isnan(scores)) or np.any(np.isposinf(scores)):
-        raise UserError("highest scores that are no numbers", legal="a finite score, or -inf for a run without finding")
+        raise UserError("not every highest score is a number", legal="a finite score, or -inf for no finding")
     n, wanted = len(scores), -float(np.expm1(-rate_per_m2 * area_m2))
     # The margin is for rounding where (n + 1) * wanted is a whole number.
     k = min(int(np.floor((n + 1) * wanted * (1 + 1e-12))) - 1, n - 1)

@@ -24,7 +24,7 @@ MAIN = "main"
 """The variant that the experiment declares; every other one changes a fact that the thesis leaves open."""
 FOUND_RULE = (
     "A hole counts as found when the 95 % Wilson interval of its detection rate over the repeats lies above 0.5, "
-    "as missed when it lies below, else as undecided."
+    "as missed when it lies below, and as undecided otherwise."
 )
 FEWEST_TRIALS = 4
 """4 of 4 have a Wilson interval from 0.51; with 3 nothing is certain."""
@@ -77,7 +77,7 @@ def found_rule(trials: int) -> str:
     """`FOUND_RULE`, and that it can call no hole found where there are so few trials of each."""
     if trials >= FEWEST_TRIALS:
         return FOUND_RULE
-    return f"{FOUND_RULE} With {trials} of them no hole can count as either: that takes {FEWEST_TRIALS} at least."
+    return f"{FOUND_RULE} {trials} repeats are too few for either: at least {FEWEST_TRIALS} are needed."
 
 
 def found_holes(summary: pd.DataFrame, variant: str, frames: int) -> dict[str, HoleState]:

@@ -88,7 +88,7 @@ def bullets(items: Iterable[str | Markup]) -> Markup:
 def figure(figures: Mapping[str, str], name: str, caption: str) -> Markup:
     """A figure of ``figures`` (SVG text by name) with its caption, or that no data for it were kept."""
     if name not in figures:
-        return note("No data for this figure were kept.")
+        return note("No data for this figure were stored.")
     return tag("figure", tag("div", Markup(figures[name]), kind="scroll"), tag("figcaption", caption), id=name)
 
 

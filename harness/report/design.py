@@ -80,7 +80,7 @@ def design_parts(design: StudyDesign) -> list[str | Grid]:
     """Return what a terminal shows: the page's tables and sentences."""
     parts: list[str | Grid] = [f"guess: {guess_text(design)}", "", plans_grid(design), *wrap(MEDIANS, WIDE), ""]
     parts += [f"sizes of the recommended plan (*){design.in_unit}:", *wrap(_sizes(design.recommended), WIDE)]
-    parts += ["", *(f"where nothing is: {line}" for line in hole_free_lines(design))]
+    parts += ["", *(f"hole-free: {line}" for line in hole_free_lines(design))]
     return [*parts, "", *(f"note: {line}" for line in notes(design)), "", answer(design)]
 
 
@@ -138,17 +138,17 @@ def plans_grid(design: StudyDesign) -> Grid:
 def hole_free_lines(design: StudyDesign) -> list[str]:
     """The unflawed sites and areas that go with the recommended targets."""
     sites = SITES_PER_TARGET * design.recommended.targets
-    lines = [f"{sites} unflawed sites: MIL-HDBK-1823A asks for {SITES_PER_TARGET} a target at least"]
+    lines = [f"{sites} unflawed sites: MIL-HDBK-1823A asks for at least {SITES_PER_TARGET} per target"]
     area = design.hole_free
     if area is None:
         return lines
     sure = f"{area.confidence:.0%} confidence".replace("%", " %")
     return [
         *lines,
-        f"a threshold for {area.rate_per_m2:g} false calls per m2 needs {area.calibration_boards} hole-free boards of "
-        f"{area.board_m2:g} m2 at least; from as few its rate is no more than {area.upper_per_m2:.3g} with {sure}",
-        f"to show at most {area.rate_per_m2:g} per m2 with {sure}: no false call on {area.silent_m2:.4g} m2, which is "
-        f"{area.silent_boards} other boards",
+        f"a threshold for {area.rate_per_m2:g} false calls per m2 needs at least {area.calibration_boards} "
+        f"hole-free boards of {area.board_m2:g} m2; its rate is then at most {area.upper_per_m2:.3g} with {sure}",
+        f"to show at most {area.rate_per_m2:g} per m2 with {sure}, no false call may occur on "
+        f"{area.silent_m2:.4g} m2, which is {area.silent_boards} other boards",
     ]
 
 
@@ -161,13 +161,13 @@ def notes(design: StudyDesign) -> list[str]:
         # The bound's distance from the truth is a multiple of a standard error.
         wanted = plan.targets * ((plan.high - plan.true_size) / (design.goal - plan.true_size)) ** 2
         found.append(
-            f"the limit nears the guess's own a90 about as one over the root of the targets: for "
-            f"{design.text(design.goal)} some {float(f'{wanted:.2g}'):.0f} would be needed"
+            f"the limit approaches the guess's own a90 roughly as one over the root of the number of targets: "
+            f"{design.text(design.goal)} needs about {float(f'{wanted:.2g}'):.0f} targets"
         )
     if high < plan.bound < np.inf:
         found.append(
             f"the a90/95 to expect lies beyond the largest target of {design.text(high)}: it rests on the "
-            "curve's shape there; make larger ones"
+            "curve's shape there; make larger targets"
         )
     if plan.targets < LEAST_TARGETS:
         found.append(f"no plan listed has the {LEAST_TARGETS} targets that MIL-HDBK-1823A asks for (40 of signals)")
@@ -175,7 +175,7 @@ def notes(design: StudyDesign) -> list[str]:
         *found,
         f"medians and quantiles of {plan.studies} simulated studies, bound by {METHOD}; the share that "
         f"demonstrates any is known to {50 / np.sqrt(plan.studies):.1f} points or better (one standard error)",
-        "repeats of the noise are no further targets: 50 inspections of each of 8 holes are worth 8 targets",
+        "repeats of the noise are not additional targets: 50 inspections of each of 8 holes count as 8 targets",
         "the plan is as good as the guess: a study whose sizes miss the rise of the true curve demonstrates less",
     ]
 

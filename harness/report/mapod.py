@@ -41,9 +41,9 @@ def answer(found: Mapod) -> str:
     agrees = f"(p = {found.agrees:.2g})"
     first = f"The real hits and misses do not contradict the simulation {agrees}."
     if found.contradicted:
-        first = f"The real hits and misses contradict the simulation {agrees}: the larger of both limits counts."
+        first = f"The real hits and misses contradict the simulation {agrees}: the larger of the two limits counts."
     if not np.isfinite(found.a90_95):
-        return f"{first} a90/95 is not demonstrated by the real ones, so no limit is stated."
+        return f"{first} The real targets do not demonstrate a90/95, so no limit is stated."
     return f"{first} A flaw of {sized(found.a90_95, 'mm')} is found 90 % of the time, with 95 % confidence (a90/95)."
 
 

@@ -49,7 +49,7 @@ def perspectives_html(
         figures["found"] = found_figure(sections.records(set_ups[set_ups["frames"] == frames[0]]))
     rule = (
         "Each set-up has hole-free runs and a threshold of its own. The same frames feed every set-up; repeats vary "
-        "the error of the nominal poses too. Of a single view all ways of registering are the same."
+        "the error of the nominal poses too. A single view needs no registration."
     )
 
     def by_frames(table: Table, rows: pd.DataFrame, only: Sequence[str] = ()) -> Markup:

@@ -27,7 +27,7 @@ MOST_MARKS = 2000
 STRIPE = 0.10
 """Height of the stripes above 1 and below 0 in which hits and misses are spread, in units of POD."""
 VALIDITY = (
-    "The limit speaks of inspections like these: the same kind of flaws and parts, the same procedure, the sizes that "
+    "The limit holds for inspections like these: the same kind of flaws and parts, the same procedure, the sizes that "
     "were tried. Targets are taken as independent of each other. Sizes beyond the largest target are extrapolation."
 )
 

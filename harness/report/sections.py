@@ -163,7 +163,7 @@ def rule_note(repeats: int, *more: str) -> Markup:
     draws = "The one repeat is one draw" if repeats == 1 else f"The repeats are {repeats} draws"
     said = (
         f"{draws} of the noise before the same board in the same place with one unit of each camera: the intervals "
-        "speak of these set-ups, not of other boards, places or units."
+        "hold for these set-ups, not for other boards, places or units."
     )
     return note(" ".join((found_rule(repeats), *more, said)))
 

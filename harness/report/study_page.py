@@ -260,8 +260,8 @@ def study_html(
         title=title,
         answer=unbroken(study_answer(limits)),
         conditions=result.conditions,
-        rule=f"Fixed beforehand: a damage is found {result.record.hit_rule}, and no finding counts for two. Repeats of "
-        "the noise on one board are no further targets.",
+        rule=f"Fixed beforehand: a damage is found {result.record.hit_rule}, and no finding counts twice. Repeats of "
+        "the noise on one board are not additional targets.",
         limits=limits_grid(limits).html() if limits else None,
         limit_notes=[unbroken(note) for note in limit_notes(limits)],
         set_ups=len(limits),

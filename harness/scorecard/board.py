@@ -108,7 +108,7 @@ def image_of(target: TargetConfig, camera: AnyCamera, lens: Lens | None) -> Imag
     if colour is None:
         raise UserError(
             f"the capture has {lens.width} x {lens.height} pixels, {camera.name} has {own.width} x {own.height}",
-            legal="depth images of the camera's own, or aligned to its colour camera where its file places that",
+            legal="the camera's own depth images, or images aligned to a colour camera that its file places",
         )
     lens = lens if any(lens.distortion) else replace(lens, distortion=tuple(colour.distortion.value))
     return Image(lens, colour.T_colour_depth @ T_depth_board, colour.T_colour_depth)
@@ -193,7 +193,7 @@ def run_board(options: argparse.Namespace, recording: Recording | None, command:
     target = source.target
     if not isinstance(target, TargetConfig) or not target.holes or config.threshold.k is None:
         raise UserError(
-            f"{options.board}: declares no drilled board before a simulated camera, or no threshold k",
+            f"{options.board}: declares no drilled board in front of a simulated camera, or no threshold k",
             legal="source.kind: simulated, source.target.name: custom with holes, threshold: {k: ...}",
         )
     camera, frames, told, rows = camera_of(source.camera), config.capture.frames, [], []

@@ -71,7 +71,7 @@ def run_scorecard(options: argparse.Namespace, command: str) -> int:
     print(f"wrote {options.out / 'scorecard.html'}")
     for score in scores:
         if score.passes and score.figure.fails:
-            print(f"{score.figure.name} passes: take `fails` off its entry", file=sys.stderr)
+            print(f"{score.figure.name} passes: remove `fails` from its entry", file=sys.stderr)
         if score.fell_behind:
             told = "simulated {:.4g}, passes from {:g} to {:g}".format(score.simulated.value, *score.figure.limits)
             print(f"{score.figure.name} ({score.figure.what()}) fails: {told}", file=sys.stderr)

@@ -257,7 +257,7 @@ def limit_sentence(limit: SetUpLimit, *, again: bool = False) -> str:
         new = f" by a new unit of the camera, judged from {limit.over_units.units},"
     if not quote.demonstrated:
         reason = _reason(quote)
-        if reason.startswith("a chance that does not grow with size"):
+        if reason.startswith("a constant probability"):
             reason = f"the hits do not grow clearly with {limit.record.inspected.limit_of}"
         # without its statistics, which stand in the notes
         found = f"a90/95 is {NOT_DEMONSTRATED}: {re.sub(r' [(][^()]*[<>=][^()]*[)]', '', reason)}"

@@ -161,7 +161,7 @@ def _h1(case: maps.MapCase) -> tuple[Answer, str]:
     answers = [False if "behind" in each else True if "ahead" in each else None for each, _ in duels]
     evidence = " ".join(text for _, text in duels)
     if len(duels) == 1:
-        evidence += " No single view has as many exposures in all: judged without."
+        evidence += " No single view has as many exposures in total, so that comparison is left out."
     return decide(answers), evidence
 
 
@@ -247,6 +247,6 @@ def _over_units(verdicts: Sequence[Verdict]) -> Verdict:
     answers = [one.verdict for one in verdicts]
     if len(verdicts) < FEWEST_UNITS and set(answers) != {"undecided"}:
         on = f"{many(len(verdicts), 'unit')} of the camera"
-        evidence = f"Judged on {on} only, which says nothing of others; there: {', '.join(answers)}. {evidence}"
+        evidence = f"Judged on {on} only, which says nothing about others; there: {', '.join(answers)}. {evidence}"
     agreed = len(verdicts) >= FEWEST_UNITS and len(set(answers)) == 1
     return replace(verdicts[0], verdict=answers[0] if agreed else "undecided", evidence=evidence)

@@ -29,7 +29,7 @@ PICTURE_BYTES = 512 << 20  # A picture's file: what `FRAME_PIXELS` of 48 bits ne
 RECORD_BYTES = 256 << 20  # A study's record: three million inspections; as Python's values 10 times as large
 TEXT_BYTES = 16 << 20  # A file of settings, poses, a calibration, a bag's description: mostly some kB
 TABLE_BYTES = 256 << 20  # A table of inspections: five million rows
-RAISE = "if the file is to be so large, raise the limit in harness/vocabulary/files.py"
+RAISE = "if the file must be this large, raise the limit in harness/vocabulary/files.py"
 
 
 def size_text(count: int) -> str:
@@ -110,12 +110,12 @@ def strict_json(content: bytes | str, *, nan: bool = False) -> Any:
         found: dict[str, Any] = {}
         for key, value in pairs:
             if key in found:
-                raise ValueError(f"the key {key[:60]} stands twice")
+                raise ValueError(f"the key {key[:60]} occurs twice")
             found[key] = value
         return found
 
     def no_number(word: str) -> Any:
-        raise ValueError(f"{word} is no number of JSON")
+        raise ValueError(f"{word} is not a JSON number")
 
     text = content.decode("utf-8-sig") if isinstance(content, bytes) else content
     try:
@@ -152,7 +152,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     """Yield a new folder beside ``path``, which gets its name on success. Raises UserError where it cannot be."""
     path = Path(path)
     if path.is_dir() and any(path.iterdir()):
-        raise UserError(f"{path}: is not empty, and nothing is written over", fix="name a new folder with --out")
+        raise UserError(f"{path}: the folder is not empty, and is left as it is", fix="name a new folder with --out")
 
     def make() -> str:
         if path.exists() and not path.is_dir():
@@ -187,10 +187,10 @@ def inside(folder: Path, *parts: str) -> Path:
     is no plain name, or where a link in ``folder`` leads out of it. ``folder`` itself may be a link."""
     for part in parts:
         if part in ("", ".", "..") or any(letter in part for letter in "/\\\0"):
-            raise UserError(f"{part!r} is no name of a file or folder", legal="letters, digits, - and _")
+            raise UserError(f"{part!r} is not a name for a file or folder", legal="letters, digits, - and _")
     path = Path(folder).joinpath(*parts)
     if not path.resolve().is_relative_to(Path(folder).resolve()):
-        fix = f"remove the link, or name its goal with --out; {folder} itself may be a link"
+        fix = f"remove the link, or name its target with --out; {folder} itself may be a link"
         raise UserError(f"{path}: is a link that leads out of {folder}, to {path.resolve()}", fix=fix)
     return path
 

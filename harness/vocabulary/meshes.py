@@ -36,7 +36,7 @@ def read_mesh(file: str) -> Any:
     path = Path(file)
     if path.suffix.lower() in (".step", ".stp", ".iges", ".igs"):
         fix = "convert it to triangles, for instance in FreeCAD: Mesh, Create mesh from shape, export as .stl"
-        raise UserError(f"{file}: holds surfaces of a CAD program, no triangles", legal=FILES, fix=fix)
+        raise UserError(f"{file}: holds CAD surfaces, not triangles", legal=FILES, fix=fix)
     try:
         content = bounded_bytes(path, MOST_BYTES)
         with limited_memory():
@@ -45,7 +45,7 @@ def read_mesh(file: str) -> Any:
     except OSError as error:
         raise UserError(f"{file}: cannot be read ({error.strerror})") from error
     except (ValueError, KeyError, IndexError, TypeError, NotImplementedError) as error:
-        raise UserError(f"{file}: is no mesh that can be read ({error})", legal=FILES) from error
+        raise UserError(f"{file}: is not a readable mesh ({error})", legal=FILES) from error
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
     return mesh

@@ -76,7 +76,7 @@ def check_version(
         message = f"{said} of {what}"
     elif found > known:
         message = f"was written by a newer tofpod: it is {what} of version {found}"
-        fix = "upgrade tofpod, or use the one that wrote it"
+        fix = "upgrade tofpod, or use the version that wrote it"
     elif found < first:
         message = f"is {what} of version {found}"
     else:

@@ -169,7 +169,7 @@ def alone(folder: Path) -> Iterator[None]:
         try:
             file = held.enter_context(opened_lock(folder / LOCK))
         except OSError as error:
-            raise UserError(f"{folder}: cannot be written ({error.strerror})", fix="ask whoever owns it") from error
+            raise UserError(f"{folder}: cannot be written ({error.strerror})", fix="ask its owner") from error
         if lock(file, shared=False, wait=False) == "busy":
             fix = "wait until it has ended; nothing was removed"
             raise UserError(f"{folder}: a sweep that is running uses these renders", fix=fix)

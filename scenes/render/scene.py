@@ -35,7 +35,7 @@ def load_mitsuba() -> Any:
         return mi
     if "open3d" in sys.modules:
         # Both wheels bring a libc++.so.1; the first that is loaded serves both, and Open3D's is too old for LLVM.
-        message = "Mitsuba cannot run: Open3D was imported before it, and its C++ library stands in for the one of LLVM"
+        message = "Mitsuba cannot run: Open3D was imported before it, and Open3D's C++ library replaces LLVM's"
         fix = "call scenes.render.scene.load_mitsuba() before importing open3d, or render in a process of its own"
         raise UserError(message, fix=fix)
     raise UserError("Mitsuba cannot run: no NVIDIA GPU answers and no usable LLVM was found", legal=LEGAL, fix=FIX)
@@ -67,7 +67,7 @@ def _point_to_llvm() -> UserError | None:
     named = os.environ.get("DRJIT_LIBLLVM_PATH")
     if named:
         message, legal = f"DRJIT_LIBLLVM_PATH names {named}, which does not exist", "the path of LLVM 17 or newer"
-        return None if Path(named).exists() else UserError(message, legal=legal, fix="mend or unset DRJIT_LIBLLVM_PATH")
+        return None if Path(named).exists() else UserError(message, legal=legal, fix="set or unset DRJIT_LIBLLVM_PATH")
     for folder in (Path(sys.prefix) / "lib", Path(sys.base_prefix) / "lib"):
         found = sorted(folder.glob("libLLVM.so.*"), key=lambda p: (len(p.name), p.name))
         if found:

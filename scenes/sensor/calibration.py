@@ -89,13 +89,13 @@ def calibrated_numbers(camera: PhotonCamera) -> dict[str, float]:
 
 def _main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser("python -m scenes.sensor.calibration", description=__doc__.partition("\n")[0])
-    parser.add_argument("camera", help="a file of scenes/cameras/ without its ending")
+    parser.add_argument("camera", help="the name of a file in scenes/cameras/ without .yaml")
     name = parser.parse_args(arguments).camera
 
     def print_numbers() -> int:
         camera = load_camera(name)
         if isinstance(camera, EmpiricalCamera):
-            fix = "measure it anew with python -m harness.characterise"
+            fix = "measure it again with python -m harness.characterise"
             raise UserError(f"{name}: an empirical camera has no gain to calibrate", fix=fix)
         for key, value in calibrated_numbers(camera).items():
             print(f"{name}: {key} = {value:.5g}")

@@ -94,7 +94,7 @@ def camera_file(name: str) -> Path:
         return Path(offer.target)
     offered = CAMERAS.load(offer)
     if not isinstance(offered, str | Path):
-        raise CAMERAS.broken(offer, f"the path of a YAML file is wanted, not {type(offered).__name__}")
+        raise CAMERAS.broken(offer, f"it must be the path of a YAML file, not {type(offered).__name__}")
     path = Path(offered)
     if path.stem != name or not path.is_file():
         raise CAMERAS.broken(offer, f"the camera {name} needs a file called {name}.yaml; there is no such file {path}")
@@ -163,7 +163,7 @@ def _with_numbers(name: str, numbers_json: str) -> AnyCamera:
             legal = f"a number of {camera_file(name)}, such as lens.fx_px"
             raise UserError(f"source.camera.numbers: {name} has no number {path!r}{hint}", legal=legal)
         at.update(value=value, tag="U", source="set by the experiment")
-    return settings_of(KINDS[data["kind"]], data, f"source.camera.numbers, put into {name}, does not describe a camera")
+    return settings_of(KINDS[data["kind"]], data, f"source.camera.numbers and {name} together do not describe a camera")
 
 
 def number_paths(data: Mapping[str, Any], prefix: str = "") -> list[str]:
@@ -192,7 +192,7 @@ def _completed(source: Source, depth: int = 0) -> Source:
     if name is None:
         return source
     if not isinstance(name, str) or depth == DEEPEST:
-        message = "`like` is not the name of a camera" if depth < DEEPEST else f"`like` leads on {DEEPEST} times"
+        message = "`like` is not the name of a camera" if depth < DEEPEST else f"`like` chains {DEEPEST} files"
         problem = Problem(message, source.place_of(("like",)), legal=f"one of {', '.join(camera_names())}")
         raise DeclarationError(source.origin, [problem])
     beside = Path(source.origin).parent / name

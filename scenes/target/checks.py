@@ -91,9 +91,9 @@ def _damage_problems(damage: custom.AnyDamage, board: custom.BoardConfig, face: 
         outward = np.round([-np.sin(damage.turn_rad), np.cos(damage.turn_rad)])
         off_mm = float(np.abs(outward @ ((x, y) - outward * (half_x, half_y)))) / MM
         if off_mm > LEAST_WEB_MM:
-            return [f"{name}: its centre is {off_mm:g} mm off the edge that angle_deg names"]
+            return [f"{name}: its centre is {off_mm:g} mm away from the edge that angle_deg names"]
     elif not (abs(x) < half_x and abs(y) < half_y):
-        return [f"{name}: its centre is off {_size(board)}"]
+        return [f"{name}: its centre is outside {_size(board)}"]
     tightest = float(np.abs(face.curvatures(x, y)).max())
     if isinstance(damage, FlawConfig):
         rim, _, axis, _ = relief_points(damage, face, board.thickness_mm * MM)
@@ -106,7 +106,7 @@ def _damage_problems(damage: custom.AnyDamage, board: custom.BoardConfig, face: 
         if not (face.normal(rim[:, 0], rim[:, 1]) @ axis).min() > MOST_TURN:
             return [f"{name}: too large for the face, which turns by more than 37 degrees within it"]
     elif face.rough or isinstance(board.shape, custom.MeshConfig):
-        return [f"{name}: holes and dents need a smooth face; this one takes target.flaws (a slot, corrosion ...)"]
+        return [f"{name}: holes and dents need a smooth face; here use target.flaws (a slot, corrosion ...)"]
     elif damage.radius_m * tightest > WIDEST_BEND:
         return [f"{name}: too wide for a face bent to a radius of {1 / tightest / MM:.3g} mm there"]
     if isinstance(damage, custom.DentConfig) and damage.ball_m * tightest > SHALLOWEST_BEND:
@@ -120,7 +120,7 @@ def _damage_problems(damage: custom.AnyDamage, board: custom.BoardConfig, face: 
         problems.append(f"{name}: a chamfer of {damage.chamfer_mm:g} mm must be less than the depth, {deep_mm:g} mm")
     if isinstance(damage, custom.DentConfig) and damage.depth_mm > damage.diameter_mm / 2:
         radius = f"its radius {damage.diameter_mm / 2:g} mm"
-        problems.append(f"{name}: depth {depth_mm:g} mm is more than {radius}, which no spherical cap has")
+        problems.append(f"{name}: depth {depth_mm:g} mm is more than {radius}, the limit of a spherical cap")
     # The rim, at the face and at the bottom of the damage, against the board's edge in plan. The side walls follow the
     # normals of the edge, so below the face the limits move by the depth times the normal there.
     centre, axis = face.point(x, y), face.normal(x, y)
@@ -220,7 +220,7 @@ def _pose_problems(config: custom.TargetConfig) -> list[str]:
         backing = transform_points(T_camera_board, backing_corners_board_m(config, config.backing))
         farthest_m = max(farthest_m, backing[:, 2].max())
     if nearest_m < NEAREST_M:
-        said = f"the board's nearest point is {nearest_m:.3g} m before the lens; the limit is {NEAREST_M} m"
+        said = f"the board's nearest point is {nearest_m:.3g} m in front of the lens; the limit is {NEAREST_M} m"
         problems.append(f"pose: {said}")
     floor_m, wall_m = (room.floor_below_lens_m, room.back_wall_distance_m) if room else (None, None)
     if floor_m is not None and lowest_m >= floor_m:

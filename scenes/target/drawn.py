@@ -313,10 +313,8 @@ class DrawnTargetConfig(Config):
             best = max(best, len(places))
             if best == count:
                 return places
-        full = (
-            f"a board of {board.width_mm:g} x {board.height_mm:g} mm is too full for {count} damages whose centres are "
-        )
-        full += f"{self.apart_mm:g} mm apart and {margin_mm:.4g} mm off its edge: {best} found a place on the "
+        full = f"a board of {board.width_mm:g} x {board.height_mm:g} mm is too small for {count} damages with centres "
+        full += f"{self.apart_mm:g} mm apart and {margin_mm:.4g} mm from its edge: only {best} fit on the "
         full += f"{2 * half[0]:g} x {2 * half[1]:g} mm that are left"
         fix = "lower damage.per_board, damage.diameter_mm, apart_mm or edge_mm, or declare a larger board"
         raise UserError(full, legal=f"fewer than {best} damages on this board" if best > 1 else None, fix=fix)

@@ -73,7 +73,7 @@ def image_pattern(file: str) -> np.ndarray:
     except (OSError, cv2.error) as error:
         raise UserError(f"target.material.texture: {file} cannot be read ({error})") from error
     if image is None or image.dtype.kind != "u" or min(image.shape) < 2 or not image.any():
-        said = f"target.material.texture: {file} is no image that can be read, or it is black"
+        said = f"target.material.texture: {file} is not a readable image, or it is black"
         raise UserError(said, legal="a PNG, JPEG or TIFF image of 8 or 16 bits")
     encoded = image / (2.0 ** (8 * image.itemsize) - 1)
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
@@ -234,7 +234,7 @@ def sheet(
     lengths = np.where(bends > 1e-9, np.sqrt(4 * sagitta_m / np.maximum(bends, 1e-9)), np.inf)
     columns, rows = (max(1, int(np.ceil(size / length))) for size, length in zip(size_m, lengths, strict=True))
     if columns * rows > MAX_CELLS:
-        needs = f"{columns} x {rows} cells to be followed within {sagitta_m / MM * 1e3:.3g} um"
+        needs = f"{columns} x {rows} cells for an error below {sagitta_m / MM * 1e3:.3g} um"
         fix = "make the board smaller or bend it less"
         raise UserError(f"board: its face needs {needs}", legal=f"at most {MAX_CELLS} cells", fix=fix)
     places = plan(columns, rows)

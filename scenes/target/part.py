@@ -64,9 +64,9 @@ def part_of(shape: custom.MeshConfig) -> tuple[np.ndarray, np.ndarray]:
     refuse(edges[counts > 2], "edges that three faces or more share", "split them")
     refuse(edges[counts == 1], "open edges", "close them")
     if not len(mesh.faces):
-        raise UserError(f"{shape.file}: is no mesh: it holds no triangles", legal="a closed surface")
+        raise UserError(f"{shape.file}: is not a mesh: it holds no triangles", legal="a closed surface")
     if not mesh.is_winding_consistent:
-        said = f"{shape.file}: neighbouring triangles face in and out"
+        said = f"{shape.file}: neighbouring triangles face opposite sides"
         raise UserError(said, fix="orient its faces in a mesh editor, such as MeshLab (Re-Orient All Faces Coherently)")
     refuse(mesh.faces[crossing(mesh.triangles)], "triangles that cross others", "unite its overlapping shells")
     if mesh.volume < 0:

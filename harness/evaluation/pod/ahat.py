@@ -78,7 +78,7 @@ def fit_ahat(
     n = len(sizes)
     names = np.arange(n) if inspections is None else np.asarray(inspections).astype(str)
     if not n == len(signals) == len(names):
-        raise UserError(f"{n} sizes, {len(signals)} signals and {len(names)} targets: one of each a row")
+        raise UserError(f"{n} sizes, {len(signals)} signals and {len(names)}targets: each row needs one of each")
     rows_each = rows_of_target(sizes, names)
     targets = round(float((1 / rows_each).sum()))
     low, high = -np.inf if left is None else left, np.inf if right is None else right
@@ -90,7 +90,7 @@ def fit_ahat(
     below, above = signals <= low, signals >= high
     between = signals[~(below | above)]
     if len(between) > 1 and np.ptp(between) <= SAME * np.abs(between).max():
-        fix = "take hits and misses instead: signals that are all alike say nothing of size"
+        fix = "use hits and misses instead: signals that are all equal say nothing about size"
         raise UserError(f"the signals do not vary: all {len(between)} between the limits are {between[0]:.6g}", fix=fix)
     x = _axis("sizes", sizes, log_size)
     y = _axis("signals", np.clip(signals, low, high), log_signal)
@@ -98,7 +98,7 @@ def fit_ahat(
     line = fit_censored(np.column_stack([np.ones_like(x), x]), y, below, above)
     b0, b1 = line.coefficients
     if b1 <= 0:
-        fix = "check the columns of size and signal, or take the signal with the other sign"
+        fix = "check the columns of size and signal, or reverse the sign of the signal"
         raise UserError(f"the signal does not grow with size (slope {b1:.4g}): there is no detection limit", fix=fix)
     per_target = float(rows_each.mean())  # the design effect of rows that are alike within a target (Kish)
     mu, sigma, covariance = float((threshold - b0) / b1), float(line.tau / b1), line.covariance * per_target
@@ -108,7 +108,7 @@ def fit_ahat(
     if targets < LEAST_TARGETS:
         notes.append(f"{targets} independent targets; MIL-HDBK-1823A asks for at least {LEAST_TARGETS}")
     if per_target > 1:
-        notes.append(f"{per_target:.3g} signals per target: covariance multiplied by that, {targets} targets count")
+        notes.append(f"{per_target:.3g} signals per target multiply the covariance: {targets} targets count")
     if not sizes.min() <= (a90 := curve.size_at(0.9)) <= sizes.max():
         notes.append(f"a90 = {a90:.3g} lies outside the sizes inspected ({sizes.min():.4g} to {sizes.max():.4g})")
     log_likelihood = line.log_likelihood - (float(y[~(below | above)].sum()) if log_signal else 0.0)  # the Jacobian
@@ -143,7 +143,7 @@ def ahat_bound(fit: AhatFit, pod: float = 0.9, confidence: float = 0.95) -> Boun
     curve, v = fit.curve, fit.curve.covariance
     z, quantile = float(stats.norm.ppf(pod)), float(stats.norm.ppf(confidence))
     if curve.sigma**2 <= quantile**2 * v[1, 1]:
-        why = "the signal's growth with size is too uncertain at this confidence (band open at large sizes)"
+        why = "the signal's growth with size is too uncertain at this confidence (the band is open at large sizes)"
         return Bound(pod, confidence, "delta", float("inf"), why)
     x = curve.mu + z * curve.sigma + quantile * float(np.sqrt(v[0, 0] + 2 * z * v[0, 1] + z**2 * v[1, 1]))
     return Bound(pod, confidence, "delta", float(np.exp(x)) if curve.log_size else x)

@@ -36,8 +36,8 @@ def curve_through(a50: float, a90: float, link: str = "logit", *, log_size: bool
     """The curve of ``link`` with POD 0.5 at ``a50`` and 0.9 at ``a90`` (any one unit); its covariance is zero.
     UserError where it would not rise, and for sizes that are not above 0."""
     if not (np.isfinite([a50, a90]).all() and 0 < a50 < a90):
-        said = f"a50 {a50:g} and a90 {a90:g}: the chance of detection has to grow with size"
-        raise UserError(said, legal="0 < a50 < a90", fix="a50 is found half the time, the larger a90 nine times of ten")
+        said = f"a50 {a50:g} and a90 {a90:g}: the probability of detection must grow with size"
+        raise UserError(said, legal="0 < a50 < a90", fix="a50 is found 50 % of the time and a90 90 %, so a90 is larger")
     start, end = np.log([a50, a90]) if log_size else (a50, a90)
     half, nine_tenths = link_ppf(link, np.array([0.5, 0.9]))
     sigma = float((end - start) / (nine_tenths - half))

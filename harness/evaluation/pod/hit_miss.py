@@ -121,13 +121,13 @@ def fit_hit_miss(
         place = penalised_maxima(several, EXACT)[0]
         if x[hits].mean() < x[~hits].mean():
             place[1] = 0.0
-        notes = ("no miss is larger than any hit (separation): no maximum likelihood; Firth's penalised likelihood",)
+        notes = ("no miss is larger than any hit (separation), so Firth's penalised likelihood is used",)
     else:
         start = np.array([float(link_ppf(link, np.array(rate))), 0.0])
         place = maxima(several, start, EXACT)[0]
     if place[1] <= 0:
         fix = "check that hits are 1 and misses 0, and that size is what detection depends on"
-        raise UserError("the chance of detection does not grow with size: the slope is not positive", fix=fix)
+        raise UserError("the probability of detection does not grow with size: the slope is not positive", fix=fix)
     single = HitsAndMisses(design, found, weight - found, link)
     log_likelihood = float(single.value(place))
     unscale = np.array([[1.0, -centre / spread], [0.0, 1.0 / spread]])
@@ -135,9 +135,9 @@ def fit_hit_miss(
     covariance = unscale @ (np.linalg.pinv(_information(single, place)) * repeats) @ unscale.T
     slopes = np.array([[-1.0 / b1, b0 / b1**2], [0.0, -1.0 / b1**2]])  # of mu = -b0 / b1 and sigma = 1 / b1
     if targets < n:
-        notes += (f"{n} inspections of {targets} targets count as {targets}: variance times {repeats:.4g}",)
+        notes += (f"{n} inspections of {targets} targets count as {targets} (variance multiplied by {repeats:.4g})",)
         if np.ptp(rows_each):
-            notes += (f"{rows_each.min()} to {rows_each.max()} inspections a target: weighted, each counts once",)
+            notes += (f"{rows_each.min()} to {rows_each.max()} inspections per target: each target counts once",)
     curve = PodCurve(link, log_size, -b0 / b1, 1.0 / b1, slopes @ covariance @ slopes.T)
     null = float(-2.0 * n * (rate * np.log(rate) + (1.0 - rate) * np.log1p(-rate)))
     numbers = (b0, b1, covariance, -2.0 * log_likelihood, null, log_likelihood, n, int(hits.sum()), targets, repeats)
@@ -253,7 +253,7 @@ def rows_of_target(size: np.ndarray, inspections: ArrayLike | None) -> np.ndarra
         return np.ones(len(size), int)
     names = np.asarray(inspections).astype(str)
     if len(names) != len(size):
-        raise UserError(f"{len(names)} identities of targets for {len(size)} rows", legal="one for each row")
+        raise UserError(f"{len(names)} target names for {len(size)} rows", legal="one for each row")
     _, first, target = np.unique(names, return_index=True, return_inverse=True)
     if np.any(other := size != size[first][target]):
         raise UserError(f"target {names[other][0]} has more than one size", legal="one size for each target")
@@ -277,7 +277,7 @@ def bound(fit: HitMissFit, pod: float = 0.9, confidence: float = 0.95, *, design
     with np.errstate(over="ignore"):
         value = float(np.exp(x)) if fit.curve.log_size else x
     if not np.isfinite(value):
-        why = f"not demonstrated: {why or 'the bound is beyond all numbers'}"
+        why = f"not demonstrated: {why or 'the bound is infinite'}"
         return Bound(pod, confidence, METHOD, float("inf"), why)
     return Bound(pod, confidence, METHOD, value)
 
@@ -318,7 +318,7 @@ def _likelihood_bound(fit: HitMissFit, pod: float, allowed: float) -> tuple[floa
     top = float(data.value(place))
     flat = 2.0 * (top - flat_maximum(data, level))
     if flat <= allowed:
-        return float("inf"), f"a chance that does not grow with size fits too (ratio {flat:.2f} <= {allowed:.2f})"
+        return float("inf"), f"a constant probability is not rejected (ratio {flat:.2f} <= {allowed:.2f})"
 
     slope = place[1]
 
@@ -332,7 +332,7 @@ def _likelihood_bound(fit: HitMissFit, pod: float, allowed: float) -> tuple[floa
     while excess(z_best + reach) <= 0:
         reach *= 2.0
         if reach > FARTHEST:
-            return float("inf"), "the likelihood ratio set has no end"
+            return float("inf"), "the likelihood ratio set is unbounded"
     z = optimize.brentq(excess, z_best, z_best + reach, xtol=1e-10)
     return fit.centre + fit.spread * float(z), ""
 

@@ -29,7 +29,7 @@ NOTHING = ("", "na", "n/a", "nan", "null", "none", "-", "#n/a")
 """Cells that stand for no value, whatever their case."""
 NUMBER = re.compile(r"[+-]?(\d[\d.,'\u2019\u00a0\u202f ]*|[.,]\d+)([eE][+-]?\d+)?")
 GROUPED = re.compile(r"[+-]?\d{1,3}([.,])\d{3}")
-LEGAL = "a header row with column names, then one row an inspection"
+LEGAL = "a header row with column names, then one row per inspection"
 MARKS = ".,"
 Rows = list[tuple[int, list[str]]]
 
@@ -78,22 +78,22 @@ def read_inspections(
     names = np.array(texts[-1]) if target else (lines.astype(str) if len(responses) > 1 else None)
     for line, name in zip(lines, names if target and names is not None else (), strict=False):
         if not name:
-            raise UserError(f"{path}, line {line}: {target} is empty", fix="name the target, or take the row out")
+            raise UserError(f"{path}, line {line}: {target} is empty", fix="name the target, or remove the row")
     # one inspection a row from here on: all of the first inspector, all of the second ...
     response, count = np.concatenate(each), len(responses)
     sizes, lines = np.tile(sizes, count), np.tile(lines, count)
     names = None if names is None else np.tile(names, count)
     if missing := int(np.isnan(response).sum()):
-        notes.append(f"{missing} of {len(response)} inspections state no result: left out")
+        notes.append(f"{missing} of {len(response)} inspections state no result and are left out")
     if (below := sizes < 0).any():
         said = f"{path}, line {lines[below][0]}: {size} is {sizes[below][0]:g}, and no size is below 0"
         raise UserError(said, fix="give the sizes, not their logarithms: --log takes these")
     seen, flawed = ~np.isnan(response), np.nan_to_num(sizes) != 0
     if sites := int((seen & ~flawed).sum()):
-        notes.append(f"{sites} of {len(response)} inspections are of unflawed sites (size 0 or none): not in the curve")
+        notes.append(f"{sites} of {len(response)} inspections are of unflawed sites (no size, or 0): not in the curve")
     kept = seen & flawed
     if kept.sum() < FEWEST_ROWS:
-        legal = f"at least {FEWEST_ROWS}; 60 targets (hit/miss) or 40 (signal) are what the standard asks for"
+        legal = f"at least {FEWEST_ROWS}; the standard asks for 60 targets (hit/miss) or 40 (signal)"
         raise UserError(f"{path}: {int(kept.sum())} rows are too few for a POD curve", legal=legal)
     read = Inspections(path, size, ", ".join(responses), sizes[kept], response[kept], None, lines[kept])
     if names is not None:
@@ -118,7 +118,7 @@ def _require_one_size(read: Inspections) -> None:
         j = first.setdefault(name, k)
         if read.size[j] != read.size[k]:
             where = f"size {read.size[j]:g} in line {read.line[j]} and {read.size[k]:g} in line {read.line[k]}"
-            fix = "give every target one size (the true one), or different targets different names"
+            fix = "give each target one size (its true size), and different targets different names"
             raise UserError(f"{read.path}: target {name!r} has {where}", fix=fix)
 
 
@@ -136,7 +136,7 @@ def require_positive(read: Inspections, response: bool, why: str) -> None:
     wrong = values <= 0
     if wrong.any():
         said = f"{read.path}, line {read.line[wrong][0]}: {column} is {values[wrong][0]:g}, which has no logarithm"
-        raise UserError(said, legal=f"values above 0 with {why}", fix=f"leave out {why}, or take out the rows")
+        raise UserError(said, legal=f"values above 0 with {why}", fix=f"leave out {why}, or remove the rows")
 
 
 def _column(path: Path, header: list[str], name: str, chosen: tuple[str | None, ...]) -> int:
@@ -163,7 +163,7 @@ def _hits(path: Path, name: str, lines: np.ndarray, texts: list[str], notes: lis
             found[k] = HITS[word]
         elif word not in NOTHING:
             said = f"{path}, line {lines[k]}: {name} is {text!r}, which is neither hit nor miss"
-            legal = "1, yes, true, hit or found; 0, no, false, miss or missed; NA or nothing where it was not inspected"
+            legal = "1, yes, true, hit or found; 0, no, false, miss or missed; NA or an empty cell for none"
             raise UserError(said, legal=legal, fix="a column of signals is analysed with --ahat and --decision")
     return found
 
@@ -182,7 +182,7 @@ def _numbers(path: Path, name: str, lines: np.ndarray, texts: list[str], notes: 
             found[k] = float(plain)
         if not np.isfinite(found[k]):
             said = f"{path}, line {lines[k]}: {name} is {text!r}, not a number"
-            raise UserError(said, legal="a finite number, or NA", fix="mend the row, or take it out")
+            raise UserError(said, legal="a finite number, or NA", fix="correct the row, or remove it")
     if told:
         value = found[texts.index(told)]
         notes.append(f"{name}: {told!r} was read as {value:g}; write thousands without a mark if it is more")
@@ -233,7 +233,7 @@ def _text_rows(path: Path, content: bytes, column: str) -> Rows:
         text = content.decode("cp1252", errors="replace")
     if "\0" in text:
         legal = "CSV in UTF-8, UTF-16 or Latin-1, or an Excel file (.xlsx)"
-        raise UserError(f"{path}: is no text", legal=legal, fix="export it as CSV")
+        raise UserError(f"{path}: is not a text file", legal=legal, fix="export it as CSV")
     lines = text.splitlines(keepends=True)
     skipped = next((k for k, line in enumerate(lines) if line.strip()), len(lines))
     stated = re.fullmatch(r"\"?sep=(.)\"?", lines[skipped].strip("\r\n")) if skipped < len(lines) else None
@@ -270,7 +270,7 @@ def _sheet_rows(path: Path, content: bytes) -> Rows:
         raise UserError(f"{path}: cannot be read as an Excel file ({error})"[:300], fix="save it as CSV") from error
     filled = {title: rows for title, rows in sheets.items() if rows}
     if len(filled) > 1:
-        legal, fix = "one sheet with inspections", "save the sheet that is meant as CSV"
+        legal, fix = "one sheet with inspections", "save the intended sheet as CSV"
         raise UserError(f"{path}: has {len(filled)} sheets with data: {', '.join(filled)}", legal=legal, fix=fix)
     rows = next(iter(filled.values()), [])
     # a table may begin in any column, and rows end where their last cell does

@@ -167,7 +167,7 @@ def state_hits(
         notes.append(f"a90/95 = {limit.value:.3g} lies beyond the largest size inspected, {largest:.4g}")
     if any(test.needed for test in tests):
         likeliest = min(tests, key=lambda test: test.p_value)
-        speaks = f"the data speak for {TESTED[likeliest.beyond]} (p = {likeliest.p_value:.2g})"
+        speaks = f"the data suggest {TESTED[likeliest.beyond]} (p = {likeliest.p_value:.2g})"
         notes.append(f"the curve has no floor or ceiling, and {speaks}{DOUBTED}")
     said = []
     for test in tests:
@@ -199,7 +199,7 @@ def state_signals(
     fits = [fit for fit in tried if log_size in (None, fit.log_size) and log_signal in (None, fit.log_signal)]
     if not fits:
         fix = "leave out --log or --log-signal"
-        raise UserError(f"{read.path}: the axes asked for need logarithms of values <= 0", fix=fix)
+        raise UserError(f"{read.path}: the requested axes need logarithms of values <= 0", fix=fix)
     fit, curve = fits[0], fits[0].curve
     limit = ahat_bound(fit, POD, CONFIDENCE)
     (of_mu, common), (_, of_sigma) = curve.covariance.tolist()
@@ -209,7 +209,7 @@ def state_signals(
     numbers |= {"signals at or above --right": float(fit.above.sum()), "decision": fit.decision}
     numbers |= false_positives(read, fit)
     models = [(one, ahat_bound(one, POD, CONFIDENCE)) for one in tried]
-    reads = {True: f"doubtful at {LEVEL:.0%}", False: f"nothing against it at {LEVEL:.0%}"}
+    reads = {True: f"doubtful at {LEVEL:.0%}", False: f"not rejected at {LEVEL:.0%}"}
     said = [(f"{one.assumption} ({one.test})", one.p_value, reads[one.p_value < LEVEL]) for one in diagnose(fit)]
     what = (read, "signal against size", unit, (), fit, _models(models, (fit,)), limit)
     return PodStatement(*what, numbers, (*read.notes, *fit.notes), tuple(said))

@@ -204,7 +204,7 @@ class Mapod:
     ) -> Mapod:  # fmt: skip
         """Correct a study's curve. Raises UserError where the study has no curve, and says ``why``."""
         if simulated is None:
-            raise UserError(f"set-up {set_up} has no curve to correct: {why}", fix="name another one with --set-up")
+            raise UserError(f"set-up {set_up} has no curve to correct: {why}", fix="name another set-up with --set-up")
         measured, none = None, ""
         try:
             measured = state_hits(read, unit="mm", tested=False)

@@ -106,7 +106,7 @@ def efficiency_of(limit: SetUpLimit, ideal: IdealDamages) -> Efficiency:
         needed[~inside] = np.nan
         if not inside.all():
             wanted = " and ".join(f"{100 * share:.0f} %" for share in np.array(SHARES)[~inside])
-            why = f"found {wanted} of the time at no d' that was inspected ({index.min():.2g} to {index.max():.3g})"
+            why = f"the d' at which {wanted} are found was not inspected ({index.min():.2g} to {index.max():.3g})"
     except UserError as error:
         why = error.message
     all_found = bool((1.0 - pod).sum() <= HARDLY)
@@ -140,7 +140,7 @@ def warnings_of(rows: list[Efficiency]) -> list[str]:
         if ideal.kurtosis > HEAVY:
             said.append(
                 f"{name}: the noise has heavier tails than a Gaussian (excess kurtosis {ideal.kurtosis:.2g}): the ideal"
-                " observer for Gaussian noise is not the best detector there, nor does it keep to the rate"
+                " observer for Gaussian noise is not the best detector there, nor does it keep the stated rate"
             )
         if ideal.lost > MOST_LOST:
             said.append(

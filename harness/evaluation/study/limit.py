@@ -183,7 +183,7 @@ def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | No
     seen = record.inspected
     hit = seen.hit
     if not len(hit) or hit.all() or not hit.any():
-        return None, "every damage fared alike: there is no surface to fit"
+        return None, "all damages had the same outcome: there is no surface to fit"
     diameters, depths = ((float(sizes.min()), float(sizes.max())) for sizes in (seen.diameter_mm, seen.depth_mm))
     if depths[0] <= 0 or not depth_varies(seen.depth_mm):
         return None, "depth does not vary: {:g} to {:g} mm".format(*depths)
@@ -192,7 +192,7 @@ def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | No
     a, d = np.log(seen.diameter_mm), np.log(seen.depth_mm)
     crossed = np.stack([np.ones_like(a), a, d, a * d], axis=1)
     if _separated(crossed[:, :3], hit):
-        return None, f"hits and misses do not overlap over {seen.size_of} and depth (separation): no maximum likelihood"
+        return None, f"hits and misses do not overlap over {seen.size_of} and depth (separation): no surface fits"
     repeats = len(hit) / len({*zip(seen.board.tolist(), seen.hole.tolist(), strict=True)})
 
     def fit(link: str, design: np.ndarray) -> tuple[float, np.ndarray, str]:
@@ -203,7 +203,7 @@ def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | No
 
     deviance, b, link = min((fit(link, crossed[:, :3]) for link in LINKS), key=lambda one: one[0])
     if b[1] <= 0:
-        return None, f"the chance of detection does not grow with {seen.size_of}"
+        return None, f"the probability of detection does not grow with {seen.size_of}"
     p, terms, note = np.nan, 3, "POD falls with depth" if b[2] < 0 else ""
     if not _separated(crossed, hit):
         least, bent, _ = fit(link, crossed)
@@ -388,5 +388,5 @@ def _all_found(size_mm: np.ndarray, what: str) -> Bound:
     method = f"all found: binomial on the {ALL_FOUND} smallest {what}"
     if len(size_mm) >= ALL_FOUND:
         return Bound(POD, CONFIDENCE, method, float(np.sort(size_mm)[ALL_FOUND - 1]))
-    reason = f"not demonstrated: all of {len(size_mm)} {what} were found, and it takes {ALL_FOUND}"
+    reason = f"not demonstrated: all of {len(size_mm)} {what} were found, but {ALL_FOUND} are needed"
     return Bound(POD, CONFIDENCE, method, np.inf, reason)

@@ -34,7 +34,7 @@ RECORD_VERSION = 2
 OLDEST_VERSION = 1
 """Still read: where nothing is lost by missing returns its hits are those of today."""
 LEGAL = "a study.json, or a baseline that python -m harness.check --update wrote"
-AGAIN = "run the study again, which writes the file anew; it is not made to be edited by hand"
+AGAIN = "run the study again, which rewrites the file; do not edit it by hand"
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def _one_table(table: Any) -> Any:
         raise ValueError(f"columns of different lengths: {', '.join(lengths.values())}")
     named = [column.tolist() for name, column in columns.items() if name in ("board", "repeat", "hole")]
     if len(set(zip(*named, strict=True))) < len(table.board):
-        raise ValueError("the same inspection stands there twice")
+        raise ValueError("the same inspection occurs twice")
     return table
 
 
@@ -71,7 +71,7 @@ def _no_set_up_twice(set_ups: tuple[SetUpRecord, ...]) -> tuple[SetUpRecord, ...
     names = [(one.variant, one.frames) for one in set_ups]
     for variant, frames in names:
         if names.count((variant, frames)) > 1:
-            raise ValueError(f"set-up {variant!r} with frames {frames} stands there twice")
+            raise ValueError(f"set-up {variant!r} with frames {frames} occurs twice")
     return set_ups
 
 
@@ -238,9 +238,9 @@ def read_record(path: Path) -> StudyRecord:
         fix = "name a folder that a sweep with a `study` wrote, such as results/detection_limit/<digest>"
         raise UserError(f"{file}: cannot be read ({error.strerror})", fix=fix) from error
     except ValueError as error:
-        raise UserError(f"{file}: is no JSON ({error})", legal=LEGAL, fix=AGAIN) from error
+        raise UserError(f"{file}: is not JSON ({error})", legal=LEGAL, fix=AGAIN) from error
     if not isinstance(data, dict) or "record_version" not in data:
-        raise UserError(f"{file}: is no study's record", legal=LEGAL)
+        raise UserError(f"{file}: is not the record of a study", legal=LEGAL)
     check_version(data.pop("record_version"), RECORD_VERSION, file, "a record", oldest=OLDEST_VERSION, again=AGAIN)
     try:
         return TypeAdapter(StudyRecord).validate_python(data)

@@ -117,14 +117,14 @@ def validity_of(
     counted = "closest pairs first, each finding for one damage at most; fixed beforehand, the same for all sizes"
     hits = [f"A damage is hit {record.hit_rule} ({counted})."]
     if record.hit_overlap is not None:
-        hits += ["Further findings that lie on a damage are its parts and no false calls."]
+        hits += ["Further findings that lie on a damage are its parts and not false calls."]
         hits += ["Chance hits are counted by centres alone, so those of long damage come out too low."]
     hits += [f"The largest damages, up to {largest:.3g} mm, reach beyond that radius."] if largest / 2 > radius else []
     sections = (
         ("What was inspected", _inspected(limits, facts.get("sweep") or {})),
         ("What counts as a hit", tuple(hits)),
         ("Departures from MIL-HDBK-1823A", _departures(limits, chances, facts)),
-        ("What is not in it", _missing(limits, facts)),
+        ("What is not included", _missing(limits, facts)),
         ("What is measured and what is simulated", tuple(facts.get("implanted", ()))),
     )
     return tuple((heading, sentences) for heading, sentences in sections if sentences)
@@ -176,10 +176,10 @@ def _departures(
         (repeated, f"Targets were inspected more than once with new noise {counted}."),
         (
             units > 1,
-            f"{units} units of the camera inspected each damaged board, and every other board was before a unit of its "
-            "own. Intervals of sizes are over units and boards drawn again; patches of one sensor are taken as alike.",
+            f"{units} units of the camera inspected each damaged board, and every other board was recorded by its own "
+            "unit. Intervals of sizes resample units and boards; patches of one sensor are assumed to be alike.",
         ),
-        (calibrated, "Other calibration boards would give another threshold, which is in no interval here."),
+        (calibrated, "Other calibration boards would give another threshold; no interval here includes this scatter."),
         (
             fewest_places < SITES_PER_TARGET,
             f"Unflawed places for each damage: {fewest_places:.3g}; the handbook asks for {SITES_PER_TARGET}. "
@@ -189,11 +189,11 @@ def _departures(
         (chosen, f"The same data chose the model: a90/95 is the largest over models whose {NEARLY}."),
         (
             all_found,
-            f"Where everything was found there is no curve. a90/95 is then the {ALL_FOUND}th smallest size: were its "
+            f"Where all damages were found there is no curve. a90/95 is then the {ALL_FOUND}th smallest size: were its "
             f"POD below 90 %, the {ALL_FOUND} smallest would all be found in less than 5 % of studies.",
         ),
-        (len(limits) > 1, f"{len(limits)} limits stand side by side; each interval holds for itself, not for all."),
-        (failed, f"Failed trials ({failed}) are missing from what is counted: a refused board is no miss."),
+        (len(limits) > 1, f"{len(limits)} limits are stated; each interval holds for one limit, not for all jointly."),
+        (failed, f"Failed trials ({failed}) are not counted: a refused board is not a miss."),
     )
     return _true(rules)
 
@@ -237,14 +237,14 @@ def _missing(limits: Sequence[SetUpLimit], facts: Mapping[str, Any]) -> tuple[st
     simulated, drawn = source.get("kind") == "simulated", target.get("name") == "drawn"
     rules = (
         (True, "An inspector, who can miss findings and doubt others: the POD is that of the program alone."),
-        (drawn, f"Damage of another kind, that stands in rows or clusters, or several kinds on one board{only}."),
+        (drawn, f"Damage of another kind, damage in rows or clusters, or several kinds on one board{only}."),
         (simulated, "Translucency, undeclared light and gloss, motion, dirt and wear."),
         (
             one_unit,
-            "Other units of the camera: fixed pattern and offset are those of one unit. What many frames leave over "
-            "lies on the same pixels of all its boards, which are not as independent as the intervals take them to be.",
+            "Other units of the camera: fixed pattern and offset are those of one unit. The error that remains "
+            "after many frames lies on the same pixels of all its boards, which the intervals ignore.",
         ),
-        (judged, "Boards of another family: intervals are over boards drawn like these."),
+        (judged, "Boards of another family: the intervals hold for boards drawn like these."),
     )
     return _true(rules)
 

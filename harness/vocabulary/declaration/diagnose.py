@@ -114,7 +114,7 @@ def problems_of(error: ValidationError, declared: shape.Declared, source: Source
             meant = meant or {label for label in labels if label.startswith(("list[", "tuple["))}
         alone += [(at, each) for label, at, each in errors if label in meant]
         if not meant:
-            message = f"`{dotted(path)}` is {shown(data)}, which fits none of what is legal here"
+            message = f"`{dotted(path)}` is {shown(data)}, which matches none of the legal forms"
             problems.append(Problem(message, source.place_of(path), legal=shape.legal_at(slot)))
     return problems + [_problem(path, each, declared, source) for path, each in alone]
 
@@ -127,7 +127,7 @@ def _problem(path: KeyPath, error: Any, declared: shape.Declared, source: Source
         parent, name = path[:-1], path[-1]
         inside = f"`{dotted(parent)}` lacks" if parent else "the file lacks"
         if isinstance(name, int):
-            return Problem(f"{inside} an item number {name + 1}", source.place_of(parent), legal)
+            return Problem(f"{inside} item number {name + 1}", source.place_of(parent), legal)
         return Problem(f"{inside} the key `{name}`", source.key_place_of(parent), legal)
     if kind == "extra_forbidden":
         within = path[:-1]
@@ -141,7 +141,7 @@ def _problem(path: KeyPath, error: Any, declared: shape.Declared, source: Source
         if key in value:
             return wrong_choice((*path, key), value[key], tags, source.place_of((*path, key)))
         near = nearest(key, value)
-        message = f"`{dotted(path)}` lacks the key `{key}`, which says what it is"
+        message = f"`{dotted(path)}` lacks the key `{key}`, which selects its kind"
         fix = f"rename `{near}` to `{key}`" if near else None
         return Problem(message, source.key_place_of(path), legal="one of " + ", ".join(tags), fix=fix)
     if kind == "literal_error" and (choices := shape.choices_of(slot)):
@@ -153,7 +153,7 @@ def _problem(path: KeyPath, error: Any, declared: shape.Declared, source: Source
     if isinstance(value, dict | list) and kind in ("model_type", "dict_type", "tuple_type", "list_type"):
         return Problem(f"`{dotted(path)}` is {shown(value)}", place, legal)
     if kind.startswith("int_") and isinstance(value, float) and value.is_integer():
-        fix = f"write {int(value)}, without point or exponent"
+        fix = f"write {int(value)} without a decimal point or exponent"
     if kind.startswith("bool_") and str(value).lower() in YES_AND_NO:
         fix = f"write {YES_AND_NO[str(value).lower()]}"
     text = re.sub(r"valid dictionary( or (instance of|object to) .*)?$", "mapping", error["msg"])

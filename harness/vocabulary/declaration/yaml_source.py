@@ -184,7 +184,7 @@ def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = Fa
 
     if version := _OTHER_VERSION.search(text):
         at = place(version.start() - start, version.end())
-        raise DeclarationError(origin, [Problem("only YAML 1.2 is read", at)])
+        raise DeclarationError(origin, [Problem("only YAML 1.2 is supported", at)])
     reader = YAML(typ="safe", pure=True)
     reader.Parser = _BoundedParser
     try:
@@ -202,13 +202,13 @@ def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = Fa
         where = place(mark.index, mark.index + 1) if mark else None
         begun = place(context.index, context.index + 1) if context and mark and context.index != mark.index else None
         what = " ".join(filter(None, [error.context, error.problem])).replace("\n", " ")
-        problem = Problem(f"no valid YAML: {what}", where, other=begun, other_says="begun at")
+        problem = Problem(f"not valid YAML: {what}", where, other=begun, other_says="begun at")
     except ReaderError as error:
         index = int(error.position)
         letter = f"U+{ord(text[start + index]):04X}"
         problem = Problem(f"character {letter} is not allowed in YAML", place(index, index + 1))
     except YAMLError as error:
-        problem = Problem(f"no valid YAML: {error}", place(0, 1))
+        problem = Problem(f"not valid YAML: {error}", place(0, 1))
     raise DeclarationError(origin, [problem])
 
 
@@ -256,7 +256,7 @@ class _Builder:
         if len(self.problems) >= MAX_PROBLEMS or self._nodes > MAX_NODES + 1:
             return None
         if self._nodes > MAX_NODES:
-            return self._refuse("too many values", here, f"at most {MAX_NODES} values, aliases followed")
+            return self._refuse("too many values", here, f"at most {MAX_NODES} values after aliases are expanded")
         if any(node is outer for outer in within):
             return self._refuse("an alias within its own anchor", here)
         if len(within) >= MAX_DEPTH:
@@ -272,7 +272,7 @@ class _Builder:
         for key_node, value_node in node.value:
             at, before = self._of(key_node), len(self.problems)
             if key_node.tag == _TAG + "merge":
-                fix = "write the keys out, or an alias for a whole value"
+                fix = "write the keys out, or use an alias for a whole value"
                 self.problems.append(Problem("merge keys (`<<`) are not part of YAML 1.2", at, fix=fix))
                 continue
             key = self._scalar(key_node, at) if isinstance(key_node, ScalarNode) else None
@@ -304,7 +304,7 @@ class _Builder:
         except (ValueError, KeyError):
             return self._refuse(f"{text[:40]!r} cannot be read as {kind}", here)
         tag = str(node.tag).replace(_TAG, "!!")
-        return self._refuse(f"the tag {tag} is not read", here, "plain mappings, lists, text and numbers")
+        return self._refuse(f"the tag {tag} is not supported", here, "plain mappings, lists, text and numbers")
 
     def _refuse(self, message: str, place: Place, legal: str | None = None) -> None:
         self.problems.append(Problem(message, place, legal=legal))

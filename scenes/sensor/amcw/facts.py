@@ -267,7 +267,7 @@ class EngineFacts(LimitFacts):
     @model_validator(mode="after")
     def _gates_can_hold(self) -> EngineFacts:
         if self.residual_by_amplitude and not self.lattice_residual_turns:
-            raise ValueError("residual_by_amplitude needs lattice_residual_turns, the least that it gives")
+            raise ValueError("residual_by_amplitude needs lattice_residual_turns, its lower limit")
         return self
 
 
@@ -288,7 +288,7 @@ class AmcwCamera(CameraFacts):
     def _parts_fit_each_other(self) -> AmcwCamera:
         widest_px = WIDEST_PX - self.engine.window_px.value + 1
         if self.lens.width_px.value > widest_px:
-            raise ValueError(f"lens.width_px is {self.lens.width_px.value}; the model takes {widest_px} at most")
+            raise ValueError(f"lens.width_px is {self.lens.width_px.value}; the model allows at most {widest_px}")
         if len(self.engine.amplitude_gains.value) != len(self.frequencies_hz):
             raise ValueError("engine.amplitude_gains needs one value for each of modulation.frequencies_hz")
         return self
