@@ -225,15 +225,16 @@ def _reflowed(block: str) -> str:
 def _set_up(checks: Sequence[WallCheck], camera: AmcwCamera) -> str:
     lens, albedo = camera.nominal_lens, camera.photons.calibration_albedo.value
     planes = _listed(
-        f"the {c.wall.name} one {c.wall.z_m[:, c.wall.mask].mean(0).min():.2f} to "
-        f"{c.wall.z_m[:, c.wall.mask].mean(0).max():.2f} m away, {_tilt_deg(c):.0f} degrees from frontal, "
-        f"{c.wall.mask.sum():,} pixels"
+        f"the {c.wall.name} wall is {c.wall.z_m[:, c.wall.mask].mean(0).min():.2f} to "
+        f"{c.wall.z_m[:, c.wall.mask].mean(0).max():.2f} m away and {_tilt_deg(c):.0f} degrees from frontal "
+        f"({c.wall.mask.sum():,} pixels)"
         for c in checks
     )
     return f"""# The simulated Azure Kinect beside a real one
 
-A public set of Azure Kinect wall frames ({len(checks[0].wall.z_m)} frames of a static camera, NFOV unbinned, 640 x 576,
-whole millimetres, everything but two plaster walls masked out) against the camera model. The walls: {planes}.
+This page compares the camera model with a public set of Azure Kinect wall frames ({len(checks[0].wall.z_m)} frames of
+a static camera, NFOV unbinned, 640 x 576,
+whole millimetres; everything except two plaster walls is masked out). {planes[0].upper()}{planes[1:]}.
 
 ![{_ALT}]({FIGURE})
 
@@ -272,10 +273,11 @@ Standard deviation over frames, rms over pixels, in bins of 0.1 m (bins of fewer
 
 {_markdown(SIGMA_HEAD, rows)}
 
-Simulated by measured: {inner} in the lit cone; {whole} over whole walls. The growth with range is right
-(each wall's ratios in the lit cone lie within {100 * spread:.0f} % of their mean), the level is too low.
+The ratio of simulated to measured deviation is {inner} in the lit cone and {whole} over whole walls. The growth with
+range is correct
+(each wall's ratios in the lit cone lie within {100 * spread:.0f} % of their mean), but the level is too low.
 An albedo of {needed} in place of the assumed one would make the levels in the lit cone equal; that
-number is stated, not used."""
+number is reported, but not used."""
 
 
 def _spatial(checks: Sequence[WallCheck]) -> str:
@@ -292,9 +294,10 @@ def _spatial(checks: Sequence[WallCheck]) -> str:
 {_markdown(CORRELATION_HEAD, rows)}
 
 The real frames jitter as a whole: a wall's mean over all its pixels varies from frame to frame by {real}; simulated
-{ours} (its size in the camera's file is from these very frames, so that is no test; independent pixels would give 0.03
-mm). The jitter lifts the correlation at all lags alike; with each frame's mean taken off, measured and simulated
-differ by at most {gaps[False]:.3f} at lags 1 to 5, with it by at most {gaps[True]:.3f}."""
+{ours} (its size in the camera's file was set from these frames, so this agreement is not a test; independent pixels
+would give 0.03
+mm). The jitter lifts the correlation at all lags alike; with each frame's mean subtracted, measured and simulated
+correlations differ by at most {gaps[False]:.3f} at lags 1 to 5, with it by at most {gaps[True]:.3f}."""
 
 
 def _pattern(checks: Sequence[WallCheck], camera: AmcwCamera) -> str:
@@ -307,41 +310,46 @@ def _pattern(checks: Sequence[WallCheck], camera: AmcwCamera) -> str:
     planted = facts.pixel_mm.value / camera.engine.window_px.value
     return f"""## Fixed pattern
 
-The average of the frames less a robust surface of degree 5 in 1/z; what is left of the temporal noise (its covariance
-divided by the number of frames) is taken off the covariance of the residual at every lag.
+The fixed pattern is the average of the frames minus a robust surface of degree 5 in 1/z. The remaining temporal noise
+(its covariance divided by the number of frames) is subtracted from the covariance of the residual at every lag.
 
 {_markdown(PATTERN_HEAD, rows)}
 
-Measured: a standard deviation of {real}, a Gaussian correlation length of {length}; simulated: {ours} (rms of
+The measured standard deviation is {real}, the Gaussian correlation length {length}; the simulated standard deviation
+is {ours} (rms of
 five units). The camera file's {facts.smooth_mm.value} mm and {facts.smooth_length_px.value} px are put in
-along the ray before the filter; filter, projection to z and the removed surface take their share. The part that is
+along the ray before the filter; the filter, the projection to z and the removed surface reduce them. The part that is
 white before the 5x5 window shows as a triangle in the covariance. The file's {facts.pixel_mm.value} mm leaves
-{planted:.2f} mm after the window, which the analysis finds again in the simulated walls; in the real ones it
+{planted:.2f} mm after the window, and the analysis finds this value in the simulated walls; in the real walls it
 finds {white}."""
 
 
 def _why(checks: Sequence[WallCheck]) -> str:
     angles = np.concatenate([c.wall.angle_deg[c.wall.mask] for c in checks])
     times = _listed(f"{c.pattern.std_m / _simulated(c, lambda p: p.std_m):.2f}" for c in checks)
-    return f"""## Where the simulation is off, and the likely reasons
+    return f"""## Where the simulation deviates, and the likely reasons
 
 - **Less temporal noise than measured.** The walls are seen {angles.min():.0f} to {angles.max():.0f} degrees off the
   axis. The model's light falls with incidence, distance and the lens' natural cos^4 law less what barrel distortion
-  gives back; mechanical vignetting and the emitter's profile are not published and not modelled. A darker wall explains
-  the level as well (the albedos above), but not what fall with angle remains. On the axis, where the gain is
+  gives back; mechanical vignetting and the emitter's profile are not published and not modelled. A darker wall
+  explains
+  the level as well (the albedos above), but not the remaining fall with angle. On the axis, where the gain is
   calibrated, neither makes a difference.
 - **The edge of the lit field.** On the right wall the measured deviation doubles over the last 20 px before the field
   ends. The renderer's emitter has a linear roll-off between two guessed angles; the closed-form plane has none.
 {_polygon(checks)}- **Correlation slightly low at lags 1 to 3.** Rounding to whole millimetres adds 0.29 mm
   of white noise; where the simulated deviation is smaller than the real one, that share is larger and the correlation
   lower.
-- **Correlation beyond the window.** Simulated noise within a frame is uncorrelated at 5 px, the real one is not
-  quite: beside the frames' common jitter, which is modelled, something varies smoothly within a frame, which is not.
-- **Fixed pattern: measured by simulated {times}.** The camera file's two sizes were set from these very frames, so
-  this agreement is no test. The white part was set from patches of 3 to 15 pixels, which ask for less
-  than this analysis finds. The measured one contains the plaster's own relief and texture and
-  light between walls and ceiling, so it is an upper bound of the camera's. Its covariance falls faster than a Gaussian
-  at the first lags, has a longer tail and differs between x and y; the model is one isotropic Gaussian and white noise.
+- **Correlation beyond the window.** Simulated noise within a frame is uncorrelated at 5 px; real noise is still
+  slightly correlated. Beside the frames' common jitter, which is modelled, real frames have an error that varies
+  smoothly within a frame and is not modelled.
+- **Fixed pattern: measured by simulated {times}.** The camera file's two sizes were set from these frames, so this
+  agreement is not a test. The white part was set from patches of 3 to 15 pixels, which need less than this analysis
+  finds. The measured pattern contains the plaster's own relief and texture and
+  light between walls and ceiling, so it is an upper bound of the camera's pattern. Its covariance falls faster than a
+  Gaussian
+  at the first lags, has a longer tail and differs between x and y; the model is one isotropic Gaussian and white
+  noise.
 - **One unit, one pair of walls, {len(checks[0].wall.z_m)} frames.** The spread between units is not known."""
 
 
