@@ -1,4 +1,4 @@
-"""Everything from frames to findings; runs on real captures without Mitsuba. Knows nothing of scenes.
+"""The path from frames to findings; it runs on real captures without Mitsuba and does not import scenes.
 
 Detectors are found by name: the built-in ones below, others through the entry point group ``tofpod.detectors``.
 """
@@ -40,7 +40,7 @@ def detector_names() -> tuple[str, ...]:
 
 def detector_type(name: str) -> Any:
     """Return the class behind a name; its ``settings_type`` is the Config that validates its settings. Raises UserError
-    on an unknown name, a name taken twice, a package that is not installed, and a plug-in that is no detector."""
+    on an unknown name, a name taken twice, a package that is not installed, and a plug-in that is not a detector."""
     from harness.vocabulary.config import Config
 
     offer = DETECTORS.offer(name)

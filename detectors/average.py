@@ -55,7 +55,7 @@ the pixels, and frames of static real cameras differ from the first by 0.3 % bey
 
 
 def unsteadiness(cloud: Cloud) -> str:
-    """Return a sentence where so many frames are left out of an average that the recording was not steady, else ""."""
+    """Return a warning where an average leaves out so many frames that the recording was not steady, else ""."""
     out, frames = len(cloud.left_out), cloud.n_frames + len(cloud.left_out)
     what = f"{out} of {frames} frames differ from the others and are left out: the camera or the scene moved"
     return what if out > MOST_LEFT_OUT * frames else ""

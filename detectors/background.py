@@ -3,8 +3,7 @@
 Each shape, fitted to the medians of cells of some 16 pixels or more, predicts tiles of cells that it was not fitted to;
 the simplest whose errors are not significantly larger than the best shape's is taken. Where neighbouring cells still
 depart together, smooth free forms of ever shorter wavelength are tried. Not modelled: creases, several sheets, surfaces
-with real structure that is as small as damage.
-"""
+with real structure as small as damage."""
 
 from __future__ import annotations
 
@@ -49,8 +48,8 @@ STRUCTURE_CELLS, STRUCTURE_SIGMAS, SEEN = 5, 4.0, 0.5
 class Background:
     """The surface without its damage. ``surface_z_m`` and ``residual_m`` (h, w): z of the surface, and of the cloud
     less the surface; NaN where it is not judged. ``noise_m`` (h, w): standard deviation of the residuals round about,
-    without the surface's own misfit. ``scale_m``: width above which shallow damage is taken for shape, of a free form.
-    ``warning``: a sentence where structure is left that would pass for damage."""
+    without the surface's own misfit. ``scale_m``: width above which a free form follows shallow damage. ``warning``: a
+    sentence where remaining structure could be mistaken for damage."""
 
     surface_z_m: np.ndarray
     residual_m: np.ndarray
@@ -89,7 +88,7 @@ class _Cells:
         return float(np.hypot(median_of(self.noise[np.isfinite(self.noise)]), self.level_noise))
 
     def refreshed(self, residuals: np.ndarray, fit: Fit) -> _Cells:
-        """Return the cells with medians and deviations of the points' residuals (n,); some then count no more."""
+        """Return the cells with medians and deviations of the points' residuals (n,); some cells are then dropped."""
         medians, deviations = _group_medians(residuals, self.of, len(self.points))
         z = fit(self.points) + medians
         known = np.isfinite(z)

@@ -31,7 +31,7 @@ def nested_clusters(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Label finite points (n, 3) as `euclidean_clusters` does, those with a score (n,) above each of ``thresholds``
     (t,), which rise: (t, n) int64, -1 also for the others. And return (t, n) by label the lowest threshold at which its
-    cluster is found no more, as parts of it that are large enough remain longest."""
+    cluster is no longer found, as parts of it that are large enough remain longest."""
     if not len(points_m):
         return np.zeros((len(thresholds), 0), np.int64), np.zeros((len(thresholds), 0))
     # a little below distance / sqrt(3): rounding must not put two points of one cell beyond the distance

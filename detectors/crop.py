@@ -1,9 +1,8 @@
 """The pixels that belong to the target: a box, a polygon in the image, or the nearest large smooth surface.
 
 Every two surfaces are compared by what is seen at their outlines: one stands before the other, lies on it, shows
-through its hole, or they only meet. The surface with the best odds, a model of how people take pictures of a target, is
-proposed; where some are poor, the choice is called doubtful.
-"""
+through its hole, or they only meet. The surface with the best odds under a model of how people take pictures of a
+target is proposed; where the odds are poor, the choice is reported as doubtful."""
 
 from __future__ import annotations
 
@@ -89,7 +88,7 @@ class Candidate:
 
     @cached_property
     def cut_off(self) -> float:
-        """Part of its outline on the picture's edge; without a pixel grid, on what no point lies beyond."""
+        """Part of its outline on the picture's edge; without a pixel grid, on the border of the cloud."""
         outline = self.filled & ~(cv2.erode(self.filled.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0)
         if self.grid.organised:
             edge = np.ones(self.filled.shape, dtype=bool)
@@ -99,7 +98,7 @@ class Candidate:
         return int(np.count_nonzero(outline & edge)) / max(int(np.count_nonzero(outline)), 1)
 
     def continues(self, other: Candidate, apart_m: float) -> bool:
-        """Return whether this flat surface and the other lie in one plane, but for ``apart_m`` at nine in ten."""
+        """Return whether this flat surface and the other lie in one plane, within ``apart_m`` at nine in ten."""
         normal, middle = self._plane[1][:, 0], self._some.mean(axis=0)
         off_m = [np.quantile(np.abs((each._some - middle) @ normal), 0.9) for each in (self, other)]
         return bool(max(off_m) <= apart_m)
@@ -124,7 +123,7 @@ class Candidate:
 @dataclass(frozen=True)
 class Choice:
     """``candidates``: the proposal first; ``taken``: number, from 1, of the one that was taken. ``mask`` (h, w) bool:
-    valid pixels inside its outline. ``grid``: the cloud, or its raster. ``warnings``: doubts of the choice."""
+    valid pixels inside its outline. ``grid``: the cloud, or its raster. ``warnings``: doubts about the choice."""
 
     candidates: tuple[Candidate, ...]
     taken: int
@@ -299,9 +298,8 @@ class AutoCrop(_Crop):
 
     Neighbours are joined where the step in z is no more than a tilted surface and noise explain and the surface does
     not bend by more than ``crease_deg`` over ``smooth_px``; then its holes are filled, and ``inset_px`` comes off its
-    rim. A background so near that blur leaves no crease is taken for target (13 mm behind the face, at 0.7 m with a 5 x
-    5 window). Without a pixel grid: the same on a raster of the nearest points.
-    """
+    rim. A background so near that blur leaves no crease is taken for the target (13 mm behind the face, at 0.7 m with a
+    5 x 5 window). Without a pixel grid: the same on a raster of the nearest points."""
 
     kind: Literal["auto"] = "auto"
     inset_px: int = Field(default=RIM_PX, ge=0, le=200)

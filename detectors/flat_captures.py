@@ -1,13 +1,12 @@
-"""A unit's fixed pattern from captures of a flat surface: what moves with the pixels, what moves with the surface.
+"""A unit's fixed pattern from captures of a flat surface: parts fixed to the pixels and to the surface.
 
 Each capture's average is a smooth fit, the pattern P at each pixel, the surface's own shape S at each place, and noise.
 Where the captures' poses are known, P and S are solved for together by least squares, with the noise's variances and
 the variance of S, which the captures' disagreement tells. Without poses each capture sees an S of its own, which counts
-as noise and averages out; a camera that did not move sees the same S each time, and nothing can part it from P.
+as noise and averages out; a camera that did not move sees the same S each time, and nothing can separate it from P.
 
-The smooth fit is a polynomial in 1/z over the rays' slopes, in which a plane is exact; it takes up what is wider than
-some sixth of the image. Not modelled: errors of the stated poses, and the correlation of noise.
-"""
+The smooth fit is a polynomial in 1/z over the rays' slopes, in which a plane is exact; it absorbs structure wider than
+about a sixth of the image. Not modelled: errors of the stated poses, and the correlation of noise."""
 
 from __future__ import annotations
 
@@ -90,7 +89,7 @@ class PatternChange:
 
 @dataclass(frozen=True)
 class Separated:
-    """A flat field and what was found on the way. ``surface_m``: standard deviation of what captures do not share
+    """A flat field with its diagnostics. ``surface_m``: standard deviation of the part that captures do not share,
     beyond their noise, or NaN; ``separated``: whether the shape was solved for. ``in_time``: first captures beside last
     ones, at equal distances; ``in_range``: near beside far ones; None where there are not enough."""
 
@@ -131,8 +130,8 @@ def flattened(cloud: Cloud, mask: np.ndarray, name: str, T_first_camera: np.ndar
 
 
 def separated(captures: Sequence[FlatCapture], lens: Lens) -> Separated:
-    """Return the pattern of one unit from captures with one lens, in the order in which they were taken; with the
-    surface's shape solved for where all captures have places on it. Raises UserError where no pixel counts in any."""
+    """Return the pattern of one unit from captures with one lens, in the order in which they were taken; the surface's
+    shape is solved for if all captures have places on it. Raises UserError if no pixel counts in any capture."""
     captures = _on_one_plane(captures)
     residuals, variances = (np.stack([getattr(c, name) for c in captures]) for name in ("residual_m", "variance_m2"))
     counts = np.isfinite(residuals).sum(axis=0)

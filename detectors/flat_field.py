@@ -33,7 +33,7 @@ AGAIN = "run python -m harness.flatfield on captures of this camera in this mode
 
 
 class FlatFieldConfig(Config):
-    """A flat field to take: ``frames`` of a plane across the axis, ``distance_m`` away."""
+    """A flat field to record: ``frames`` of a plane across the axis, ``distance_m`` away."""
 
     frames: int = Field(ge=LEAST_FRAMES, le=10_000)
     distance_m: float = Field(gt=0, le=100)
@@ -43,7 +43,7 @@ class FlatFieldConfig(Config):
 class FlatField:
     """A unit's fixed pattern. ``error_m`` (h, w): how much farther along its ray each pixel of the whole sensor sees a
     surface, without smooth parts; NaN where unknown. ``variance_m2`` (h, w) of that error. ``distances_m``: the nearest
-    and the farthest at which it was measured. ``warnings``: full sentences on what makes it doubtful."""
+    and the farthest at which it was measured. ``warnings``: full sentences on doubts about it."""
 
     error_m: np.ndarray
     variance_m2: np.ndarray
@@ -53,7 +53,7 @@ class FlatField:
 
     @property
     def rms_m(self) -> float:
-        """Root mean square of the pattern, the map's own noise taken off."""
+        """Root mean square of the pattern, less the map's own noise."""
         return float(np.sqrt(max(np.nanmean(self.error_m.astype(float) ** 2 - self.variance_m2), 0.0)))
 
 
@@ -75,7 +75,7 @@ def corrected(cloud: Cloud, field: FlatField) -> Cloud:
 
 
 def doubts(cloud: Cloud, field: FlatField, name: str | Path) -> tuple[str, ...]:
-    """Return full sentences on what makes the correction of a cloud doubtful; ``name``: the flat field's."""
+    """Return full sentences on doubts about the correction of a cloud; ``name``: the flat field's."""
     said = [f"the flat field {name}: {warning}" for warning in field.warnings]
     known = np.isfinite(field.error_m[cloud.region.within(field.lens.whole)])
     share = float(known[cloud.valid].mean()) if cloud.valid.any() else 1.0
@@ -119,7 +119,7 @@ def save_flat_field(path: Path, field: FlatField) -> None:
 
 
 def load_flat_field(path: Path) -> FlatField:
-    """Read a file of `save_flat_field`. Raises UserError where it is none, is broken, too large or newer."""
+    """Read a file of `save_flat_field`. Raises UserError where it is not such a file, is broken, too large or newer."""
     from detectors.recordings.arrays import load_npz
 
     held = load_npz(path)

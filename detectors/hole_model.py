@@ -70,7 +70,7 @@ def sight(centre_m: np.ndarray, per_px_m: np.ndarray, emitter_m: np.ndarray, sha
 
 
 def straight_sight(per_px_m: np.ndarray) -> np.ndarray:
-    """Return the sight along z from everywhere at once, lit likewise: a parallel projection of unknown origin."""
+    """Return the sight along z for a parallel projection of unknown origin, with light along the same direction."""
     normal = normal_of(per_px_m)
     normal = normal / np.copysign(np.linalg.norm(normal), normal[2])
     drift = np.linalg.solve(per_px_m[:, :2].T, normal[:2])

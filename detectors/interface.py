@@ -1,4 +1,4 @@
-"""The interface of a detector: a cloud goes in, scored evidence comes out; the threshold belongs to the caller."""
+"""The interface of a detector: it turns a cloud into scored evidence; the caller sets the threshold."""
 
 from __future__ import annotations
 
@@ -13,15 +13,14 @@ from harness.vocabulary.geometry import Cloud
 
 @dataclass(frozen=True)
 class Evidence:
-    """A detector's knowledge about each pixel of a cloud before any threshold is applied.
+    """A detector's result for each pixel of a cloud before any threshold is applied.
 
     ``score`` (h, w): the threshold below which the pixel counts as damage; NaN where the detector has no opinion.
     ``residual_m`` (h, w): distance along the viewing axis behind (+) or before (-) the fitted surface, ``surface_z_m``
-    (h, w). ``scale_m``: the standard deviation that one unit of score is. ``warnings``: full sentences on what makes
-    these numbers unreliable; every program shows them first. ``behind`` (h, w) bool: whether the score speaks for
+    (h, w). ``scale_m``: the standard deviation that one unit of score is. ``warnings``: full sentences on reasons why
+    these numbers are unreliable; every program shows them first. ``behind`` (h, w) bool: whether the score speaks for
     something behind the surface; None: by the residual's sign. ``unit``: what a unit of score is, in words, where
-    scores are not residuals over a deviation; ``scale_m`` is then the least that it is at a typical point.
-    """
+    scores are not residuals over a deviation; ``scale_m`` is then the least that it is at a typical point."""
 
     score: np.ndarray
     residual_m: np.ndarray
@@ -35,10 +34,10 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Detection:
-    """One finding. ``score``: the lowest threshold at which it is found no more. ``pixels`` (n,): flat indices into the
+    """A finding. ``score``: the lowest threshold at which it is no longer found. ``pixels`` (n,): flat indices into the
     cloud's (h, w) grid, ascending; ``centre_m`` (3,): its place in the cloud's frame, which decides for which damage it
     counts. ``kind``: "depth" for points that depart from the surface, "no return" for connected pixels (then invalid)
-    inside the target's outline that returned nothing, "object" for a thing that lies on the target."""
+    inside the target's outline that returned nothing, "object" for an object that lies on the target."""
 
     score: float
     pixels: np.ndarray
@@ -67,7 +66,7 @@ class MissingReturns:
 
     @property
     def blind_text(self) -> str:
-        """Sentence on how much of the target is blind, and how much of that chance explains."""
+        """A sentence on how much of the target is blind, and how much of that chance explains."""
         places = f"{len(self.detections)} place{'' if len(self.detections) == 1 else 's'}"
         chance = f"{self.expected:.1g} expected by chance; scattered dropouts {100 * self.dropouts:.2g} %"
         places += f" of {self.least_points} connected pixels and more ({chance})"
@@ -111,8 +110,8 @@ class Measurement:
 
 @dataclass(frozen=True)
 class TrueDamage:
-    """One true damage, as a detector that tests the harness is told of it: centre (3,) on the face in the cloud's
-    frame, diameter, and the flat indices of the pixels that see into it."""
+    """A true damage, as given to a detector that tests the harness: centre (3,) on the face in the cloud's frame,
+    diameter, and the flat indices of the pixels that see into it."""
 
     centre_m: np.ndarray
     diameter_m: float
@@ -121,7 +120,7 @@ class TrueDamage:
 
 @runtime_checkable
 class ToldTheTruth(Protocol):
-    """A detector that is handed the truth, and by it tests the harness; no detector of damage implements this."""
+    """A detector that receives the truth, to test the harness; no detector of damage implements this."""
 
     def told(self, truth: tuple[TrueDamage, ...]) -> Detector:
         """Return the detector for one cloud with this truth; empty on a hole-free board."""
@@ -131,16 +130,16 @@ class ToldTheTruth(Protocol):
 @runtime_checkable
 class Calibratable(Protocol):
     """A detector that learns from hole-free clouds before it judges: the noise's spectrum, its tails, a memory of the
-    undamaged face. What it learns is plain arrays, so that it can be stored and sent; names are identifiers."""
+    undamaged face. The result is plain arrays, so that it can be stored and sent; names are identifiers."""
 
     def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
-        """Return what the clouds teach, as arrays without objects; empty where there is nothing to learn. The clouds
-        were taken as those that will be judged (camera, frames, average), of targets without damage. Changes neither
-        the detector nor the clouds. Raises UserError where they cannot be judged or are too few."""
+        """Return what was learned from the clouds, as arrays without objects; empty where there is nothing to learn.
+        The clouds were taken as those that will be judged (camera, frames, average), of targets without damage. Changes
+        neither the detector nor the clouds. Raises UserError where they cannot be judged or are too few."""
         ...
 
     def calibrated(self, learned: Mapping[str, np.ndarray]) -> Detector:
-        """Return the detector, of the same name and version, that uses what `calibrate` has returned."""
+        """Return the detector, with the same name and version, that uses the result of `calibrate`."""
         ...
 
 
@@ -151,7 +150,7 @@ class Detector(Protocol):
     def name(self) -> str: ...
     @property
     def version(self) -> int:
-        """Number that every change raises that can change a result."""
+        """Version number; every change that can change a result raises it."""
         ...
 
     def analyse(self, cloud: Cloud) -> Evidence:

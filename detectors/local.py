@@ -4,9 +4,8 @@ A pixel is judged by means over windows of several widths against the mean of th
 score is the standard deviation of that difference as it is measured round about, so that correlated noise, a fixed
 pattern and texture raise the threshold where they are. Findings are peaks of the score.
 
-Not modelled: the noise's spectrum, damage that is narrower than a pixel or wider than the widest filter, what texture
-has in common with damage, and steps of the noise within a window.
-"""
+Not modelled: the noise's spectrum, damage that is narrower than a pixel or wider than the widest filter, texture that
+resembles damage, and steps of the noise within a window."""
 
 from __future__ import annotations
 
@@ -140,7 +139,7 @@ class LocalDetector:
         self, residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]
     ) -> tuple[np.ndarray, float, str]:
         """Return signed scores (r, c) of a picture of residuals with weights, 0 where nothing is known; the deviation
-        in metres of the narrowest filter at a typical point; and what a unit of score is, in words."""
+        in metres of the narrowest filter at a typical point; and the meaning of a unit of score, in words."""
         signed, widths, typical_m = _scored(residual_m, weights, rounding_m2)
         text = f"the local noise of means over {widths[0]} to {widths[-1]} pixels"
         return signed, typical_m, f"{text}, {1e3 * typical_m:.3g} mm for the narrowest at a typical point"

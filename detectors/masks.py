@@ -1,4 +1,4 @@
-"""Operations on masks (h, w) bool: what they enclose, their rims, connected parts and nearest pixels."""
+"""Operations on masks (h, w) bool: enclosed areas, rims, connected parts and nearest pixels."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def notches_filled(mask: np.ndarray, radius_px: int) -> np.ndarray:
 
 
 def grown(mask: np.ndarray, pixels: int, shape: int = cv2.MORPH_RECT) -> np.ndarray:
-    """Return the mask with all pixels so near to it: in a square, or in OpenCV's ``shape``."""
+    """Return the mask grown by all pixels within this distance: in a square, or in OpenCV's ``shape``."""
     kernel = cv2.getStructuringElement(shape, (2 * pixels + 1, 2 * pixels + 1))
     return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0)
 
@@ -55,7 +55,7 @@ def shrunk(mask: np.ndarray, side: int) -> np.ndarray:
 
 
 def inset(mask: np.ndarray, pixels: int) -> np.ndarray:
-    """Take so many pixels off the mask's outer rim. Holes inside do not grow; the picture's edge is no rim."""
+    """Remove so many pixels from the mask's outer rim. Holes inside do not grow; the picture's edge is not a rim."""
     if pixels == 0:
         return mask
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1, 2 * pixels + 1))

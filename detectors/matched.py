@@ -10,8 +10,8 @@ C^-1 r is solved for by conjugate gradients, so missing pixels and borders add n
 of each template are then divided by the deviation that they have, for each distance from the outline on its own. Wide
 templates have few independent places, so their scores are raised (`detectors.whitening.Worth`).
 
-What stands out strongly is taken out (its pixels count as unknown) and the rest is judged again, so that no filter sees
-the shoulder of a neighbour's hole. What pixels along the target's outline share beyond those farther in is subtracted.
+Strong findings are removed (their pixels count as unknown) and the rest is judged again, so that no filter sees the
+shoulder of a neighbour's hole. What pixels along the target's outline share beyond those farther in is subtracted.
 Depth that was upsampled is judged on squares of pixels in which its noise reaches no farther than a camera's window.
 
 Not modelled: slots that no template fits; slots within `RIM_PX` of outlines and of what was taken out; templates'

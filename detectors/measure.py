@@ -94,7 +94,7 @@ def _extremes(points: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
 
 
 def measure_extents(cloud: Cloud, detection: Detection, note: str) -> Measurement:
-    """Measure the thesis' extents and the place on the sensor, if any; ``note`` says why there is no more."""
+    """Measure the thesis' extents and the place on the sensor, if any; ``note`` says why there are no other numbers."""
     points = cloud.points_m.reshape(-1, 3)[detection.pixels]
     diameter, centre = extents(points)
     u = v = np.nan
@@ -107,7 +107,7 @@ def measure_extents(cloud: Cloud, detection: Detection, note: str) -> Measuremen
 def measure_detection(
     cloud: Cloud, evidence: Evidence, detection: Detection, config: HoleModelConfig, by_lag: np.ndarray | None = None
 ) -> Measurement:
-    """Measure one detection both ways; NaN and a note where one cannot be made. ``by_lag``: the noise's correlation."""
+    """Measure a detection both ways; NaN and a note where a measurement fails. ``by_lag``: the noise's correlation."""
     if not cloud.organised:
         return measure_extents(cloud, detection, "no pixel grid: extents only")
     placed = measure_extents(cloud, detection, "too few valid pixels around for a model")

@@ -1,10 +1,9 @@
 """Missing returns as evidence: connected pixels inside the target's outline from which no light came back.
 
-What tells a hole from chance is its size; a place that touches the edge of the outline or image is no finding. Chance
-is simulated: scattered dropouts are places where white noise averaged over a square of 1 to 5 pixels falls below a
-level; the square gives the share of missing neighbours, the level the local rate, both from clusters that are too small
-to be findings. Not modelled: dropouts that come in equal blobs wider than 3 pixels.
-"""
+Size distinguishes a hole from chance; a place that touches the edge of the outline or image is not a finding. Chance is
+simulated: scattered dropouts are places where white noise averaged over a square of 1 to 5 pixels falls below a level;
+the square gives the share of missing neighbours, the level the local rate, both from clusters that are too small to be
+findings. Not modelled: dropouts that come in equal blobs wider than 3 pixels."""
 
 from __future__ import annotations
 
@@ -117,7 +116,7 @@ def _counted(image: np.ndarray, kernel: np.ndarray) -> np.ndarray:
 
 
 def missing_returns(cloud: Cloud, evidence: Evidence) -> MissingReturns | None:
-    """Look for missing returns inside the outline of what was judged. None for a cloud without a pixel grid."""
+    """Look for missing returns inside the outline of the judged area. None for a cloud without a pixel grid."""
     gaps = _gaps(cloud, evidence)
     if gaps is None:
         return None

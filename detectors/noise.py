@@ -1,4 +1,4 @@
-"""Robust statistics, and the noise of an average: what rounding leaves, and how far neighbours share it."""
+"""Robust statistics, and the noise of an average: the remainder of rounding, and how far neighbours share it."""
 
 from __future__ import annotations
 

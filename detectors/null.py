@@ -1,11 +1,11 @@
 """The threshold that a capture sets itself: noise seen towards the camera tells how often noise looks like damage.
 
-Damage lies behind the surface. What stands out before it is noise, fixed pattern or texture, once objects on the target
-(regions that stand before the surface as a whole, edges in the colour picture or the amplitude) and a margin are left
-out. The tail of these peaks is extrapolated to the threshold at which the wanted number of false calls is expected,
-bumps and hole-like calls together: exponential in (s^q - 1) / q of the score s, less the logarithm by which the maxima
-of normal noise in two dimensions are more. The data weigh the exponents, starting from `PRIOR`; rates and scales are
-integrated out.
+Damage lies behind the surface. Peaks in front of the surface are noise, fixed pattern or texture, once objects on the
+target (regions that stand before the surface as a whole, edges in the colour picture or the amplitude) and a margin are
+left out. The tail of these peaks is extrapolated to the threshold at which the wanted number of false calls is
+expected, bumps and hole-like calls together: exponential in (s^q - 1) / q of the score s, less the logarithm by which
+the maxima of normal noise in two dimensions are more. The data weigh the exponents, starting from `PRIOR`; rates and
+scales are integrated out.
 
 Not modelled: noise that is not symmetric beyond what `skew_of` sees in the core; damage towards the camera that is no
 larger than the noise; objects on clouds without a grid, or that neither stand out nor are seen in a picture.

@@ -1,4 +1,4 @@
-"""Open3D where it is needed: files of points, odometry, volumes. Importing it takes seconds: nothing else does."""
+"""Access to Open3D for files of points, odometry and volumes. Only this module imports it: that takes seconds."""
 
 from __future__ import annotations
 

@@ -222,9 +222,8 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
     Horwitz and Hoshen, "Back to the Feature", CVPR workshops 2023: FPFH (Rusu et al., ICRA 2009), averaged over a
     window; the memory is a greedy k-centre coreset (Roth et al., CVPR 2022); the score is the Euclidean distance to its
     nearest feature, in units of the median distance of one more undamaged target. A wide hole shows by its rim alone,
-    and a step that is sharp and deeper than the spheres is not seen. Not done: the paper's smoothing of scores. A score
-    is no length; ``scale_m`` is the deviation of the residuals.
-    """
+    and a sharp step deeper than the spheres is missed. Not done: the paper's smoothing of scores. A score is not a
+    length; ``scale_m`` is the deviation of the residuals."""
 
     settings_type: ClassVar[type[FpfhMemoryConfig]] = FpfhMemoryConfig
     name = "fpfh_memory"

@@ -1,9 +1,9 @@
-"""A part's own mesh as the undamaged surface: laid onto the cloud, it tells where each ray should end.
+"""A part's own mesh as the undamaged surface: laid onto the cloud, it states where each ray should end.
 
 The part's front axis is turned to the camera, upright or rolled by quarters; closest points, then closest planes, move
-it onto the cloud (Besl and McKay 1992; Chen and Medioni 1992), points off it counting less (Tukey). What faces away is
-left out. Not found: a part that stands otherwise, by more than some 30 degrees. Where the mesh fixes no place, as of a
-plane along itself, none is found, and nothing depends on it."""
+it onto the cloud (Besl and McKay 1992; Chen and Medioni 1992), points off it counting less (Tukey). Triangles that face
+away are left out. Not found: a part that is turned by more than about 30 degrees. Where the mesh fixes no place, as of
+a plane along itself, none is found, and nothing depends on it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ LOOSE = 1e-6
 @lru_cache(maxsize=4)
 def front_of(reference: ReferenceConfig) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners (m, 3, 3) of a part's triangles, x right, y up, z to the camera, in metres, and their unit
-    normals (m, 3). Raises UserError for a file that is no mesh, and where nothing of it faces the front."""
+    normals (m, 3). Raises UserError for a file that is not a mesh, and where no triangle faces the front."""
     mesh = read_mesh(reference.file)
     corners = front_first(mesh, reference.unit, reference.front)[np.asarray(mesh.faces)]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

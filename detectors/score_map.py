@@ -1,4 +1,4 @@
-"""The easy way to a detector: score every pixel, and clusters, quiet threshold and sizes follow."""
+"""A base for detectors that only score pixels: it adds clusters, the quiet threshold and sizes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from harness.vocabulary.geometry import MM, Cloud
 
 class ScoreMapConfig(Config):
     """Settings that turn a score map into findings. Pixels above the threshold that a chain of steps no longer than
-    ``cluster_distance_mm`` joins are one finding; those with fewer than ``min_points`` are none."""
+    ``cluster_distance_mm`` joins are one finding; groups of fewer than ``min_points`` are dropped."""
 
     min_points: int = Field(default=1, ge=1)
     cluster_distance_mm: float = Field(default=10.0, gt=0)
@@ -31,9 +31,9 @@ S = TypeVar("S", bound=ScoreMapConfig)
 
 
 class ScoreMapDetector(ABC, Generic[S]):
-    """Implements `detectors.interface.Detector` but for `analyse`. A subclass also gives ``name``, ``version`` and, for
-    settings of its own, a ``settings_type`` that derives from `ScoreMapConfig`; the first line of its docstring is what
-    ``python -m harness.ls`` says of it. `on_grid` puts the scores of cropped pixels back on the cloud's grid."""
+    """Implements `detectors.interface.Detector` except `analyse`. A subclass also gives ``name``, ``version`` and, for
+    settings of its own, a ``settings_type`` that derives from `ScoreMapConfig`; the first line of its docstring is its
+    description in ``python -m harness.ls``. `on_grid` puts the scores of cropped pixels back on the cloud's grid."""
 
     settings_type: ClassVar[type[ScoreMapConfig]] = ScoreMapConfig
     name: str
@@ -63,7 +63,7 @@ class ScoreMapDetector(ABC, Generic[S]):
         return found
 
     def quiet_threshold(self, cloud: Cloud, evidence: Evidence) -> float:
-        """Return the lowest threshold at which `find` returns nothing; exact, 0 where nothing can ever be found."""
+        """Return the lowest threshold at which `find` returns nothing; exact, 0 where nothing can be found."""
         pixels = above(evidence, 0.0)
         pixels = pixels[cloud.valid.reshape(-1)[pixels]]
         scores, least = evidence.score.reshape(-1)[pixels], self.settings.min_points
@@ -113,7 +113,7 @@ class Findings:
 
     @property
     def detections(self) -> tuple[Detection, ...]:
-        """The same one by one, strongest first."""
+        """The findings as single detections, strongest first."""
         by_label = np.argsort(self.labels, kind="stable")
         groups = np.split(self.pixels[by_label], np.cumsum(np.bincount(self.labels, minlength=len(self.scores)))[:-1])
         found = (Detection(float(self.scores[k]), groups[k], self.centres_m[k]) for k in range(len(self.scores)))

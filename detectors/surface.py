@@ -1,5 +1,5 @@
-"""The shapes that a target may have, fitted to points of which some are damage: polynomials z(x, y) (the thesis'
-"robust cubic" and others), quadrics (sphere, cylinder, cone, ...).
+"""Shapes of a target, fitted to points that include damage: polynomials z(x, y) (the thesis' "robust cubic" and
+others), quadrics (sphere, cylinder, cone, ...).
 
 Large clouds are solved on an even sample first and finished on all points. Not modelled: errors in x and y, correlated
 noise, overhangs, creases, several sheets. Damage of one to three sigma bends every point-wise robust fit by a third of
@@ -115,7 +115,7 @@ class Surface:
     note: str
 
     def evaluate(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
-        """Return z in metres at x, y of one shape; NaN where they are NaN. Extrapolates as polynomials do: badly."""
+        """Return z in metres at x, y of one shape; NaN where they are NaN. Polynomials extrapolate badly."""
         x, y = np.broadcast_arrays(np.asarray(x_m, dtype=np.float64), np.asarray(y_m, dtype=np.float64))
         return self.chebyshev.summed(self.coefficients, np.column_stack([x.ravel(), y.ravel()])).reshape(x.shape)
 

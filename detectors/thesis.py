@@ -1,6 +1,6 @@
 """The thesis' detector: points farther from a surface than k deviations, in clusters at 10 mm. The text's variant:
 robust cubic, robust deviations of the residual. The script's: ``surface: {method: least_squares, drop_cross_terms:
-true}, scale: raw_z_std``, at k = 1.2. `highest_before` excludes outliers that are no damage, as the text also asks."""
+true}, scale: raw_z_std``, at k = 1.2. `highest_before` excludes outliers that are not damage, as the text also asks."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class ThesisConfig(ScoreMapConfig):
 
 
 class ThesisDetector(ScoreMapDetector[ThesisConfig]):
-    """A surface through the cropped cloud; whatever lies k deviations off it, clustered: the thesis' way."""
+    """The thesis' detector: points k deviations off a surface through the cropped cloud, in clusters."""
 
     settings_type: ClassVar[type[ThesisConfig]] = ThesisConfig
     name = "thesis"

@@ -12,7 +12,7 @@ from harness.vocabulary.geometry import Cloud
 
 @dataclass(frozen=True)
 class View:
-    """One view. ``T_reference_view_guess`` (4, 4): its camera frame to the first view's, roughly; None: unknown."""
+    """A view. ``T_reference_view_guess`` (4, 4): its camera frame to the first view's, roughly; None: unknown."""
 
     name: str
     cloud: Cloud

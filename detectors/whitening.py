@@ -65,8 +65,8 @@ def spectrum(covariance: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def window_of(covariance: np.ndarray) -> int:
-    """Return the side of `WINDOWS_PX` that noise shows: its covariance falls steadily with the lag up to the side of a
-    square, and bends there; neighbours that share less than half were not averaged."""
+    """Return the side of `WINDOWS_PX` that the noise indicates: its covariance falls steadily with the lag up to the
+    side of a square, and bends there; neighbours that share less than half were not averaged."""
     middle = len(covariance) // 2
     by_lag = (covariance[middle, middle:] + covariance[middle:, middle]) / 2.0
     if by_lag[1] < 0.5 * by_lag[0]:
@@ -178,7 +178,7 @@ def _low(spectrum_of: np.ndarray) -> np.ndarray:
 
 class Template(NamedTuple):
     """A damage's picture on a square of odd side, its centre ``halves`` (down, right) of half a pixel off the middle;
-    the radius of a disc as large; whether it is a slot; whether every second pixel tells its scores."""
+    the radius of a disc as large; whether it is a slot; whether its scores are taken on every second pixel."""
 
     image: np.ndarray
     radius_px: float
@@ -198,7 +198,7 @@ class Worth(NamedTuple):
 
 
 def worths(power: np.ndarray, window_px: int) -> tuple[Worth, ...]:
-    """Return what each template is worth under noise with this spectrum on `GRID`."""
+    """Return each template's `Worth` under noise with this spectrum on `GRID`."""
     found, crowds, white = [], [], 1.0 / np.sqrt(power)
     for sizes, seen_by in zip(_sizes(window_px), (white, _low(white)), strict=True):
         values = sizes * seen_by

@@ -1,1 +1,1 @@
-"""Everything up to a frame: target, light transport, camera models. Knows nothing of detectors."""
+"""The simulation up to a frame: target, light transport, camera models. It does not import detectors."""

@@ -1,4 +1,4 @@
-"""Views known in closed form: endless planes under one emitter, direct light only. For calibration and checks."""
+"""Views known in closed form: endless planes under one emitter, direct light only. Used for calibration and checks."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""Virtual damage for a real scan: what a camera would have measured of a damage, less what it measures without it.
+"""Virtual damage for a real scan: the change that a damage would make to a camera's measurement.
 
 A small board stands where the scan's surface is and is rendered twice: with one damage and without. The camera's model
-turns both renders into frames with the same draws of noise; the recorded frames keep what they have of their own.
+turns both renders into frames with the same draws of noise; the recorded frames keep their own errors.
 
 Not modelled: the surface's bend within the small board, texture at the damage, light that reaches it by way of other
-surfaces, and a damage that makes pixels quieter: recorded noise is never taken away. Range is not rounded anew."""
+surfaces, and a damage that makes pixels quieter: recorded noise is never removed. Range is not rounded again."""
 
 from __future__ import annotations
 
@@ -90,8 +90,8 @@ def local_board(
 def implant_of(
     config: CameraConfig, same: bool, lens: Lens, board: custom.TargetConfig, frames: int, seed: int, cache: Path
 ) -> Implant:
-    """Return the difference that the one damage of `local_board` makes to ``frames`` frames (or more) of a recording
-    with this lens; ``config``, ``same`` of `unit_config`. Raises UserError where the board leaves the view."""
+    """Return the difference that the damage of `local_board` makes to ``frames`` frames (or more) of a recording with
+    this lens; ``config``, ``same`` of `unit_config`. Raises UserError where the board leaves the view."""
     camera = camera_of(config)
     declared = board.at_wavelength(camera.optics.wavelength_nm)
     count, drawn, smooth = max(frames, LEAST_DRAWS), [], []
@@ -131,7 +131,7 @@ def implant_of(
 
 
 def side_mm(damage: custom.AnyDamage, distance_m: float, config: CameraConfig) -> float:
-    """Return the side of a board that holds a damage, what the camera's filter reaches of it, and a rim."""
+    """Return the side of a board that holds a damage, the reach of the camera's filter around it, and a rim."""
     camera = camera_of(config)
     pitch_mm = distance_m / MM / min(camera.nominal_lens.fx, camera.nominal_lens.fy)
     return 2 * damage.reach_mm + 2 * (camera.optics.margin_px + BEYOND_PX + AROUND_PX) * pitch_mm

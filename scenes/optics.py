@@ -45,7 +45,7 @@ class Optics:
         return np.clip((1 / np.sqrt(1 + (slopes**2).sum(axis=-1)) - cutoff) / (full - cutoff), 0.0, 1.0)
 
     def content(self) -> dict[str, Any]:
-        """Plain data of everything here that can change a render; equal for cameras that share renders."""
+        """Return all data that can change a render; they are equal for cameras that share renders."""
         return {
             "lens": [*self.lens.__dict__.values()],
             "emitter_m": self.emitter_m.tolist(),
@@ -169,7 +169,7 @@ class NoiseFreeView:
 
 
 class RenderConfig(Config):
-    """Work that goes into the indirect light. ``bounces`` 0 leaves direct light only."""
+    """Effort for the indirect light. ``bounces`` 0 leaves direct light only."""
 
     bounces: int = Field(10, ge=0, le=32, description="reflections beyond the first; albedo 0.6 leaves 0.4 % after 10")
     face_spacing_mm: float = Field(80.0, gt=0, description="grid of nodes on the face")

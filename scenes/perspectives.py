@@ -23,7 +23,7 @@ CHECKED_STEPS = 16  # places along each side of a face at which its range is che
 
 def check_in_view(config: TargetConfig, optics: Optics) -> None:
     """Raise UserError where all of the face, or all damage, is out of the camera's field of view, or all of the face
-    out of its range. A face partly out of view or range is legal; damage out of view is no target."""
+    out of its range. A face partly out of view or range is legal; damage out of view is not a target."""
     face = _face_before_lens(config, CHECKED_STEPS)
     places = np.array([damage.centre_m for damage in config.damages]).reshape(-1, 2)
     centres = transform_points(config.pose.T_camera_board, face_of(config.board).point(*places.T))
@@ -151,7 +151,7 @@ def T_reference_view_of(poses: tuple[PoseConfig, ...], number: int) -> np.ndarra
 def guessed_T_reference_view(
     views: AnyViews, poses: tuple[PoseConfig, ...], number: int, *labels: str | int
 ) -> np.ndarray:
-    """4x4: the nominal pose, wrong by what ``views`` says in directions drawn from its seed and ``labels``."""
+    """4x4: the nominal pose with the error that ``views`` states, in directions drawn from its seed and ``labels``."""
     from scipy.spatial.transform import Rotation
 
     T_reference_view = T_reference_view_of(poses, number)

@@ -1,8 +1,8 @@
 """Fusion in the target's frame: registered views to one 2.5-D map over the fitted surface, with its variance.
 
 Each pixel's depth counts as a height over the surface at the place where its *ray meets the surface*. On an intact
-surface that is the point itself; at a hole it is the mouth, which thereby lies in one place for all views. What lies at
-the bottom of a wide hole, or before the surface, is displaced in a view that is slanted.
+surface that is the point itself; at a hole it is the mouth, which thereby lies in one place for all views. A point at
+the bottom of a wide hole, or in front of the surface, is displaced in a slanted view.
 
 View i measures a cell's height as h + e_i + f(p_i) + g_i: e_i is the noise that the sensor's law and the registration's
 covariance explain; f the camera's fixed pattern, which belongs to the *pixel* p_i that looks at the cell; g_i what is

@@ -1,9 +1,9 @@
-"""The way from views to one cloud: prepare, register (`detectors.registration.register`), and merge.
+"""The steps from views to one cloud: prepare, register (`detectors.registration.register`), and merge.
 
 A volume is a truncated signed distance field over the views' depth images (Open3D's VoxelBlockGrid): depth is resampled
 to an image without distortion by the same triangles as the map, as the field's projection knows no lens. Every view
 counts alike and depth counts along its own optical axis (Curless and Levoy 1996). Not modelled: noise and incidence in
-the weights; what a view sees through a hole carves the rim from aside."""
+the weights; views through a hole remove part of its rim."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ MAX_BOXES = 1 << 21
 @dataclass(frozen=True)
 class Merged:
     """One cloud of several views. ``T_reference_cloud`` (4, 4): its frame to the first view's camera frame.
-    ``views_used``: names of those that went in. ``surface_map``: what a fused map knows beside its cloud."""
+    ``views_used``: names of the merged views. ``surface_map``: further results of a fused map."""
 
     cloud: Cloud
     T_reference_cloud: np.ndarray

@@ -136,7 +136,7 @@ MAX_CELLS = 1 << 24
 
 @dataclass(frozen=True)
 class ChosenView:
-    """A view that goes in, and its registration. ``inside`` (h, w) bool: valid pixels of the target."""
+    """A view to be merged, and its registration. ``inside`` (h, w) bool: valid pixels of the target."""
 
     name: str
     cloud: Cloud

@@ -1,4 +1,4 @@
-"""Pixels that stand apart from the target's own colour, and their groups: what may be a mark, with its rim.
+"""Pixels that differ from the target's own colour, and their groups: candidates for marks, with their rims.
 
 A smooth polynomial over the target follows light of another colour; the scatter of what is left (minimum covariance
 determinant, Rousseeuw 1985) says how far the target's own colour strays; the threshold is extrapolated from its tail to

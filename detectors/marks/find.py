@@ -214,8 +214,8 @@ LARGEST_SHARE = 0.15
 
 
 def find_marks(cloud: Cloud, inside: np.ndarray, config: RedMarks | ColourMarks | CodedMarks) -> MarkSet:
-    """Find the marks among the pixels ``inside`` (h, w) bool of a cloud with colour. Never raises for what the picture
-    shows: a set on which no registration can rest says so in its ``problem``."""
+    """Find the marks among the pixels ``inside`` (h, w) bool of a cloud with colour. No picture makes it raise: a set
+    that cannot support a registration says so in its ``problem``."""
     none = MarkSet((), np.zeros(0, dtype=np.int64))
     if cloud.rgb is None:
         return replace(none, problem="the capture has no colour, which is needed to find marks")

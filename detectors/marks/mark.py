@@ -1,4 +1,4 @@
-"""Fiducial marks as a registration needs them, how they are found, and what they must fulfil together."""
+"""Fiducial marks for a registration: their data, the rules that find them, and the conditions on a set of marks."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def problem_of(marks: Sequence[Mark], missing: str = "") -> str:
 
 
 def off_line_problem(marks: Sequence[Mark]) -> str:
-    """Return that the marks lie on a line, and how far off it they stray; empty where they do not."""
+    """Return a sentence if the marks lie on a line, with their distance from it; empty otherwise."""
     places = np.stack([mark.centre_m for mark in marks])
     sizes = np.linalg.svd(places - places.mean(axis=0), compute_uv=False) / np.sqrt(len(marks))
     error = float(np.sqrt(np.mean([np.linalg.eigvalsh(mark.covariance_m2)[-1] for mark in marks])))

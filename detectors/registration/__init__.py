@@ -1,1 +1,1 @@
-"""Rigid registration of views of one target: where each stands to the first, how well that is known, and when not."""
+"""Rigid registration of views of one target: the pose of each relative to the first, its uncertainty, and failures."""

@@ -37,7 +37,7 @@ REFUSE_BELOW = 1e-4
 
 def register_by_marks(reference: PreparedView, view: PreparedView) -> registered.Registration:
     """Return the pose of a view relative to the reference, from their trusted marks; ``overlap`` stays NaN. Too few
-    marks, marks on a line, marks that fit nowhere, in several ways, or badly, are its ``failure``; the transform is
+    marks, marks on a line, and marks that fit nowhere, badly or in several ways are its ``failure``; the transform is
     then the best known, or else the guess, or else the identity."""
     from scipy.special import gammaincc
 

@@ -9,9 +9,8 @@ MATLAB's `pcregistercpd` both clouds are set to zero mean and the start is the w
 unit of length, and of the guess only the turn matters.
 
 Odometry (Open3D's hybrid term; Park, Zhou & Koltun, ICCV 2017) sets each view against the one before it, starting from
-no motion, by colour and depth together, so that errors add up. Only the target is shown to it: on a turntable the room
-does not move with the target. No loop is closed, no map is kept.
-"""
+no motion, by colour and depth together, so that errors add up. It gets only the target: on a turntable the room does
+not move with the target. No loop is closed, no map is kept."""
 
 from __future__ import annotations
 
@@ -130,7 +129,7 @@ PAIRS_AT_ONCE = 1 << 20  # pairs of points whose distances are held in memory
 @dataclass(frozen=True)
 class Drift:
     """The result of coherent point drift. ``T_fixed_moving`` (4, 4); ``sigma_m``: the Gaussians' width; ``matched``:
-    expected number of fixed points that are no outliers; ``step_m``: how far the last iteration moved the points;
+    expected number of fixed points that are not outliers; ``step_m``: how far the last iteration moved the points;
     ``background``: a share, as `posterior_moments` takes it."""
 
     T_fixed_moving: np.ndarray

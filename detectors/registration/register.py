@@ -185,7 +185,7 @@ def _widened(
 
 def register(views: Sequence[PreparedView], config: AnyRegistration) -> tuple[registered.Registration, ...]:
     """Return one registration for each view; the first is that of the reference. A registration that cannot be trusted
-    has a ``failure``. Raises UserError where the method needs what a view lacks (colour, a pixel grid, a guess)."""
+    has a ``failure``. Raises UserError where a view lacks an input of the method (colour, a pixel grid, a guess)."""
     if not views:
         raise UserError("no views to register", legal="one or more views, the first being the reference")
     _check_views(views, config)

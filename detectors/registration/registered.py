@@ -48,7 +48,7 @@ def reference_registration(view: str, method: str) -> Registration:
 
 
 def failed(view: PreparedView, method: str, T_guess: np.ndarray | None, failure: str, *notes: str) -> Registration:
-    """Return a registration that found nothing: it stands at its guess, or else at the reference's own place."""
+    """Return a failed registration: its pose is the guess, or else the reference's own pose."""
     T = np.eye(4) if T_guess is None else T_guess
     return Registration(view.view.name, method, T, converged=False, failure=failure, notes=notes)
 
@@ -170,7 +170,7 @@ def thinned(points_m: np.ndarray, most: int = THINNED_POINTS) -> np.ndarray:
 def clouds_of(
     reference: PreparedView, view: PreparedView, points: Literal["marks", "target"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, tuple[str, ...], str]:
-    """Return what registrations of points start from: those of the fiducials or of the whole target, of the reference
+    """Return the points that registrations start from: those of the fiducials or of the whole target, of the reference
     and of the view, each (n, 3) with at most `MAX_POINTS`; the guess (4, 4), a note where there is none, and the reason
     why they cannot be registered, empty where they can."""
     fixed, moving = (

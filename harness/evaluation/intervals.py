@@ -42,7 +42,7 @@ class Interval:
         return bool(self.high < value)
 
     def over(self, value: float) -> bool | None:
-        """Return whether what is estimated surely exceeds ``value``; None where the interval has room for both."""
+        """Return whether the estimated quantity certainly exceeds ``value``; None where the interval includes both."""
         return True if self.low > value else False if self.high <= value else None
 
     def within(self, low: float, high: float) -> bool:
@@ -92,7 +92,7 @@ def mean_t(mean: ArrayLike, std: ArrayLike, n: ArrayLike) -> tuple[np.ndarray, n
 
 
 def mean_difference(first: ArrayLike, second: ArrayLike) -> Interval:
-    """Welch's interval of mean(first) - mean(second); a point where neither varies, unknown below two values each."""
+    """Welch's interval of mean(first) - mean(second); a point if neither varies, unknown below two values each."""
     from scipy import stats
 
     a, b = np.asarray(first, float), np.asarray(second, float)

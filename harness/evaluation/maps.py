@@ -49,7 +49,7 @@ class MapSetUp:
 
 
 def maps_of(tables: ResultTables) -> list[MapSetUp]:
-    """List all set-ups and variations in the table's order. For "all views" the runs tell their number."""
+    """List all set-ups and variations in the table's order. For "all views" the number comes from the runs."""
     others = [str(path) for path in tables.axes["path"] if path not in (VIEWS, REGISTRATION, MERGE)]
     runs, seen = tables.runs, dict[Any, Any]()
     if not runs.empty and "views_used" in runs:
@@ -97,7 +97,7 @@ class Change:
 
     @property
     def is_below(self) -> bool | None:
-        """True where surely below zero, False where surely not, None where the interval has room for both."""
+        """True if certainly below zero, False if certainly not, None if the interval includes both."""
         return Interval(-self.interval.high, -self.interval.low).over(0)
 
 
@@ -173,11 +173,11 @@ class MapCase:
 
     @property
     def set_ups(self) -> list[MapSetUp]:
-        """Those of ``maps`` that are no variation."""
+        """Maps of set-ups, without variations."""
         return [one for one in self.maps if not one.is_variation]
 
     def variant(self, views: int, registration: str, merge: str) -> str | None:
-        """Name the set-up. Of a single view every registration is the same, so that any will do."""
+        """Name the set-up. All registrations of a single view are the same, so any of them serves."""
         alike = [one for one in self.set_ups if (one.views, one.merge) == (views, merge)]
         named = [one for one in alike if one.registration == registration]
         chosen = named or (alike if views == 1 else [])

@@ -1,4 +1,4 @@
-"""The shape that a hole shows in an averaged cloud: a flat floor, or a bowl."""
+"""The shape of a hole in an averaged cloud: a flat floor, or a bowl."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Set-ups of one experiment side by side: each one's smallest hole and measures, its camera, and each switch's cost.
-The smallest hole that a set-up finds is told as a step on its ladder of sizes, and as the size found in half of the
-trials: a point on a monotone curve through the rates, and no probability of detection in the handbooks' sense."""
+The smallest hole that a set-up finds is stated as a step on its ladder of sizes, and as the size found in half of the
+trials: a point on a monotone curve through the rates, not a probability of detection in the sense of the handbooks."""
 
 from __future__ import annotations
 
@@ -170,9 +170,9 @@ def _row(tables: ResultTables, part: pd.DataFrame, half_sizes: bool) -> dict[str
 
 
 def effect_costs(tables: ResultTables) -> pd.DataFrame:
-    """Return the table of effects: what each switch costs alone, against nothing on, and last, against all others on,
-    and what all cost together, for each place on the experiment's other axes and number of frames. Costs are paired
-    changes of the 50 % size; those of set-ups that were not finished with the same repeats are left out."""
+    """Return the table of effects: the cost of each switch alone (nothing else on) and last (all others on), and of all
+    together, for each place on the experiment's other axes and number of frames. Costs are paired changes of the 50 %
+    size; those of set-ups that were not finished with the same repeats are left out."""
     set_ups = tables.variants[tables.variants["switches"] != ""]
     if set_ups.empty:
         return EFFECTS.frame([])

@@ -74,7 +74,7 @@ def status_of(rate_low: float, rate_high: float) -> HoleState:
 
 
 def found_rule(trials: int) -> str:
-    """`FOUND_RULE`, and that it can call no hole found where there are so few trials of each."""
+    """Return `FOUND_RULE`, with a remark where the trials are too few to call any hole found."""
     if trials >= FEWEST_TRIALS:
         return FOUND_RULE
     return f"{FOUND_RULE} {trials} repeats are too few for either: at least {FEWEST_TRIALS} are needed."
@@ -193,8 +193,8 @@ def noise_against_frames(probes: pd.DataFrame) -> pd.DataFrame:
 
 
 def fit_floor(frames: Sequence[int] | np.ndarray, total_rms_mm: Sequence[float] | np.ndarray) -> float:
-    """Return what no averaging removes, in mm, of ``total^2 = white^2 / N + floor^2``: least squares with both parts
-    non-negative, weighted to equal relative error. NaN below two different numbers of frames."""
+    """Return the error that no averaging removes, in mm, of ``total^2 = white^2 / N + floor^2``: least squares with
+    both parts non-negative, weighted to equal relative error. NaN below two different numbers of frames."""
     n, total2 = np.asarray(frames, float), np.asarray(total_rms_mm, float) ** 2
     usable = np.isfinite(total2) & (total2 > 0)
     if len(np.unique(n[usable])) < 2:

@@ -86,14 +86,14 @@ def bullets(items: Iterable[str | Markup]) -> Markup:
 
 
 def figure(figures: Mapping[str, str], name: str, caption: str) -> Markup:
-    """A figure of ``figures`` (SVG text by name) with its caption, or that no data for it were kept."""
+    """A figure of ``figures`` (SVG text by name) with its caption, or a note that its data were not stored."""
     if name not in figures:
         return note("No data for this figure were stored.")
     return tag("figure", tag("div", Markup(figures[name]), kind="scroll"), tag("figcaption", caption), id=name)
 
 
 def fold(summary: str, *content: str | Markup, is_open: bool = False) -> Markup:
-    """Content that a click on its summary shows."""
+    """Content that a click on its summary opens."""
     return tag("details", tag("summary", summary), joined(content), open="open" if is_open else "")
 
 

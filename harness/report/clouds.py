@@ -1,4 +1,4 @@
-"""Damage as a detector has it: parts of trials kept for pictures, and residuals of whole clouds and single damages.
+"""Damage as a detector sees it: parts of trials kept for pictures, and residuals of whole clouds and single damages.
 
 Residuals have one colour scale: linear within 1 mm, logarithmic beyond, red behind the surface, blue before it."""
 

@@ -34,8 +34,8 @@ SIZE_IN = (11.5, 4.9)
 
 @dataclass(frozen=True, eq=False)
 class StudyDesign:
-    """All that was found out about a study to be made. Sizes are in ``unit``; ``origin``: of the guess; ``goal``: the
-    bound that was wanted, if any, and ``reaches``: whether nine of ten studies by the ``recommended`` plan show it."""
+    """The plans of a study that is to be made. Sizes are in ``unit``; ``origin``: of the guess; ``goal``: the bound
+    that was wanted, if any, and ``reaches``: whether nine of ten studies by the ``recommended`` plan show it."""
 
     guess: PodCurve
     origin: str
@@ -130,7 +130,7 @@ PLANS = Table(
 
 
 def plans_grid(design: StudyDesign) -> Grid:
-    """Every plan, the recommended one with a star, and what its studies demonstrate."""
+    """Make the table of all plans, the recommended plan with a star, and of what their studies demonstrate."""
     rows = [(plan, plan is design.recommended) for plan in design.plans]
     return PLANS.grid(rows, heads={"limit": f"a90/95{design.in_unit}"})
 
@@ -153,7 +153,7 @@ def hole_free_lines(design: StudyDesign) -> list[str]:
 
 
 def notes(design: StudyDesign) -> list[str]:
-    """Return the handbook's minima, Monte Carlo error, and what the plan rests on."""
+    """Return the handbook's minima, the Monte Carlo error, and the assumptions of the plan."""
     plan, (low, high), found = design.recommended, design.range_of_sizes, []
     if not low <= plan.true_size <= high:
         found.append("the guess's own a90 lies outside the range: it is extrapolated")

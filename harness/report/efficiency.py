@@ -81,7 +81,7 @@ def efficiency_figure(rows: Sequence[Efficiency]) -> str:
 
 
 def efficiency_parts(rows: Sequence[Efficiency], first: str, warnings: Sequence[str]) -> list[str | Grid]:
-    """Return what a terminal shows: for what the figures hold, warnings, the table and the answer."""
+    """Return what a terminal shows: the figures' conditions, warnings, the table and the answer."""
     grid = EFFICIENCY.grid(rows, terminal=True)
     return [first, *(f"warning: {text}" for text in warnings), grid, "", answer(rows)]
 

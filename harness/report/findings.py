@@ -56,13 +56,13 @@ class Finding:
 
     @property
     def is_long(self) -> bool:
-        """True where it is `ELONGATED`: its diameter then says little."""
+        """True where it is `ELONGATED`: its diameter is then of little use."""
         return self.length_mm > ELONGATED * max(self.width_mm, 1.0)
 
 
 @dataclass(frozen=True)
 class Judged:
-    """A cloud with all that a detector said about it; ``missing``: what it lacks, None without a pixel grid."""
+    """A cloud with a detector's results; ``missing``: its missing returns, None without a pixel grid."""
 
     cloud: Cloud
     evidence: Evidence
@@ -72,7 +72,7 @@ class Judged:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Numbered from 1, strongest first."""
+        """Findings numbered from 1, strongest first."""
         pairs = zip(self.detections, self.measurements, strict=True)
         return tuple(finding_of(i, self.evidence, d, m) for i, (d, m) in enumerate(pairs, start=1))
 

@@ -79,7 +79,7 @@ def notes(found: Mapod) -> list[str]:
 
 
 def doubts(found: Mapod) -> list[str]:
-    """Sentences on what makes the combined limit doubtful."""
+    """Return sentences on the reasons to doubt the combined limit."""
     said = [f"{found.unlike}: a difference counts as an error of the simulation"] if found.unlike else []
     return said + ["the real hits and misses contradict the simulation"] * found.contradicted
 

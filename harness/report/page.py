@@ -130,7 +130,7 @@ def costs_by_place(costs: pd.DataFrame) -> dict[tuple[str, int], dict[tuple[str,
 
 
 def effects_figure(costs: pd.DataFrame) -> str:
-    """Bars of every effect's cost with 95 % intervals, one panel for each place and number of frames."""
+    """Draw bars of every effect's cost with 95 % intervals, one panel for each place and number of frames."""
     names, places = list(dict.fromkeys(costs["effect"])), costs_by_place(costs)
 
     def draw(figure: Figure) -> None:
@@ -232,7 +232,7 @@ def set_ups_html(
 
 
 def set_ups_answer(compared: pd.DataFrame, layout: Layout, costs: pd.DataFrame, verdict: Verdict | None) -> str:
-    """Say what the experiment found: each row's holes with the most frames, the dearest effect, C11."""
+    """State what the experiment found: each row's holes with the most frames, the costliest effect, C11."""
     if compared.empty:
         return "No trial of any set-up finished, so there is no answer."
     frames = sections.shown_frames(compared)
@@ -333,7 +333,7 @@ def report_html(
 
 
 def answer_sentence(main: pd.DataFrame, verdicts: Sequence[Verdict] = ()) -> str:
-    """Say which holes were found with the most and the fewest frames, and the claims. ``main``: its summary rows."""
+    """State which holes were found with the most and the fewest frames, and the claims. ``main``: its summary rows."""
     if main.empty:
         return "No trial of the main experiment finished, so there is no answer."
     frames = sorted(int(n) for n in main["frames"].unique())

@@ -1,4 +1,4 @@
-"""The page of an experiment with several views: whether more of them beat one, and what registering and merging do."""
+"""The page of an experiment with several views: whether more views beat one, and how registering and merging matter."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def found_figure(rows: Sequence[sections.Row]) -> str:
 
 
 def answer_sentence(cases: Sequence[maps.MapCase], verdicts: Sequence[Verdict] = ()) -> str:
-    """Say how many holes one view finds, and the most views by the way that finds most; with verdicts those, too."""
+    """Say how many holes one view finds, and the most views by the way that finds most; the verdicts too."""
     said = []
     for case in cases:
         alone = case.single()
@@ -123,7 +123,7 @@ def answer_sentence(cases: Sequence[maps.MapCase], verdicts: Sequence[Verdict] =
 
 
 def map_files(examples: Sequence[MappedExample]) -> dict[str, MappedExample]:
-    """The file of each map that turns in the browser, beside the report; the most frames first, then by views, way."""
+    """The file of each browser map beside the report; the most frames first, then by views, way."""
     files: dict[str, MappedExample] = {}
     for example in sorted(examples, key=lambda e: (-e.frames, e.views, e.registration, e.merge, e.variant)):
         words = f"{example.views} views {example.registration} {example.merge} {example.frames} frames"
@@ -135,7 +135,7 @@ def map_files(examples: Sequence[MappedExample]) -> dict[str, MappedExample]:
 
 
 def map_text(example: MappedExample) -> str:
-    """One map in words."""
+    """Describe one map in words."""
     variation, way = f": {example.variant}" if example.is_variation else "", method_text(example.registration)
     way = maps.label_of(way, example.merge)
     return f"{many(example.views, 'view')} ({way}), {maps.frames_text(example.frames)}{variation}"

@@ -135,7 +135,7 @@ def answer(statement: PodStatement) -> str:
 
 
 def sized(value: float, unit: str, digits: int = 2) -> str:
-    """A size with that many significant digits and its unit; a word where it is no size."""
+    """A size with that many significant digits and its unit; a word where it is not finite."""
     if not np.isfinite(value):
         return "not reached"
     decimals = max(0, digits - 1 - int(f"{value:.{digits - 1}e}".partition("e")[2]))
@@ -148,7 +148,7 @@ def axis_text(column: str, unit: str) -> str:
 
 
 def plain(text: str) -> str:
-    """The user's words for a figure, whose library would typeset what stands between dollar signs."""
+    """Escape the user's text for a figure, whose library would typeset text between dollar signs."""
     return text.replace("$", r"\$")
 
 

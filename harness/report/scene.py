@@ -1,4 +1,4 @@
-"""The scene of an experiment as a picture: camera, target and what stands behind it, from the side, not to scale."""
+"""The scene of an experiment as a picture: camera, target and the surface behind it, from the side, not to scale."""
 
 from __future__ import annotations
 

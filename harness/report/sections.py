@@ -159,7 +159,7 @@ def counted_verdicts(verdicts: Sequence[Verdict]) -> str:
 
 
 def rule_note(repeats: int, *more: str) -> Markup:
-    """Say under the answer what counts as found, and what the intervals do not speak of."""
+    """State below the answer what counts as found, and what the intervals do not cover."""
     draws = "The one repeat is one draw" if repeats == 1 else f"The repeats are {repeats} draws"
     said = (
         f"{draws} of the noise before the same board in the same place with one unit of each camera: the intervals "
@@ -169,7 +169,7 @@ def rule_note(repeats: int, *more: str) -> Markup:
 
 
 def left_out(runs: pd.DataFrame) -> str:
-    """Say how many frames averaging left out as disturbed, over all runs; empty where it left out none."""
+    """State how many frames averaging left out as disturbed, over all runs; empty where it left out none."""
     out, used = int(runs["left_out"].sum()), int(runs["frames_used"].sum())
     return f"{out} of {out + used} frames were left out of an average as disturbed." if out else ""
 

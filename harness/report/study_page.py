@@ -1,4 +1,4 @@
-"""The page of a study: its detection limits, what they rest on, how far they hold, and its figures."""
+"""The page of a study: its detection limits, their basis and validity, and its figures."""
 
 from __future__ import annotations
 

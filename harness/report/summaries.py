@@ -1,4 +1,4 @@
-"""Summaries of an experiment that is no study, computed once: files hold them, pages and the terminal show them."""
+"""Summaries of an experiment that is not a study, computed once: files hold them, pages and the terminal show them."""
 
 from __future__ import annotations
 

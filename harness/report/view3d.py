@@ -1,4 +1,4 @@
-"""A cloud that turns in the browser: one file, offline, with what was found in it and, where known, the truth."""
+"""A cloud that can be turned in the browser: one offline file with the findings and, where known, the truth."""
 
 from __future__ import annotations
 

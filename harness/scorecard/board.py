@@ -5,7 +5,7 @@ pixels. One analysis is applied to both, about each declared hole: a quadratic s
 and the hole's peak is the largest deviation behind that surface near its centre. Detectors see whole images. Nothing is
 fitted: set-ups are declared, and all of them are shown.
 
-Not modelled: what lies on the board, the board's relief, what the maker's alignment does between two surfaces (here the
+Not modelled: objects on the board, the board's relief, what the maker's alignment does between two surfaces (here the
 depth image is interpolated linearly where the board's plane projects to)."""
 
 from __future__ import annotations

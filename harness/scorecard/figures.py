@@ -1,7 +1,7 @@
-"""Published figures: what others measured or specified of a camera, what the simulation gives, and its judgement.
+"""Published figures of cameras (measured or specified), the simulated values, and the comparison.
 
-The file of figures is YAML; adding an entry is all that a further figure needs. Every problem of a file is told at
-once, with its place. A figure that fails has its reason in the file; any other must pass."""
+The file of figures is YAML; adding an entry is all that a further figure needs. All problems of a file are reported
+together, each with its place. A figure that fails has its reason in the file; any other must pass."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class Published(Config):
 class Figure(Config):
     """One published figure as the file holds it; ``calibration``: the camera's file was, or may be, fitted to it.
     ``kind``: a figure of real cameras, or a check of the code against the arithmetic of a stated filter or limit.
-    ``fails``: why it is known to fail; without it a failure counts as a step back."""
+    ``fails``: why it is known to fail; without it a failure counts as a regression."""
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9_]+$", description="small letters, digits and _; once in the file")]
     camera: str

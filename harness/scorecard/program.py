@@ -1,4 +1,4 @@
-"""The scorecard from beginning to end: measure, judge, draw, write the table and the page, say what fell behind."""
+"""The scorecard from beginning to end: measure, judge, draw, write the table and the page, name failures."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ class Row:
 
 
 def damage_words(kind: str) -> str:
-    """Return what a kind of damage is called."""
+    """Return the name of a kind of damage."""
     return DAMAGE.get(kind, kind.replace("_", " "))
 
 
@@ -82,7 +82,7 @@ ATLAS = Table(
 def rows_at(
     surfaces: Iterable[LimitSurface], titles: Mapping[str, str], place: Mapping[str, float], size_mm: float = np.nan
 ) -> tuple[list[Row], list[tuple[str, str]]]:
-    """Return the rows at a place, best first, and why surfaces say nothing there, each with its camera's title."""
+    """Return the rows at a place, best first, and why surfaces give no answer there, each with its camera's title."""
     rows, refused = [], []
     for surface in surfaces:
         own = {axis: place[axis] for axis in surface.grid if axis in place}

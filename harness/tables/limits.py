@@ -1,6 +1,6 @@
 """The table of detection limits, and limits in words: the answer, a sentence for each set-up, notes beside them.
 
-A curve says nothing of sizes that nobody inspected: what lies beyond the largest is written ``> 15.9``."""
+A curve says nothing about sizes that were not inspected: a size beyond the largest is written ``> 15.9``."""
 
 from __future__ import annotations
 
@@ -282,7 +282,7 @@ def limit_sentence(limit: SetUpLimit, *, again: bool = False) -> str:
 
 
 def notes_of(limit: SetUpLimit) -> list[str]:
-    """Return why there is no limit, or what makes it a cautious or a doubtful one."""
+    """Return why there is no limit, or why it is cautious or doubtful."""
     said = [] if limit.a90_95.demonstrated else [_reason(limit.a90_95)]
     stated = limit.statement
     if stated is None:
@@ -305,7 +305,7 @@ def notes_of(limit: SetUpLimit) -> list[str]:
 
 
 def limit_notes(limits: Sequence[SetUpLimit]) -> list[str]:
-    """Return what to know beside the limits: what all of them have in common, then a line for each set-up."""
+    """Return notes beside the limits: the conditions that all share, then a line for each set-up."""
     notes = [(limit.record.label, notes_of(limit)) for limit in limits]
     shared = [one for one in notes[0][1] if all(one in said for _, said in notes)] if len(notes) > 1 else []
     own = [("every set-up", shared), *((name, [one for one in said if one not in shared]) for name, said in notes)]

@@ -121,7 +121,7 @@ def threshold_warnings(limits: Sequence[SetUpLimit]) -> list[str]:
 
 
 def threshold_note(record: StudyRecord) -> str:
-    """Return how thresholds came about."""
+    """Return how the thresholds were set."""
     if told := record.provenance.get("thresholds"):
         return str(told)
     if record.false_calls_per_m2 is None:
@@ -148,7 +148,7 @@ OPERATING = Table(
 
 
 def operating_notes(results: Sequence[SetUpResult]) -> list[str]:
-    """Return what AU-PRO is, and of which set-ups it could not be had."""
+    """Return what AU-PRO is, and for which set-ups it could not be computed."""
     said = (
         "AU-PRO: mean over damages of the share of pixels above, against undamaged pixels above, up to a share of "
         f"{PRO_LIMIT:g} and divided by it, as MVTec AD does."

@@ -47,7 +47,7 @@ def size(value: float, most: float = np.inf) -> str:
 
 
 def percent(share: float) -> str:
-    """Return ``93`` for 0.93; near 0 and 1 with a decimal, since a whole number would say impossible or certain."""
+    """Return ``93`` for 0.93; near 0 and 1 with a decimal, since a whole number would mean impossible or certain."""
     value = 100 * share
     if np.isnan(value) or 1 <= value <= 99:
         return UNKNOWN_TEXT if np.isnan(value) else f"{value:.0f}"
@@ -131,7 +131,7 @@ class Grid:
     def of(
         heads: Iterable[str], rows: Iterable[Iterable[object]], left: int = 1, title: str = "", kind: str = "limits"
     ) -> Grid:
-        """Make a grid of cells, or of what stands in them as text."""
+        """Make a grid of cells, or of their text."""
         cells = tuple(tuple(one if isinstance(one, Cell) else Cell(str(one)) for one in row) for row in rows)
         return Grid(tuple(heads), cells, left, title, kind)
 

@@ -58,7 +58,7 @@ def verdict_of(claim: str, answer: Answer, evidence: str) -> Verdict:
 
 
 def decide(parts: Iterable[bool | None]) -> Answer:
-    """All parts hold: borne out. One fails: not borne out. Else undecided."""
+    """Return "borne out" if all parts hold, "not borne out" if any part fails, and "undecided" otherwise."""
     values = list(parts)
     if any(value is False for value in values):
         return "not borne out"

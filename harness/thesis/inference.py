@@ -62,8 +62,8 @@ def posterior_of(summary: pd.DataFrame, axes: Sequence[str]) -> pd.DataFrame | N
 
 
 def borne_out_if(posterior: pd.DataFrame) -> str:
-    """Say in one sentence what the thesis' outcome asks for: of each axis the values that are not `DOUBTED`, and how
-    probable the outcome is in the likeliest set-up; without facts of a kind of hole that is doubted."""
+    """State in one sentence which facts the thesis' outcome requires: of each axis the values that are not `DOUBTED`,
+    and how probable the outcome is in the likeliest set-up; without facts of a kind of hole that is doubted."""
     best, doubted = posterior.iloc[0], posterior["posterior_share"] < DOUBTED * posterior["prior_share"]
     asked = []
     for name, rows in posterior[posterior["axis"] != SET_UP].groupby("axis", sort=False):

@@ -167,7 +167,7 @@ def _h1(case: maps.MapCase) -> tuple[Answer, str]:
 
 def duels_of(case: maps.MapCase) -> list[tuple[tuple[Standing, ...], str]]:
     """H1's map against one view with as many frames as each of its views, and against one with as many exposures in
-    all, where the experiment has them: the standing in each respect, and numbers."""
+    total, where the experiment has them: the standing in each respect, and numbers."""
     fused = [one for one in case.set_ups if one.merge == NOISE_REDUCING and one.views > 1 and case.frames(one.variant)]
     registration = next((name for name in MARKED if any(one.registration == name for one in fused)), None)
     fused = sorted((one for one in fused if one.registration == registration), key=lambda one: -one.views)

@@ -1,1 +1,1 @@
-"""The leaf: words that every room shares: captures, lenses, geometry, units, errors, seeds, files."""
+"""Types and functions that every room uses: captures, lenses, geometry, units, errors, seeds, files."""

@@ -15,7 +15,7 @@ CLOSED_PIPE = 141  # Exit code that a shell reports of a program that SIGPIPE en
 
 
 class UserError(Exception):
-    """A mistake that the user can mend: what is wrong and where; ``legal``: what would be; ``fix``: what to do next."""
+    """A mistake that the user can fix: what is wrong and where; ``legal``: what would be; ``fix``: what to do next."""
 
     def __init__(self, message: str, *, legal: str | None = None, fix: str | None = None) -> None:
         super().__init__(message)
@@ -33,12 +33,12 @@ class UserError(Exception):
 
 
 class DiskFull(UserError):
-    """Nothing more can be written: no part of a program's work makes sense before there is room."""
+    """The disk is full, so the program stops until the user has made room."""
 
 
 def exit_code_of(program: Callable[[], int]) -> int:
     """Run a program's body; a UserError becomes one message on stderr and exit code 2, Ctrl-C becomes 130, and output
-    that nobody reads to its end (``| head``) ends it silently with 141. Further Ctrl-C while it ends are not heard."""
+    that nobody reads to its end (``| head``) ends it silently with 141. Further Ctrl-C are ignored while it ends."""
     ours = threading.current_thread() is threading.main_thread()
     ours = ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler
 

@@ -1,6 +1,6 @@
 """Files: read within limits, as strict JSON; written whole or not at all; locked by the system's own locks.
 
-A file may be made to fill the memory: most are refused unread; libraries run within `limited_memory`."""
+A hostile file may try to fill the memory: most are refused unread; libraries run within `limited_memory`."""
 
 from __future__ import annotations
 
@@ -103,8 +103,8 @@ def limited_memory() -> Iterator[None]:
 
 
 def strict_json(content: bytes | str, *, nan: bool = False) -> Any:
-    """Return the value of a JSON text (UTF-8). Raises ValueError, saying why, for what is no JSON: a key that stands
-    twice in an object, NaN and Infinity (unless ``nan``), too deep nesting, too long integers."""
+    """Return the value of a JSON text (UTF-8). Raises ValueError, saying why, for text that is not JSON: a key that
+    occurs twice in an object, NaN and Infinity (unless ``nan``), too deep nesting, too long integers."""
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         found: dict[str, Any] = {}
@@ -184,7 +184,7 @@ def _renamed(path: Path, make: Callable[[], str], mode: int) -> Iterator[Path]:
 
 def inside(folder: Path, *parts: str) -> Path:
     """``folder`` with ``parts`` below it, for names that somebody else may have chosen. Raises UserError where a part
-    is no plain name, or where a link in ``folder`` leads out of it. ``folder`` itself may be a link."""
+    is not a plain name, or where a link in ``folder`` leads out of it. ``folder`` itself may be a link."""
     for part in parts:
         if part in ("", ".", "..") or any(letter in part for letter in "/\\\0"):
             raise UserError(f"{part!r} is not a name for a file or folder", legal="letters, digits, - and _")
@@ -236,7 +236,7 @@ Answer = Literal["held", "busy", "no locks"]  # busy: by another process; none o
 
 
 def opened_lock(path: Path) -> IO[bytes]:
-    """Open a lock file, made where there is none. Raises OSError, or UserError where it is no regular file."""
+    """Open a lock file, made where there is none. Raises OSError, or UserError where it is not a regular file."""
     return open_plain(path, os.O_RDWR | os.O_CREAT | os.O_APPEND)
 
 
@@ -294,7 +294,7 @@ def plain_json(data: Mapping[str, Any]) -> str:
 
 
 def jsonable(value: Any) -> Any:
-    """Return plain data, tuples, arrays and NumPy's numbers as JSON's types: None for what is no finite number."""
+    """Return plain data, tuples, arrays and NumPy's numbers as JSON's types: None for a number that is not finite."""
     if isinstance(value, Mapping):
         return {str(key): jsonable(item) for key, item in value.items()}
     if hasattr(value, "tolist"):

@@ -137,7 +137,7 @@ class Lens:
 
 @dataclass(frozen=True)
 class OtherLens(Lens):
-    """A lens that was not measured for the images themselves, with what to say of it: ``note`` and ``warning``, "" for
+    """A lens that was not measured for the images themselves, with remarks on it: ``note`` and ``warning``, "" for
     none. ``mode``: of a camera's nominal lens, its depth mode by name; ``unit_m``: metres in a stored number there;
     ``others``: the lenses of the same camera's other modes."""
 
@@ -232,8 +232,8 @@ class MapViews:
 
 @dataclass(frozen=True)
 class Cloud:
-    """The average of frames as points in the camera's frame: what a detector sees. ``points_m`` (h, w, 3) float64, NaN
-    where invalid; ``reason`` (h, w) uint8 of `Reason` (the commonest among the frames where no sample was valid);
+    """The average of frames as points in the camera's frame: the input of a detector. ``points_m`` (h, w, 3) float64,
+    NaN where invalid; ``reason`` (h, w) uint8 of `Reason` (the commonest among the frames where no sample was valid);
     ``count`` (h, w) valid samples; ``variance_m2`` (h, w) sample variance of one frame's z, NaN below two samples. An
     unorganised cloud has h == 1 and ``organised`` False. ``region`` places the grid on the sensor; ``z_step_m`` is the
     rounding step of one frame's z. A map of several views is a cloud too: its frame is its maker's, with z away from

@@ -45,7 +45,7 @@ class PlugIns:
     fix: str = ""
 
     def offers(self) -> tuple[Offer, ...]:
-        """Return every offer, by name; a name that two packages claim stands there twice."""
+        """Return every offer, by name; a name that two packages claim occurs twice."""
         return _offers(self.group, tuple(self.built_in().items()), tuple(sys.path))
 
     def names(self) -> tuple[str, ...]:
@@ -83,7 +83,7 @@ class PlugIns:
             raise self.broken(offer, f"{type(error).__name__}: {error}", f"python -c 'import {module}'") from error
 
     def broken(self, offer: Offer, why: str, command: str = "") -> UserError:
-        """The mistake that a plug-in is not what its group asks for. ``command`` would show more."""
+        """Return the mistake of a plug-in that does not fit its group. ``command`` would show more."""
         fix = f"repair or uninstall the package {offer.package}" + (f"; `{command}` shows more" if command else "")
         said = f"{self.noun} {offer.name!r} ({offer.target}, of the package {offer.origin}) cannot be loaded: {why}"
         return UserError(said, fix=fix)

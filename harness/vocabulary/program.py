@@ -48,12 +48,12 @@ class Program:
 
 
 def program(options: Options, description: str, epilog: str | None = None) -> Callable[[Run], Program]:
-    """Return a decorator that makes a program of what one runs; the module's name is the program's."""
+    """Return a decorator that makes a program of a function; the module's name is the program's name."""
     return lambda run: Program(f"harness.{Path(run.__code__.co_filename).stem}", options, run, description, epilog)
 
 
 def whole_number(most: int) -> Callable[[str], int]:
-    """Return what parses an argument from 1 to ``most``."""
+    """Return a parser of whole numbers from 1 to ``most``."""
 
     def parsed(text: str) -> int:
         if not (text.isascii() and text.isdigit()) or not 1 <= int(text) <= most:

@@ -1,7 +1,7 @@
 """The origin of a result: code and its digest, versions of packages and of stored files, machine.
 
 Every stored file says of which version it is: in JSON and Parquet by a key, in CSV by a column, in YAML by a comment on
-the first line, in HTML by ``<meta name="generator">``. A newer one is refused, an older one read or made anew."""
+the first line, in HTML by ``<meta name="generator">``. A newer file is refused; an older file is read or made again."""
 
 from __future__ import annotations
 

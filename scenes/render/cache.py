@@ -1,4 +1,4 @@
-"""Renders kept by content, in files with a checksum; what is in their folder, who uses it, and what goes from it."""
+"""Renders stored by content, in files with a checksum; listing, locking and trimming of their folder."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ RENDERING, LOCK = ".rendering", ".lock"  # of which a render locks a byte; which
 
 
 def render_key(target: TargetConfig, optics: Optics, config: RenderConfig) -> str:
-    """Return the digest of what a render depends on: target, the camera's optics (not its engine), work and code."""
+    """Return the digest of all inputs of a render: target, the camera's optics (not its engine), work and code."""
     content = {"target": target.to_data(), "optics": optics.content(), "render": config.to_data()}
     return digest({"code": source_digest(CODE, PACKAGES), **content})
 
@@ -79,8 +79,8 @@ def write_view(path: Path, view: NoiseFreeView) -> None:
 
 def read_view(path: Path) -> NoiseFreeView | None:
     """Return a stored view, or None where the file is absent, truncated, damaged or of another version. Nothing is
-    parsed before the checksum holds, and nothing is unpickled; memory is bounded by the file's size. A view that was
-    read has been used: its file's time says so, for `trim_cache`."""
+    parsed before the checksum holds, and nothing is unpickled; memory is bounded by the file's size. Reading a view
+    updates its file's time, by which `trim_cache` knows the last use."""
     try:
         found = os.stat(path)
         if not stat.S_ISREG(found.st_mode) or found.st_size > MOST_BYTES:
@@ -113,7 +113,7 @@ class StoredFile:
 
 
 def stored_renders(folder: Path) -> list[StoredFile]:
-    """Return all renders of a folder, the longest unused first; links and anything else are passed over."""
+    """Return all renders of a folder, the longest unused first; links and other files are skipped."""
     return sorted(_files(folder, RENDER_NAME), key=lambda file: (file.used_s, file.path.name))
 
 
@@ -124,7 +124,7 @@ def leftovers(folder: Path, older_than_s: float = LEFTOVER_AFTER_S) -> list[Stor
 
 
 def removed(files: Iterable[StoredFile]) -> list[StoredFile]:
-    """Remove files; returns those that are gone. One that cannot be removed, or is gone already, is passed over."""
+    """Remove files; returns those that are gone. A file that cannot be removed, or is gone already, is skipped."""
     gone = []
     for file in files:
         with contextlib.suppress(OSError):
@@ -154,7 +154,7 @@ def trim_cache(folder: Path, limit_bytes: int, keep: Collection[Path] = ()) -> i
 
 @contextlib.contextmanager
 def in_use(folder: Path) -> Iterator[None]:
-    """Let nobody remove renders of this folder while any sweep runs, where system and folder allow locks."""
+    """Prevent the removal of renders of this folder while any sweep runs, where system and folder allow locks."""
     with contextlib.ExitStack() as held:
         with contextlib.suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
@@ -164,7 +164,7 @@ def in_use(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def alone(folder: Path) -> Iterator[None]:
-    """Let no sweep use this folder meanwhile. Raises UserError where one does, or the folder cannot be written."""
+    """Keep sweeps off this folder meanwhile. Raises UserError where one does, or the folder cannot be written."""
     with contextlib.ExitStack() as held:
         try:
             file = held.enter_context(opened_lock(folder / LOCK))

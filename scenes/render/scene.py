@@ -1,4 +1,4 @@
-"""Mitsuba: how it runs, a target as its scene in the camera's frame, and what light transport asks of it."""
+"""Mitsuba: its start, a target as its scene in the camera's frame, and the queries of light transport."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FIX = "pip install karellen-llvm-core (Linux x86-64), or set DRJIT_LIBLLVM_PATH 
 
 
 def load_mitsuba() -> Any:
-    """Return the mitsuba module with a variant set. Raises UserError that names what to install where none works."""
+    """Return the mitsuba module with a variant set. Raises UserError, with the package to install, where none works."""
     # Dr.Jit looks for LLVM when it is imported, so the path comes first; without a GPU only does it matter.
     missing = _point_to_llvm()
     import mitsuba as mi

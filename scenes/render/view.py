@@ -118,7 +118,7 @@ def range_noise_m(batches: np.ndarray, total: np.ndarray, frequencies_hz: tuple[
 
 
 def range_change_m(change: np.ndarray, total: np.ndarray, frequencies_hz: tuple[float, ...]) -> np.ndarray:
-    """Return what a small change (..., f, n) of phasors ``total`` (f, n) does to range, (..., n); 0 without light.
+    """Return the change of range, (..., n), by a small change (..., f, n) of phasors ``total`` (f, n); 0 without light.
     Phases turn by Im(dH / H) and are fused with the least-squares weights c f_k / (4 pi sum f^2)."""
     f = np.array(frequencies_hz)[:, None]
     weights = SPEED_OF_LIGHT_AIR * f / (4 * np.pi * (f**2).sum())
@@ -127,7 +127,7 @@ def range_change_m(change: np.ndarray, total: np.ndarray, frequencies_hz: tuple[
 
 
 def noise_lines(frequencies_hz: tuple[float, ...]) -> list[int]:
-    """Return the frequencies that tell noise: all, or NOISE_LINES spread over the list where there are more."""
+    """Return the frequencies by which noise is estimated: all, or NOISE_LINES spread over a longer list."""
     count = len(frequencies_hz)
     return [round(k) for k in np.linspace(0, count - 1, min(count, NOISE_LINES))]
 

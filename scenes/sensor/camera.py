@@ -136,7 +136,7 @@ def camera_of(config: CameraConfig) -> AnyCamera:
 
 
 def guessed_precision(camera: AnyCamera) -> str:
-    """Return a sentence on a camera whose precision nobody publishes (shot noise by its gain); empty for others."""
+    """Return a sentence on a camera whose precision is not published (shot noise by its gain); empty for others."""
     if isinstance(camera, EmpiricalCamera) or (gain := camera.photons.signal_electrons).range is None:
         return ""
     low, high = (float(np.sqrt(gain.value / end)) for end in reversed(gain.range))
@@ -145,7 +145,7 @@ def guessed_precision(camera: AnyCamera) -> str:
 
 
 def numbers_of_lens(lens: Lens) -> dict[str, Any]:
-    """Return the numbers of a camera's file (`CameraConfig.numbers`) that make a lens its own."""
+    """Return the numbers of a camera's file (`CameraConfig.numbers`) that describe a lens."""
     numbers = {f"lens.{key}_px": float(getattr(lens, key)) for key in ("fx", "fy", "cx", "cy")}
     return {**numbers, "lens.distortion": [*map(float, lens.distortion)]}
 

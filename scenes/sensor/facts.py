@@ -140,7 +140,7 @@ class SmoothPatternFacts(Config):
 
 
 class OutputFacts(Config):
-    """Least range that a camera gives, and the step of the stored z."""
+    """The least range that a camera gives, and the step of the stored z."""
 
     min_range_mm: NonNegative
     output_step_mm: Positive
@@ -172,7 +172,7 @@ class ConeFacts(Config):
         return self
 
     def optics(self) -> dict[str, Any]:
-        """Return what a camera's optics take of it."""
+        """Return the arguments that a camera's optics take from it."""
         angles = {key: getattr(self, key).value for key in ("full_half_angle_deg", "cutoff_half_angle_deg")}
         return {"emitter_m": np.array(self.position_mm.value) * MM, **angles}
 
@@ -200,7 +200,7 @@ class CameraFacts(Config):
         return self.engine.output_step_mm.value * MM
 
     def optics_with(self, **own: Any) -> Optics:
-        """Return the camera's optics for the render; ``own``: what its kind alone knows."""
+        """Return the camera's optics for the render; ``own``: arguments that only its kind knows."""
         facts = {"title": self.title, "lens": self.nominal_lens, "wavelength_nm": self.wavelength_nm.value}
         return Optics(**facts, nearest_m=self.engine.min_range_mm.value * MM, **own)  # type: ignore[arg-type]
 

@@ -1,4 +1,4 @@
-"""Standard normals for the cameras' noise: vector code from a generator's raw words. One core, float32."""
+"""Standard normals for the cameras' noise: vectorised from a generator's raw words. One core, float32."""
 
 from __future__ import annotations
 

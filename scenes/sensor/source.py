@@ -23,7 +23,7 @@ from scenes.sensor.unit import FrameTotals, frame_errors_m
 
 @dataclass(frozen=True)
 class SimulatedUnit:
-    """A unit of a camera before a view: everything that frames share. Build once, then `capture` many times."""
+    """A unit of a camera before a view: the part that frames share. Build once, then `capture` many times."""
 
     camera: AnyCamera
     config: CameraConfig
@@ -37,12 +37,12 @@ class SimulatedUnit:
 
     @cached_property
     def exposure(self) -> Any:
-        """Everything of the view that its frames share; only the model knows what is in it."""
+        """The noise-free input that all frames share; its type depends on the model."""
         return self.model.expose(self.view)
 
     @cached_property
     def at_once(self) -> AtOnce | None:
-        """Sums of frames of the view without drawing each; None where only frames will do, or of other kinds."""
+        """Sums of frames of the view without drawing each; None where frames must be drawn, or for other kinds."""
         if not isinstance(self.model, AmcwImager):
             return None
         asked = np.zeros(self.view.range_m.shape, bool)
@@ -102,7 +102,7 @@ class SimulatedCapture:
 
     def totals(self, frames: np.ndarray) -> FrameTotals | None:
         """Return sums over the frames of these numbers (t,), drawn at once: equal in distribution to those of `frames`,
-        and the same whichever others are asked for. None where only frames will do."""
+        and independent of the other numbers. None where frames must be drawn."""
         summer, errors_m = self.unit.at_once, self.errors_m[frames]
         if summer is None or np.abs(errors_m).max(initial=0.0) > summer.farthest_error_m:
             return None

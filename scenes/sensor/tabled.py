@@ -2,9 +2,9 @@
 
 `harness.export_noise` measures the table of a camera and copies this file beside it. Per pixel and frame, the noise's
 deviation and the chance of no return follow from the light that comes back, intensity / range^2; neighbours are
-correlated by a separable filter; a unit has a fixed pattern, the same in all frames.
-Not modelled: what happens at steps of depth (mixing of neighbours, flying pixels), light over several surfaces, ambient
-light, warm-up and displacements of whole frames. `harness.sweep` simulates all of them."""
+correlated by a separable filter; a unit has a fixed pattern, the same in all frames. Not modelled: errors at steps of
+depth (mixing of neighbours, flying pixels), light over several surfaces, ambient light, warm-up and displacements of
+whole frames. `harness.sweep` simulates all of them."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The target: its declaration, its meshes, its truth and its export. Knows nothing of light or cameras."""
+"""The target: its declaration, its meshes, its truth and its export. It does not depend on light or cameras."""

@@ -1,4 +1,4 @@
-"""Checks of a declaration as a whole: every part that does not fit is found and named; nothing is built."""
+"""Checks of a declaration as a whole: all parts that do not fit are found and named; nothing is built."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _CIRCLE = np.column_stack([np.cos(_TURN), np.sin(_TURN)])
 
 
 def check_target(config: custom.TargetConfig) -> None:
-    """Raise UserError that names every part that does not fit, with the numbers; return where all fits."""
+    """Raise UserError that names every part that does not fit, with the numbers; return if all parts fit."""
     board = config.board
     problems = _board_problems(board)
     if not problems:

@@ -3,7 +3,7 @@
 Frames. ``board``: x across the face, y up, z out of the face towards the camera, origin on the face's centre.
 ``camera``: OpenCV's (x right, y down, z forward), origin at the depth lens. At zero tilt board +x, +y, +z are camera
 +x, -y, -z. Albedos are linear diffuse reflectances in 0..1, at 850 nm and for red, green and blue. Ranges of single
-fields are checked here; what concerns several together (a hole that leaves the board) by `scenes.target.checks`."""
+fields are checked here; rules on several fields (a hole that leaves the board) by `scenes.target.checks`."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ class DamageConfig(PlacedConfig):
 
     @property
     def mouth_m(self) -> float:
-        """Radius in metres of what is missing of a flat face, a chamfer included."""
+        """Radius in metres of the opening in a flat face, a chamfer included."""
         return self.radius_m + getattr(self, "chamfer_mm", 0.0) * MM
 
     @property
@@ -246,7 +246,7 @@ class ReflectanceConfig(Config):
 
 
 class MaterialConfig(ReflectanceConfig):
-    """The same with the grain of one board out of all alike."""
+    """A board's reflectance with the grain of one board among alike boards."""
 
     grain_seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 1
 

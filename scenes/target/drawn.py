@@ -2,8 +2,8 @@
 
 Each board has so many damages of random size, depth and place, its own grain, and stands before the camera in a random
 pose. Every quantity of every board has a random stream of its own, named by the family's seed, the board's purpose and
-its number. So a board is the same however many others there are, and at another distance, albedo, kind of hole or depth
-the boards keep their places, sizes and tilts: their results are paired.
+its number. So a board does not depend on the number of other boards, and at another distance, albedo, kind of hole or
+depth the boards keep their places, sizes and tilts: their results are paired.
 
 Not modelled: damage that is correlated (a row, a cluster), several kinds on one board."""
 
@@ -104,7 +104,7 @@ RANGES["angle_deg"] = Annotated[tuple[flaws.Angle, flaws.Angle], AfterValidator(
 
 class DrawnFlaws(_Drawn):
     """A kind of `scenes.target.flaws`. Each pair is a range: of the size that ``size_of`` names and of the depth as of
-    holes, of every other quantity uniform and independent; what is one number is the same on all boards."""
+    holes, of every other quantity uniform and independent; a single number is the same on all boards."""
 
     kind: Any
 
@@ -234,7 +234,7 @@ class DrawnTargetConfig(Config):
 
     def drawn(self, purpose: Purpose, number: int) -> custom.TargetConfig:
         """Return a board of the family with its damage, ids from 1 in the order of size; of a hole-free one call
-        ``hole_free()``: what that leaves out are unflawed sites. Raises UserError where the board is too full."""
+        ``hole_free()``: the damages left out are unflawed sites. Raises UserError where the board is too full."""
 
         def stream(quantity: str) -> np.random.Generator:
             return random_stream(self.seed, "drawn board", purpose, number, quantity)
@@ -285,7 +285,7 @@ class DrawnTargetConfig(Config):
 
     def extreme_poses(self) -> tuple[custom.PoseConfig, ...]:
         """Return the corners of what poses can be drawn, with the rolls at which the board reaches farthest sideways
-        and upwards: what is in view in all of these is in view in every pose."""
+        and upwards: a point in view in all of these is in view in every pose."""
         diagonal_deg = math.degrees(math.atan2(self.board.height_mm, self.board.width_mm))
         rolls = [self.roll_deg, *(roll for roll in (diagonal_deg, 90 - diagonal_deg) if roll < self.roll_deg)]
         limits = (self.distance_jitter_mm, self.offset_mm, self.offset_mm, self.tilt_deg, self.tilt_deg)

@@ -6,7 +6,7 @@ whose border is the outline; `mesh.solids_of` cuts or adds the solid between tha
 `truth.truth_of` measures outline, centre line and volume on it. ``angle_deg`` turns s from board +x towards board +y.
 Sizes are those in the plane that touches the face: good to second order in size over radius of curvature.
 
-Not modelled: burrs, spring-back, rust that stands on the face, another albedo of what is laid bare."""
+Not modelled: burrs, spring-back, rust that stands on the face, another albedo of the exposed material."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ class GougeConfig(_LongConfig):
 
 class RoundConfig(_FlawConfig):
     """A sheet pressed in (``pressed_dent``) or out (``pressed_bump``): front and back move alike, by a raised cosine of
-    the distance from the centre; it may be deeper than the sheet is thick. Or something that stands on the face (weld
+    the distance from the centre; it may be deeper than the sheet is thick. Or an object that stands on the face (weld
     spatter, a rivet's head): a paraboloid, its height ``depth_mm``."""
 
     kind: Literal["pressed_dent", "pressed_bump", "protrusion"]

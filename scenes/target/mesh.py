@@ -246,7 +246,7 @@ def sheet(
 
 def solids_of(item: FlawConfig, face: Face, thickness_m: float) -> tuple[list[trimesh.Trimesh], list[trimesh.Trimesh]]:
     """Return the solids that a flaw adds to the board and those that it takes away, in this order, board frame. A
-    pressed sheet moves its back too: what one side takes, the other side adds."""
+    pressed sheet moves its back too: the volume that one side loses, the other side gains."""
     import trimesh
 
     points, depth_m, axis, across = relief_points(item, face, thickness_m)

@@ -1,8 +1,8 @@
 """Parts from mesh files as targets: read, repaired or refused, and their front as a height field.
 
 The part's frame is the board's: its ``front`` axis is z, x and y are centred on its bounds, and z = 0 is its foremost
-point. The front is what is seen along z; damage lies there. Its heights are read off the triangles on a grid of `NODES`
-along the longer side, between which they are bilinear.
+point. The front is the surface seen along z; damage lies there. Its heights are read off the triangles on a grid of
+`NODES` along the longer side, between which they are bilinear.
 
 Not checked: neighbouring triangles that fold onto each other. Not modelled: steps of the front within a step of the
 grid; pressed dents and chips, which need a sheet's back or a declared edge."""
@@ -49,7 +49,7 @@ class MeshTargetConfig(custom.SetUpConfig):
 def part_of(shape: custom.MeshConfig) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (n, 3) and outward triangles (m, 3) of a closed part, board frame, metres. Equal vertices are
     joined, flat and doubled triangles left out, and a part that is inside out is turned. Raises UserError, with the
-    place, for what is open, not manifold, not oriented, crosses itself or is no mesh."""
+    place, for a part that is open, not manifold, not oriented, crosses itself or is not a mesh."""
     mesh = read_mesh(shape.file)
     if shape.content and file_digest(Path(shape.file)) != shape.content:
         raise UserError(f"{shape.file}: has changed since the experiment was declared")

@@ -28,8 +28,8 @@ _UNIT_CORNERS = np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
 @dataclass(frozen=True)
 class Face:
     """A smooth height field with z(0, 0) = 0. ``derivatives`` gives z and its derivatives (`ORDERS`), each of the shape
-    of x and y, NaN beyond its reach, ``height`` z alone where that is much quicker. Of a ``rough`` face slope and
-    curvature at one place say nothing of the places around it. Arguments of the methods broadcast."""
+    of x and y, NaN beyond its reach, ``height`` z alone where that is much quicker. On a ``rough`` face, slope and
+    curvature at one place do not describe the places around it. Arguments of the methods broadcast."""
 
     derivatives: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
     rough: bool = False

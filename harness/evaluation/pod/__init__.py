@@ -1,3 +1,3 @@
-"""Probability of detection by the field's standard (MIL-HDBK-1823A): pure statistics of anybody's inspection data."""
+"""Probability of detection by the field's standard (MIL-HDBK-1823A): pure statistics of any inspection data."""
 
 from __future__ import annotations

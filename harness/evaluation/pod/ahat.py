@@ -249,7 +249,7 @@ class Diagnostic(NamedTuple):
 
 def diagnose(fit: AhatFit) -> tuple[Diagnostic, ...]:
     """Test the assumptions of MIL-HDBK-1823A: linearity, equal scatter, normality, independence of rows in their order.
-    Below 20 signals trust none of it; nothing with fewer than `LEAST` between the limits."""
+    Do not trust it below 20 signals; it returns nothing with fewer than `LEAST` between the limits."""
     exact = ~(fit.below | fit.above)
     if exact.sum() < LEAST:
         return ()

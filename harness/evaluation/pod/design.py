@@ -45,7 +45,7 @@ def curve_through(a50: float, a90: float, link: str = "logit", *, log_size: bool
 
 
 def even_sizes(number: int, range_of_sizes: tuple[float, float]) -> np.ndarray:
-    """Ascending sizes (number,): midpoints of equal parts of the range, so that none is wasted on its very ends."""
+    """Ascending sizes (number,): midpoints of equal parts of the range, so that no target is spent on its ends."""
     low, high = range_of_sizes
     return low + (high - low) * (np.arange(number) + 0.5) / number
 

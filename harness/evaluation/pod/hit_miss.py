@@ -9,7 +9,7 @@ targets that differ in anything but size, inspectors, and hits by chance or miss
 
 A bound of one model holds if that model is true. Where the data choose among eight models, the best one's bound covers
 91 to 96 % (1,000 studies of 60 targets for each of five true curves). So `largest_bound` takes the largest over all
-that the data hardly tell from the best (`near_models`): 95.6 to 99 % (``tests/validation/pod_coverage.py``)."""
+that the data hardly distinguish from the best (`near_models`): 95.6 to 99 % (``tests/validation/pod_coverage.py``)."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def fit_hit_miss(
 def choose_model(
     size: ArrayLike, hit: ArrayLike, *, links: Sequence[str] = LINKS, inspections: ArrayLike | None = None
 ) -> tuple[HitMissFit, ...]:
-    """Fit every link with a and (where all sizes are positive) ln a, least deviance first. The order knows nothing of
+    """Fit every link with a and (where all sizes are positive) ln a, least deviance first. The order does not depend on
     the limits: a model chosen because its limit is small has no coverage."""
     logs = (False, True) if np.all(np.asarray(size, float) > 0) else (False,)
     fit = partial(fit_hit_miss, size, hit, inspections=inspections)

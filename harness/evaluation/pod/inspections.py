@@ -1,7 +1,7 @@
-"""Tables of inspections as people have them: CSV in several encodings and number formats, or a sheet of Excel.
+"""Tables of inspections in common forms: CSV in several encodings and number formats, or a sheet of Excel.
 
 A row is one flaw, or one inspection of it. Several response columns (one for each inspector, the handbook's own layout)
-are inspections of the row's flaw. What had to be understood rather than read stands in `Inspections.notes`."""
+are inspections of the row's flaw. `Inspections.notes` lists what had to be interpreted."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def _require_one_size(read: Inspections) -> None:
 
 
 def require_hits(read: Inspections) -> None:
-    """Refuse hits and misses that are all the same."""
+    """Refuse data that are all hits or all misses."""
     if np.ptp(read.response) == 0:
         kind = "hits" if read.response[0] else "misses"
         said = f"{read.path}: all {len(read.response)} rows of {read.response_column} are {kind}"

@@ -38,8 +38,8 @@ TESTED: dict[Beyond, str] = {
 
 @dataclass(frozen=True)
 class ModelRow:
-    """One model that was tried: its name, how far from the data (``deviance``, smaller is nearer), its sizes; ``near``:
-    its bound is one of those of which the statement's is the largest."""
+    """A model that was tried: its name, its ``deviance`` (smaller fits better), its sizes; ``near``: its bound is one
+    of those of which the statement's is the largest."""
 
     name: str
     deviance: float
@@ -107,7 +107,7 @@ class PodStatement:
 
     @property
     def doubts(self) -> list[str]:
-        """Return warnings: near models with a90/95 more than `APART` apart; data that speak for floor or ceiling."""
+        """Return warnings: near models with a90/95 more than `APART` apart; data that suggest a floor or ceiling."""
         doubts = [note for note in self.notes if note.endswith(DOUBTED)]
         most = min(row.deviance for row in self.models) + NEAR_DEVIANCE * len(self.read.size) / self.read.targets
         limits = [row.bound.value for row in self.models if row.deviance <= most]

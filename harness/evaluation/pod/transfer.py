@@ -10,8 +10,8 @@ of the simulated curve that fit about equally well. Sources: MIL-HDBK-1823A, app
 Progress in QNDE 28 (2009), 1685. Simulations that are wrong by a factor of 1 to 2 in size and 0.6 to 1.6 in width,
 corrected by 24 holes: the limit covers the true a90 in 98 to 100 % of 300 campaigns (``tests/validation``).
 
-Not modelled: a floor or a ceiling of real inspections, real targets that share a part. What else may be wrong with the
-simulation is what the test of agreement is for."""
+Not modelled: a floor or a ceiling of real inspections, real targets that share a part. The test of agreement looks for
+other errors of the simulation."""
 
 from __future__ import annotations
 
@@ -183,9 +183,9 @@ DISAGREES = 0.05
 class Mapod:
     """A study's curve beside real hits and misses and the combination of both. ``set_up``: the study's, by name;
     ``measured``: the real ones alone, None where no curve fits them, ``why``. ``transfers``: of all simulated models
-    that fit about equally well. ``steps``: what is known before any board and after each, limits the largest over
-    ``transfers``. ``agrees``: probability of data as far from the simulated curve as these, were it right.
-    ``unlike``: how the real hits were counted otherwise than the study's, or that it is not known; "" where alike."""
+    that fit about equally well. ``steps``: estimates before any board and after each, limits the largest over
+    ``transfers``. ``agrees``: probability of data as far from the simulated curve as these, were it right. ``unlike``:
+    how the real hits were counted otherwise than the study's, or that it is not known; "" where they agree."""
 
     set_up: str
     simulated: PodStatement

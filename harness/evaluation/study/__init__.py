@@ -1,1 +1,1 @@
-"""Detection limits of studies: what was inspected and how it fared, curves and bounds over boards, comparisons."""
+"""Detection limits of studies: inspections and their outcomes, curves and bounds over boards, comparisons."""

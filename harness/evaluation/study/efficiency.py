@@ -133,7 +133,7 @@ def _level(ideal_mm: np.ndarray, ideal_index: np.ndarray, needed: np.ndarray, al
 
 
 def warnings_of(rows: list[Efficiency]) -> list[str]:
-    """Return a sentence for everything that makes the ideal observer's figures unreliable."""
+    """Return sentences on reasons why the ideal observer's figures are unreliable."""
     said = []
     for row in rows:
         name, ideal = row.limit.record.label, row.ideal

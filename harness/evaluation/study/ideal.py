@@ -1,4 +1,4 @@
-"""The ideal observer: what the best possible detector finds at a wanted rate of false calls.
+"""The ideal observer: the detections of the best possible detector at a wanted rate of false calls.
 
 It knows the exact signature s of each damage, as far as the camera shows it, and the covariance C of the noise over
 cameras, but neither where the damage is nor the undamaged surface, a polynomial B b with unknown b. Its statistic at

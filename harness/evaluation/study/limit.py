@@ -3,9 +3,9 @@
 The headline is the likelihood ratio bound of the hit/miss curve, the largest over models that fit about as well
 (`harness.evaluation.pod.statement.state_hits`), in which damages are the independent targets. Damages of one board are
 not quite that; beside it stands the same bound with its criterion multiplied by the boards' design effect. Where the
-a50 of boards scatters by 2 mm about 6 mm, a90/95 of the true model covers 88 % (60 boards) and 91 % (20), that bound
-93 % and 95 %; where boards do not matter both cover 95 to 97 %. The upper percentile of boards drawn again is no
-substitute: it covers 86 % with 20 boards (300 studies, ``tests/validation/study_coverage.py``). Boards, not damages,
+a50 of boards scatters by 2 mm about 6 mm, a90/95 of the true model covers 88 % (60 boards) and 91 % (20), that bound 93
+% and 95 %; where boards do not matter both cover 95 to 97 %. The upper percentile of boards drawn again does not
+replace it: it covers 86 % with 20 boards (300 studies, ``tests/validation/study_coverage.py``). Boards, not damages,
 are what a study draws at random, so whole boards are resampled with replacement (the cluster bootstrap; Davison and
 Hinkley 1997, section 3.8)."""
 

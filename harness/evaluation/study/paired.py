@@ -1,6 +1,6 @@
-"""Two set-ups compared: hits, a90, signals and false calls. Boards are the unit: damages of one board share its render,
-its pose and its surface. The tests of hits and limits do not know that each set-up drew its own calibration of the
-threshold; those of signals and of false calls do. Of two one-sided p the first is of being worse."""
+"""Two set-ups compared: hits, a90, signals and false calls. Boards are the units: damages of one board share its
+render, its pose and its surface. The tests of hits and limits do not know that each set-up drew its own calibration of
+the threshold; those of signals and of false calls do. The first of two one-sided p values is for being worse."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ class SignalChange:
 
 
 def signal_change(first: SetUpRecord, second: SetUpRecord) -> SignalChange | None:
-    """Compare signals on the inspections that both have. It sees what hits hardly show: signals change with all of the
+    """Compare signals on the inspections that both have. It is more sensitive than hits: signals change with all of the
     noise and the threshold, hits only near the limit. Damages count whose two signals, each over what is needed, exceed
     1 in the geometric mean: smaller ones are noise. None where fewer than two boards have any, or for two detectors."""
     one, two = shared_rows(first.inspected, second.inspected)
@@ -150,8 +150,8 @@ def signal_change(first: SetUpRecord, second: SetUpRecord) -> SignalChange | Non
 
 
 def found_from(seen: Inspected) -> float:
-    """Find the signal that parts hits from misses with the fewest exceptions, midway between its two neighbours: the
-    threshold as it acts. Hits by missing returns alone do not count; NaN without any signal."""
+    """Find the signal that separates hits from misses with the fewest exceptions, midway between its two neighbours:
+    the threshold as it acts. Hits by missing returns alone do not count; NaN without any signal."""
     hit = seen.hit if seen.by_depth is None else seen.by_depth
     known = np.flatnonzero(seen.signal > 0)
     if not len(known):

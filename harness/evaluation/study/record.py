@@ -230,7 +230,7 @@ def record_text(record: StudyRecord) -> str:
 
 def read_record(path: Path) -> StudyRecord:
     """Read the record at ``path``: a file, or a result folder with its ``study.json``. Raises UserError where there is
-    none, where it is no record or a damaged one (with set-up and field), and where it is of another version."""
+    none, where it is not a record or is damaged (with set-up and field), and where it is of another version."""
     file = Path(path) / "study.json" if Path(path).is_dir() else Path(path)
     try:
         data = strict_json(bounded_bytes(file, RECORD_BYTES), nan=True)  # its form says where a NaN stands
@@ -249,7 +249,7 @@ def read_record(path: Path) -> StudyRecord:
 
 
 def set_up_named(study: StudyRecord, name: str | None) -> SetUpRecord:
-    """Return the set-up with this label, or the only one. Raises UserError where there is none, or it is left open."""
+    """Return the set-up with this label, or the only one. Raises UserError where there is none, or none is named."""
     by_label = {record.label: record for record in study.set_ups}
     name, known = name or (next(iter(by_label)) if len(by_label) == 1 else None), "; ".join(by_label)
     if name is None:

@@ -266,7 +266,7 @@ CONDITIONS = (
 
 
 def conditions_of(facts: Mapping[str, Any], inspected: int | None = None) -> str:
-    """Return what all set-ups have in common, damage first, in one line, and whether not all was ``inspected``."""
+    """Return the conditions common to all set-ups in one line, damage first; ``inspected``: damages that were seen."""
     said = [words] if (words := _damage_words(facts)) else []
     for path, words in CONDITIONS:
         value: Any = facts

@@ -1,4 +1,4 @@
-"""Limits over units of a camera: each unit's own, and the limit of a unit drawn anew.
+"""Limits over units of a camera: each unit's own, and the limit of a newly drawn unit.
 
 All units inspect the same boards, so that their limits differ by the unit and by noise alone. Logarithms of the units'
 a90 are taken as normal (a random effect of the unit). With 95 % confidence that of a new unit lies less than

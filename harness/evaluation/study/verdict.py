@@ -149,7 +149,7 @@ def paired_set_ups(first: StudyRecord, second: StudyRecord) -> tuple[Pair, ...]:
 
 
 def not_comparable(first: StudyRecord, second: StudyRecord, one: SetUpRecord, other: SetUpRecord) -> str:
-    """Say why the two were not measured in the same way (hit radius, wanted false calls, damage), empty where they
+    """Return why the two were not measured in the same way (hit radius, wanted false calls, damage), empty where they
     were. Damage of other boards is compared by Kolmogorov and Smirnov's test with as many values as there are boards,
     since damages of one board may be alike: cautious where they are not."""
     if first.hit_radius_mm != second.hit_radius_mm:
@@ -174,7 +174,7 @@ def not_comparable(first: StudyRecord, second: StudyRecord, one: SetUpRecord, ot
 
 
 def differences(one: SetUpRecord, other: SetUpRecord) -> tuple[str, ...]:
-    """List what differs and may be the cause, in words."""
+    """Describe differences that may be the cause."""
     told = [(f"{of.detector} {of.detector_version}", f"frames {of.frames}") for of in (one, other)]
     said = [f"{before} → {now.removeprefix('frames ')}" for before, now in zip(*told, strict=True) if before != now]
     for axis in sorted({*one.axes, *other.axes}):

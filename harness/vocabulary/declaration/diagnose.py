@@ -1,4 +1,4 @@
-"""Turning pydantic's errors into problems with a place: what is wrong, what is legal there, the nearest legal word."""
+"""Translation of pydantic's errors into problems: place, mistake, legal values, nearest legal word."""
 
 from __future__ import annotations
 
@@ -87,8 +87,8 @@ def settings_of(model: type[C], data: Mapping[str, Any], what: str, within: str 
 
 def problems_of(error: ValidationError, declared: shape.Declared, source: Source, base: KeyPath = ()) -> list[Problem]:
     """Return the problems behind a ValidationError whose locations start at ``base``; the first `MAX_PROBLEMS` of them.
-    pydantic's locations mix keys of the data with labels of union branches. Of a union without a discriminator only the
-    errors of the branch that was meant are told; where that is unclear, the union as a whole is a problem."""
+    pydantic's locations mix keys of the data with labels of union branches. For a union without a discriminator, only
+    the errors of the intended branch are reported; if that branch is unclear, the union as a whole is the problem."""
     alone: list[tuple[KeyPath, Any]] = []
     unions: dict[KeyPath, list[tuple[str, KeyPath, Any]]] = defaultdict(list)
     for each in error.errors(include_url=False, include_input=False)[:MAX_PROBLEMS]:
@@ -189,7 +189,7 @@ def shown(value: Any) -> str:
 
 
 def wrong_choice(path: Sequence[str | int], value: Any, choices: Iterable[Any], place: Place) -> Problem:
-    """Return the problem of a value that is none of the legal ones."""
+    """Return the problem of a value that is not legal."""
     words = [shape.plain(choice) for choice in choices]
     message = f"`{dotted(path)}` is {shown(value)}, which is none of the legal values"
     return Problem(message, place, legal="one of " + ", ".join(words), nearest=nearest(value, words))

@@ -165,7 +165,7 @@ def choices_of(slot: Slot | None) -> tuple[Any, ...]:
 
 
 def legal_at(slot: Slot | None) -> str | None:
-    """Say in words what a place accepts: type, bounds, choices, and what the field's description says of it."""
+    """Describe in words what a place accepts: type, bounds, choices, and what the field's description says of it."""
     if slot is None:
         return None
     words = " or ".join(filter(None, dict.fromkeys(_words(kind, limits) for kind, limits in slot.branches)))

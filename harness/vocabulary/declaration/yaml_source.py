@@ -1,7 +1,7 @@
 """YAML 1.2 as plain data that remembers the place of every key and value; problems are shown there, all at once.
 
 Only ruamel.yaml's node tree is used, so that no tag can build an object and every duplicate key is seen. Not supported
-on purpose: merge keys (``<<``, no part of YAML 1.2), tags, several documents, keys that are no text."""
+on purpose: merge keys (``<<``, not part of YAML 1.2), tags, several documents, keys that are not text."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Problem:
-    """One mistake: what, where, what would be legal, the nearest legal word, and a second place that it concerns."""
+    """A mistake: message, place, legal values, the nearest legal word, and a second place that it concerns."""
 
     message: str
     place: Place | None
@@ -76,7 +76,7 @@ class Problem:
 
 
 class DeclarationError(UserError):
-    """Everything that is wrong with an experiment, in the order of the file."""
+    """All problems of an experiment, in the order of the file."""
 
     def __init__(self, origin: str, problems: Iterable[Problem]) -> None:
         self.origin, self.problems = origin, in_order(problems)

@@ -205,8 +205,8 @@ def windows_of(image: np.ndarray, side: int, beyond: float, pixels: np.ndarray) 
 
 
 def at_once(imager: AmcwImager, exposure: AmcwExposure, asked: np.ndarray) -> AtOnce | None:
-    """Return what sums frames at the pixels ``asked`` (h, w) bool; None where frames must be drawn: without noise that
-    hides the converter's steps, where a sample may saturate or not, or where many pixels hang on a gate."""
+    """Return the sums of frames at the pixels ``asked`` (h, w) bool; None where frames must be drawn: without noise
+    that hides the converter's steps, where a sample may saturate or not, or where many pixels hang on a gate."""
     largest = np.abs(exposure.means).max(axis=(0, 1))
     lost = largest - DEVIATIONS * exposure.sigma > exposure.limit
     wild = (largest + DEVIATIONS * exposure.sigma > exposure.limit) & ~lost

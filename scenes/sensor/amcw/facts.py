@@ -132,7 +132,7 @@ class EmitterFacts(ConeFacts):
 
 
 class ScatterFacts(Config):
-    """Light that reaches other pixels than its own: a Gaussian blur by the lens, deviation ``blur_px``; a share of the
+    """Light that reaches pixels other than its own: a Gaussian blur by the lens, deviation ``blur_px``; a share of the
     light is spread by a Gaussian of ``stray_px`` instead. A ghost image at a distance is not modelled."""
 
     blur_px: NonNegative
@@ -223,9 +223,9 @@ class ResidualByAmplitudeFacts(Config):
 
 
 class FlyingPixelFacts(Config):
-    """The gate on the finished range image, 3x3: a pixel goes where its neighbours reach more than ``near_mm`` nearer
-    and ``far_mm`` farther, either more than ``most_mm``, and their summed amplitudes scatter by ``relative_deviation``
-    of their mean or more (the mean taken as at least ``least_mean_units``)."""
+    """The gate on the finished range image, 3x3: a pixel is removed where its neighbours reach more than ``near_mm``
+    nearer and ``far_mm`` farther, either more than ``most_mm``, and their summed amplitudes scatter by
+    ``relative_deviation`` of their mean or more (the mean taken as at least ``least_mean_units``)."""
 
     relative_deviation: NonNegative
     least_mean_units: NonNegative
@@ -235,7 +235,7 @@ class FlyingPixelFacts(Config):
 
 
 class EngineFacts(LimitFacts):
-    """The depth engine: phase-space filter, unwrapping, fusion, gates, output. A gate that is left out is none.
+    """The depth engine: phase-space filter, unwrapping, fusion, gates, output. A gate that is left out is not applied.
     ``filter_on``: each phasor counts by its weight alone (``unit_phasors``), or by its amplitude too (``phasors``).
     ``spatial_sigma_px``: Gaussian of the window; None is a box. A centre not brighter than ``dim_amplitude_units`` gets
     weights by distance alone; before a brighter one, dimmer neighbours are dropped where ``drop_dim_neighbours``.

@@ -6,7 +6,7 @@ gates, the correction for the emitter beside the lens, rounding, the lens' natur
 light and exposures that end early where the camera's file has them. Not modelled: dark current, motion, light that
 changes during a frame, cross-talk between pixels, in-pixel rejection of ambient light, gain switching, the steps in
 which exposures end, errors of phase that differ between frequencies other than harmonics, any post-processing beyond
-this. What a unit's tables of lens, emitter and phase offsets leave is the fixed pattern and the unit's offset."""
+this. The error that a unit's tables of lens, emitter and phase offsets leave is its fixed pattern and offset."""
 
 from __future__ import annotations
 
@@ -220,7 +220,7 @@ class AmcwImager(UnitModel[AmcwCamera]):
 
     @cached_property
     def engine(self) -> ranging.DepthEngine:
-        """Everything that decides after the filter."""
+        """Return the engine's steps after the filter."""
         facts, emitter = self.camera.engine, self.camera.optics.emitter_m
         along, cosine = rays_of(self.slopes, emitter)
         geometry = np.stack([along, np.full_like(along, emitter @ emitter), cosine]).reshape(3, -1).astype(f4)

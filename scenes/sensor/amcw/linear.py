@@ -73,7 +73,7 @@ class Filtered(NamedTuple):
 
 
 def unknown_filtered(frequencies: int, n: int) -> Filtered:
-    """Return n pixels of which nothing is known."""
+    """Return n pixels with unknown values."""
     start = (1.0 + 0.0j, 0.0, np.inf, np.inf, np.inf, np.inf, np.inf, 0.0, np.inf)
     return Filtered(*(np.full((frequencies, n), value) for value in start))
 

@@ -58,8 +58,8 @@ class FlyingGate(NamedTuple):
 
 
 class DepthEngine(NamedTuple):
-    """Everything that decides after the filter. ``geometry`` (3, n) of each pixel's unit ray u and the emitter at e:
-    u.e, e.e, u_z; ``outside_mask`` (n,) bool: pixels that the emitter's polygon leaves out."""
+    """The gates and tables that are applied after the filter. ``geometry`` (3, n) of each pixel's unit ray u and the
+    emitter at e: u.e, e.e, u_z; ``outside_mask`` (n,) bool: pixels that the emitter's polygon leaves out."""
 
     geometry: np.ndarray
     outside_mask: np.ndarray

@@ -1,1 +1,1 @@
-"""The empirical camera: what captures of a real unit show, without a model of how it measures."""
+"""The empirical camera: statistics of a real unit's captures, without a model of the measurement."""

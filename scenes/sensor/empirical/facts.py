@@ -65,7 +65,7 @@ class EdgeKernelFacts(Config):
 
 
 class EmpiricalCamera(CameraFacts):
-    """Any depth camera, described by what its captures show."""
+    """Any depth camera, described by statistics of its captures."""
 
     kind: Literal["empirical"]
     light: SurfaceLightFacts
