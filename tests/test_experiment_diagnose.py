@@ -155,16 +155,16 @@ def test_a_missing_key() -> None:
         ("body: {radius: 1, heigth: 1}", ["2:27: unknown key `heigth` in `board.body`", "legal: radius"]),
         (
             "body: 7",
-            ["2:15: `board.body` is 7, matches none", "keys width, height or a mapping with the keys radius"],
+            ["2:15: `board.body` is 7, which matches none", "keys width, height or a mapping with the keys radius"],
         ),
         (
             "size: medium",
-            ['2:15: `board.size` is "medium", matches none', "a whole number or one of small, large"],
+            ['2:15: `board.size` is "medium", which matches none', "a whole number or one of small, large"],
         ),
         ("loose: [1, x]", ['2:20: `board.loose.1` is "x":']),
         (
             "loose: x",
-            ['2:16: `board.loose` is "x", matches none', "a list, each a whole number or a whole number"],
+            ['2:16: `board.loose` is "x", which matches none', "a list, each a whole number or a whole number"],
         ),
         ("width_mm: 666", ["2:8: `board`: no board is that wide"]),
     ],
