@@ -228,5 +228,5 @@ def test_a_batch_system_is_waited_for_as_long_as_it_takes(client, monkeypatch, c
         engine._step()
     assert capsys.readouterr().err.count("as long as its queue takes") == 1
     started_by_hand = engine_with(client)
-    with pytest.raises(UserError, match="no worker came"):
+    with pytest.raises(UserError, match="no worker connected"):
         stepped(started_by_hand, lambda: False)

@@ -180,7 +180,7 @@ def test_a_set_up_that_sees_nothing_is_told_and_costs_no_other(finished, tmp_pat
     (one,) = record.set_ups
     assert one.axes == {"source.camera.unit_seed": 1} and one.failed == 0 and len(one.inspected.hit) == 20
     (said,) = without_limit(experiment.points, outcome, failed, record.set_ups)
-    assert said.startswith("no limit for unit seed 2: the camera sees nothing of the board here")
+    assert said.startswith("no limit for unit seed 2: the camera sees no part of the board that can be judged")
     assert "leaves none of the cloud's points" in said
 
 

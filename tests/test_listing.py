@@ -219,7 +219,7 @@ def test_a_latest_of_somebody_else_is_left_alone(tmp_path, capsys, kind):
         "link": lambda: theirs.symlink_to("../goal"),
     }[kind]()
     point_to(run)
-    assert "is not tofpod's" in capsys.readouterr().err
+    assert "was not written by tofpod" in capsys.readouterr().err
     assert clean.main(["results", "study", "--yes", "--out", str(tmp_path)]) == 0
     assert os.path.lexists(theirs) and not run.exists()
 

@@ -405,7 +405,7 @@ def test_metadata_that_says_nothing_is_refused(tmp_path: Path, text: str) -> Non
 def test_metadata_may_not_name_what_is_not_there(tmp_path: Path) -> None:
     folder = bags.write_bag(tmp_path / "bag", bags.clouds(1))
     (folder / "bag.db3").rename(folder / "other.db3")
-    assert "names bag.db3, which is not there" in refusal(folder)
+    assert "names bag.db3, which is missing" in refusal(folder)
 
 
 def test_files_that_are_compressed_whole_are_told_how_to_be_unpacked(tmp_path: Path) -> None:

@@ -358,4 +358,4 @@ def test_a_bag_whose_description_is_hostile(tmp_path):
         described.write_text(text)
         assert "metadata.yaml" in capture_refusal(folder)
     described.write_text(whole.replace(next(folder.glob("*.db3")).name, "../../../etc/passwd"))
-    assert "passwd, which is not there" in capture_refusal(folder)
+    assert "passwd, which is missing" in capture_refusal(folder)
