@@ -104,7 +104,7 @@ def test_c8(world, expected):
     assert verdict("C8", in_units(worlds(world))).verdict == expected
     alone = verdict("C8", worlds(world))
     assert alone.verdict == "undecided"
-    assert expected == "undecided" or f"1 unit of the camera only, which says nothing of others; there: {expected}" in (
+    assert expected == "undecided" or f"1 unit of the camera only, which says nothing about others; there: {expected}" in (
         alone.evidence
     )
 

@@ -281,7 +281,7 @@ def test_the_program_writes_map_and_figures_and_detect_uses_it(recorded, tmp_pat
     assert detect.main([*judged, "--flat-field", str(unit), "--out", str(tmp_path / "with")]) == 0
     assert capsys.readouterr().out.startswith(f"warning: the flat field {unit}: nothing shows that")
     assert detect.main(judged) == 0
-    unit_of_score = float(re.search(r"one unit of score is .* ([0-9.]+) mm of", capsys.readouterr().out)[1])
+    unit_of_score = float(re.search(r"one unit of score is .* ([0-9.]+) mm for", capsys.readouterr().out)[1])
     with_field = json.loads((tmp_path / "with" / "findings.json").read_text())
     assert with_field["surface"]["one_unit_of_score_mm"] < 0.6 * unit_of_score
     assert str(unit) in [file["path"] for file in with_field["provenance"]["files"]]

@@ -81,7 +81,7 @@ def test_targets_inspected_unequally_often_count_once_each(example3: list[np.nda
         inspections=np.repeat(np.arange(len(size)), times),
     )
     assert (often.targets, often.n) == (len(size), times.sum())
-    assert "1 to 3 inspections a target" in often.notes[-1]
+    assert "1 to 3 inspections per target" in often.notes[-1]
     assert (often.curve.mu, often.curve.sigma) == pytest.approx((once.curve.mu, once.curve.sigma), rel=1e-5)
     assert often.covariance == pytest.approx(once.covariance, rel=1e-4)
     assert bound(often).value == pytest.approx(bound(once).value, rel=1e-5)

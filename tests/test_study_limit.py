@@ -125,7 +125,7 @@ class TestWithoutACurve:
     def test_28_found_of_28_demonstrate_nothing(self, small):
         record = first_rows(small, 28)
         limit = limit_of(with_hits(record, np.ones(28, bool)))
-        assert not limit.a90_95.demonstrated and "it takes 29" in limit.a90_95.why
+        assert not limit.a90_95.demonstrated and "29 are needed" in limit.a90_95.why
 
     def test_nothing_found(self, small):
         limit = limit_of(with_hits(small, np.zeros(120, bool)))
