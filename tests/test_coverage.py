@@ -30,12 +30,12 @@ def signal_m(size_mm: np.ndarray, seen: Seen) -> np.ndarray:
     return np.asarray(1e-3 * size_mm**1.5 * np.exp(2.0 * seen.cosine - seen.cosine**2) / seen.range_m)
 
 
-def inspections(count: int, looks: int = 4) -> ScoredDamage:
-    """Damages of `signal_m`, with a logarithmic scatter of `SCATTER` over the cosine of the angle."""
+def inspections(count: int, looks: int = 4, growth: float = 1.0) -> ScoredDamage:
+    """Damages of `signal_m`, with a logarithmic scatter of `SCATTER` over a power of the angle's cosine."""
     rng, damage = np.random.default_rng(3), np.repeat(np.arange(count), looks)
     size_mm, cosine, range_m = rng.uniform(0.5, 8, count), rng.uniform(0.4, 1, count), rng.uniform(0.6, 0.9, count)
     seen = Seen(rng.uniform(1e-3, 3e-3, count)[damage], cosine[damage], range_m[damage])
-    size_mm, noise = size_mm[damage], rng.standard_normal(len(damage)) * SCATTER / seen.cosine
+    size_mm, noise = size_mm[damage], rng.standard_normal(len(damage)) * SCATTER / seen.cosine**growth
     score = signal_m(size_mm, seen) / seen.deviation_m * np.exp(noise)
     return ScoredDamage("depth", damage, size_mm, seen, np.where(score > THRESHOLD, score, np.nan))
 
@@ -66,6 +66,8 @@ def test_misses_that_size_angle_and_distance_do_not_explain_are_told() -> None:
     assert learnt(10).doubt.startswith("what is found depends on more than size, angle and distance")
     with pytest.raises(UserError, match="does not follow the depth"):
         learnt(3)
+    too_steep = findable(inspections(400, growth=6.0), THRESHOLD)
+    assert too_steep.doubt.startswith("the signal scatters more with the angle than the law can describe")
 
 
 def test_too_few_damages_teach_nothing() -> None:
