@@ -11,7 +11,7 @@ import numpy as np
 from harness.vocabulary.geometry import Cloud
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Evidence:
     """A detector's result for each pixel of a cloud before any threshold is applied.
 

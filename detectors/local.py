@@ -74,7 +74,7 @@ class LocalConfig(FilterConfig):
         return {**data, "surface": {"shape": "auto", **surface}}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LocalEvidence(Evidence):
     """``signed`` (r, c): the score of each cell of a picture, negative before the surface. ``cell`` (h, w): the
     flat index of each point's cell in it, -1 where there is no score."""

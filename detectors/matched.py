@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import ClassVar, NamedTuple
 
 import cv2
@@ -134,10 +135,7 @@ class MatchedDetector(LocalDetector):
 
     def correlation(self, evidence: Evidence) -> np.ndarray:
         """Return the learned correlation of the noise by lag, or that of the residuals."""
-        covariance, known = self._covariance, np.isfinite(evidence.residual_m)
-        if covariance is None:
-            residual_m = np.where(known, evidence.residual_m, 0.0)
-            covariance = _covariance(_in_deviations(residual_m, known.astype(np.float32), (0.0, 0.0))[0], known)
+        covariance = _own_covariance(evidence) if self._covariance is None else self._covariance
         reach = np.arange(-whitening.LONGEST_LAG_PX, whitening.LONGEST_LAG_PX + 1)
         grid = (whitening.GRID, whitening.GRID)
         lags = scipy.fft.irfft2(whitening.spectrum(covariance, grid), grid)[np.ix_(reach, reach)]
@@ -169,6 +167,14 @@ def _in_deviations(
     share = median_of(np.abs(short[known])) / max(median_of(np.abs(values[known])), 1e-12)
     unit_m = np.maximum(local_sigma(short) / max(share, 1e-3), floor_m)
     return _without_rim(values / unit_m, known), unit_m, known
+
+
+@lru_cache(maxsize=1)
+def _own_covariance(evidence: Evidence) -> np.ndarray:
+    """Return the covariance of a cloud's residuals, in squared deviations, once for all findings of the cloud."""
+    known = np.isfinite(evidence.residual_m)
+    residual_m = np.where(known, evidence.residual_m, 0.0)
+    return _covariance(_in_deviations(residual_m, known.astype(np.float32), (0.0, 0.0))[0], known)
 
 
 def _covariance(noise: np.ndarray, known: np.ndarray) -> np.ndarray:
