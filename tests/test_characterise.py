@@ -108,6 +108,7 @@ def figures_of(folder: Path) -> pd.DataFrame:
 
 
 @pytest.mark.usefixtures("unsaved")
+@pytest.mark.slow  # a long recording
 def test_an_empirical_camera_s_truth_is_found_again(truth, tmp_path, capsys):
     """Noise law, correlation, dropouts, jitter, jumps and pattern within 10 %, and a file that repeats them."""
     paths = [

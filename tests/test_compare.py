@@ -340,6 +340,7 @@ def weaker(study: StudyRecord, by: float, above: float = 1.0, **changed: Any) ->
     return first_set_up(study, inspected=replace(record.inspected, signal=signal, hit=signal > at), **changed)
 
 
+@pytest.mark.slow  # a Monte Carlo campaign
 def test_weaker_signals_and_a_higher_threshold_are_worse_though_a90_is_not():
     """Signals grow so fast with size that the limit moves by less than the margin."""
     one = small(SetUp(a50_mm=7.0, width_mm=0.2), boards=20)

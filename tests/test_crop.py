@@ -124,7 +124,13 @@ def judged(kind: str, seed: int, camera: str, flat: bool = False) -> tuple[bool,
 SURE = [kind for kind in SCENES if kind not in ("hand_in_front", "two_boards", "board_close_before_wall")]
 
 
-@pytest.mark.parametrize("kind", SURE)
+QUICK = "board_before_wall", "board_on_floor", "pipe", "plate_with_large_holes", "bent_sheet"
+"""The others are a campaign of the same kind."""
+
+
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=[] if kind in QUICK else [pytest.mark.slow]) for kind in SURE]
+)
 def test_the_target_of_a_random_scene_is_taken(kind: str) -> None:
     """A warning is no answer here: these scenes have one target."""
     for seed, camera in ((1, "phone"), (2, "l515"), (3, "azure wfov binned")):

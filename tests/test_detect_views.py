@@ -113,7 +113,7 @@ def test_three_views_become_one_cloud_and_the_hole_is_in_its_place(
 
 
 @pytest.mark.usefixtures("unpictured")
-@pytest.mark.parametrize("merge", ("grid", "volume"))
+@pytest.mark.parametrize("merge", ["grid", pytest.param("volume", marks=pytest.mark.slow)])
 def test_every_merge_finds_the_hole(
     views: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], merge: str
 ) -> None:
@@ -129,7 +129,7 @@ def test_every_merge_finds_the_hole(
 
 
 @pytest.mark.usefixtures("unpictured")
-@pytest.mark.parametrize("method", ("icp", "cpd", "joint"))
+@pytest.mark.parametrize("method", ["cpd", *(pytest.param(each, marks=pytest.mark.slow) for each in ("icp", "joint"))])
 def test_other_methods_start_from_the_marks_where_nobody_says_where_views_stand(
     views: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], method: str
 ) -> None:
@@ -370,6 +370,7 @@ def _halves(source: Path, folder: Path) -> list[str]:
 
 
 @pytest.mark.usefixtures("unpictured")
+@pytest.mark.slow  # a real capture, twice
 def test_two_halves_of_a_static_capture_stand_where_they_stood(shared_data: Path, tmp_path: Path) -> None:
     """The camera did not move, so the truth is the identity. The one colour picture serves both halves, so that only
     the marks' ranges differ: the error within the plane is not tested by it."""

@@ -130,6 +130,7 @@ def test_a_half_finished_sweep_resumes_to_the_same_numbers(finished, tmp_path):
     pd.testing.assert_frame_equal(trials(finished), trials(half), check_exact=True)
 
 
+@pytest.mark.slow  # a sweep in a process of its own; test_engine_run interrupts in process
 def test_interrupted_sweep_keeps_what_is_finished_and_says_how_to_go_on(finished, tmp_path):
     """Ctrl-C after the first finished trial of many: exit 130, the journal whole, the command to resume told."""
     cut = tmp_path / "cut"
@@ -258,13 +259,13 @@ name: capture
 source:
   kind: capture
   paths: [{path}]
-capture: {{frames: 12}}
+capture: {{frames: 7}}
 detector:
   name: thesis
   settings: {{crop: {{kind: auto, inset_px: 8}}}}
 threshold: {{k: 5.0}}
 sweep:
-  capture.frames: [1, 12]
+  capture.frames: [1, 7]
 """
 
 
@@ -276,7 +277,7 @@ def test_a_real_capture_is_a_source_of_frames(shared_data, tmp_path):
     assert "left out: " in done.stdout
     assert "00003.png" in done.stdout
     table = pd.read_csv(next((tmp_path / "out").glob("capture/[0-9a-f]*/summary.csv")))
-    assert list(table.frames_used) == [1, 11] and list(table.results_version) == [RESULTS_VERSION] * 2
+    assert list(table.frames_used) == [1, 6] and list(table.results_version) == [RESULTS_VERSION] * 2
     assert len(list((tmp_path / "out").glob("capture/[0-9a-f]*/point-*/findings.csv"))) == 2
 
 

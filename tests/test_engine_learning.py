@@ -181,6 +181,7 @@ def test_a_study_over_units_states_the_limit_of_a_new_unit_beside_that_of_one(ov
     assert set_up.beside is not None and set_up.beside.area_m2.sum() == pytest.approx(3 * 4 * 0.054, rel=0.05)
 
 
+@pytest.mark.slow  # shards without units are compared above
 def test_units_in_shards_give_the_same_record(over_units, study_out, tmp_path):
     assert study_of(study_out, tmp_path, UNITS, *ONE_FRAME, shards=2).to_data() == over_units[1].to_data()
 
@@ -192,6 +193,7 @@ def test_one_unit_is_said_first(study_out, tmp_path):
     assert "new unit (mm)" not in limits_grid([one]).heads
 
 
+@pytest.mark.slow  # three studies
 def test_one_blob_of_one_unit_decides_its_calibration_and_units_spread_it(study_out, tmp_path):
     """With a fixed pattern alone, without noise, the same pixels of one unit are loudest on most boards."""
     asked = ("source.camera.effects={noise: false}", *ONE_FRAME)

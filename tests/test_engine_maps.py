@@ -132,7 +132,7 @@ repeats: 1
 sweep:
   mapping.views: [1, 3]
   mapping.registration.method: [cpd, marks]
-  mapping.merge.kind: [grid, fusion]
+  mapping.merge.kind: [fusion]
 sensitivity:
   repeats: 1
   frames: [2]

@@ -140,6 +140,7 @@ def test_written_read_back_and_detected_is_equal_bit_for_bit(
 
 
 @pytest.mark.usefixtures("unpictured")
+@pytest.mark.slow  # the readers' tests compare both storages
 def test_the_program_finds_the_same_in_either_storage(exports: dict[str, Path], tmp_path: Path) -> None:
     for form in ("ros2", "mcap"):
         bag = exports[form] / "view_00"

@@ -53,6 +53,7 @@ def test_the_table_has_the_statistics_of_the_full_model(name):
         assert kept == pytest.approx(seen, abs=0.01)
 
 
+@pytest.mark.slow  # a Monte Carlo campaign
 def test_too_little_light_and_ranges_out_of_reach_return_nothing():
     table = table_of("azure_kinect_nfov")
     noise, rng = DepthNoise(table), np.random.default_rng(1)

@@ -49,6 +49,7 @@ def test_without_real_targets_the_prior_remains():
     assert before.a90_95 > 1.5 * before.a90
 
 
+@pytest.mark.slow  # a Monte Carlo campaign
 def test_agreement_is_as_rare_as_it_says():
     """P-values of campaigns whose truth is the simulated curve: 5 % and fewer lie below 0.05 (binomial, 3 sigma)."""
     curve, size = simulated(), np.linspace(2.0, 12.0, 20)

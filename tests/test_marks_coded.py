@@ -111,6 +111,7 @@ def test_a_dictionary_that_opencv_lacks_is_refused_with_those_it_has():
         CodedMarks(dictionary="DICT_9X9_1")
 
 
+@pytest.mark.slow  # a real capture
 def test_the_real_plate_shows_its_tags(shared_data: Path):
     cloud = average(open_capture([shared_data / "azure_drilled_board"]), AverageConfig())
     inside = crop(cloud, AutoCrop())

@@ -116,11 +116,12 @@ def test_holes_that_show_a_backing_of_another_colour_are_no_marks(backing):
 @pytest.mark.parametrize(
     ("sigma_m", "samples", "turn_deg", "half_size"),
     [
-        pytest.param(5e-5, 1, 4.0, (0.02, 0.006), id="pixelation", marks=pytest.mark.slow),
-        pytest.param(5e-4, 1, 15.0, (0.008, 0.008), id="turned squares", marks=pytest.mark.slow),
+        pytest.param(5e-5, 1, 4.0, (0.02, 0.006), id="pixelation"),
+        pytest.param(5e-4, 1, 15.0, (0.008, 0.008), id="turned squares"),
         pytest.param(2e-3, 3, 4.0, (0.02, 0.006), id="mixed colours, depth noise"),
     ],
 )
+@pytest.mark.slow  # a Monte Carlo campaign
 def test_the_stated_covariance_is_that_of_the_errors(sigma_m, samples, turn_deg, half_size):
     rng = random_stream(4, "covariance", sigma_m, samples)
     squares, across, stated = [], [], []

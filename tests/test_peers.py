@@ -49,7 +49,7 @@ def made(name: str, **settings: Any) -> Detector:
     return learned() if name == "fpfh_memory" else load_detector(name, {**WHOLE, **settings})
 
 
-@pytest.mark.parametrize("name", ["plane_ransac", "m3c2", "fpfh_memory"])
+@pytest.mark.parametrize("name", ["plane_ransac", "m3c2", pytest.param("fpfh_memory", marks=pytest.mark.slow)])
 def test_they_keep_the_contract(name: str) -> None:
     """On a part of a plane with a hole of 20 mm, some of whose pixels have no range."""
     cloud = part(with_gaps(plane(3), seed=4), slice(10, 50), slice(10, 50))

@@ -89,7 +89,9 @@ def test_a_part_is_found_where_it_lies(tmp_path: Path, turn_deg: tuple[float, fl
     assert np.nanmedian(np.abs(level(points) - points[:, 2])) == pytest.approx(0.6745 * 0.5 * MM, rel=0.15)
 
 
-@pytest.mark.parametrize("detector", ["local", pytest.param("thesis", marks=pytest.mark.slow), "m3c2"])
+@pytest.mark.parametrize(
+    "detector", ["local", pytest.param("thesis", marks=pytest.mark.slow), pytest.param("m3c2", marks=pytest.mark.slow)]
+)
 def test_only_damage_differs_from_the_mesh(tmp_path: Path, detector: str) -> None:
     path, T = casting(tmp_path / "casting.stl"), stood((6, -8, 3))
     cloud = seen(path, T, 0.5, dent_mm=3.0)

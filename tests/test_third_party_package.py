@@ -88,6 +88,7 @@ def test_it_is_listed_with_its_package_and_what_is_broken_is_said_to_be(python: 
     assert cameras["acme_tof"]["title"] == "Acme ToF 1" and cameras["acme_tof"]["package"] == "acme-inspection"
 
 
+@pytest.mark.slow  # a sweep in a process of its own; the listing shows that both are found
 def test_an_experiment_sweeps_with_its_detector_and_its_camera(python: Path, tmp_path: Path) -> None:
     (tmp_path / "x.yaml").write_text(SWEEP)
     done = program(python, "harness.sweep", str(tmp_path / "x.yaml"), "--out", str(tmp_path / "out"), "--jobs", "1")

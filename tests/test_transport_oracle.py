@@ -82,6 +82,7 @@ def test_a_corner(histogram):
 
 
 @BOTH
+@pytest.mark.slow  # a long reference; the corner is the quick one
 def test_inside_a_blind_hole(histogram):
     target = build_target(
         TargetConfig.from_data(

@@ -223,6 +223,7 @@ def test_every_quantity_has_a_unit_in_its_name_and_is_on_file():
         assert in_words(quantity.conditions())
 
 
+@pytest.mark.slow  # processes of their own; the engine's tests compare them too
 def test_numbers_do_not_depend_on_processes_or_order(tmp_path):
     quantity = QUANTITIES["temporal_sigma_mm"]
     requests = [(AZURE, quantity.name, quantity.conditions(albedo=albedo)) for albedo in (0.1, 0.3)]

@@ -82,6 +82,7 @@ def test_the_edge_is_found_and_its_widths_agree(step):
 
 
 @pytest.mark.usefixtures("unsaved")
+@pytest.mark.slow  # a simulated recording of its own
 def test_a_mask_leaves_pixels_out(tmp_path):
     capture = recorded(tmp_path / "frames", plane_view(AZURE, REGION, 1.0, 0.8, 0.05, 0.02))
     mask = np.zeros((576, 640), np.uint8)
