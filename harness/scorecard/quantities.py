@@ -224,11 +224,17 @@ def _left_of_patches(z_m: np.ndarray, n: int) -> np.ndarray:
     return np.asarray((patches - plane @ np.linalg.lstsq(plane, patches)[0]).T.reshape(-1, n, n))
 
 
+@lru_cache(maxsize=4)
+def _single_frames(bench: Bench, c: PlaneConditions) -> tuple[np.ndarray, ...]:
+    """One frame's z (h, w) of each of several units, kept for all patches of this plane."""
+    units = range(1, bench.effort.few_frames + 1)
+    return tuple(plane_stack(bench, c, PATTERNED, 1, unit, PATTERN_PATCH).z_m[0] for unit in units)
+
+
 def _patch_products(bench: Bench, c: PatchConditions) -> tuple[np.ndarray, np.ndarray]:
     """(units, patches): variance about each patch's own plane in one frame, mm^2, and mean product so far apart."""
     n, k, found = c.patch_px, c.apart_px, []
-    for unit in range(1, bench.effort.few_frames + 1):
-        z_m = plane_stack(bench, _plane(c), PATTERNED, 1, unit, PATTERN_PATCH).z_m[0]
+    for z_m in _single_frames(bench, _plane(c)):
         stored_m = np.round(z_m / (c.rounded_mm * MM)) * (c.rounded_mm * MM) if c.rounded_mm else z_m
         left = _left_of_patches(stored_m, n)
         beside, below = left[:, :, k:] * left[:, :, : n - k], left[:, k:] * left[:, : n - k]

@@ -10,6 +10,7 @@ from itertools import count
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
+import scipy.fft
 from scipy import ndimage
 
 from harness.vocabulary.geometry import MM, Reason, Region
@@ -66,12 +67,14 @@ def rays_of(slopes: np.ndarray, offset_m: np.ndarray) -> tuple[np.ndarray, np.nd
 
 def smooth_field(white: np.ndarray, length_px: float) -> np.ndarray:
     """Smooth white noise (h, w) to unit variance and autocorrelation exp(-k^2 / 2 length^2), periodic."""
-    s = length_px / np.sqrt(2)
-    smooth, power = ndimage.gaussian_filter(white, s, mode="wrap"), []
+    responses = []
     for size in white.shape:
-        impulse = np.eye(1, size)[0]
-        power.append(float((ndimage.gaussian_filter1d(impulse, s, mode="wrap") ** 2).sum()))
-    return np.asarray(smooth / np.sqrt(np.prod(power)))
+        response = ndimage.gaussian_filter1d(np.eye(1, size)[0], length_px / np.sqrt(2), mode="wrap")
+        responses.append(scipy.fft.fft(response / np.linalg.norm(response)).astype(np.complex64))
+    down, across = responses
+    spectrum = scipy.fft.rfft2(white)
+    smooth = scipy.fft.irfft2(spectrum * down[:, None] * across[: spectrum.shape[1]], white.shape)
+    return np.asarray(smooth, float)
 
 
 SPECTRUM, LEAST_POWER, FAINT = 256, 1e-3, 0.05
