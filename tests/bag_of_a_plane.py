@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import struct
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,15 @@ import recorded_plane as plane
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
 
-TYPES = get_typestore(Stores.ROS2_HUMBLE)
-ROS1 = get_typestore(Stores.ROS1_NOETIC)
+
+@cache
+def types_of(store: Stores = Stores.ROS2_HUMBLE) -> Typestore:
+    """The message types, read once: every process that collects tests would read them at the import."""
+    return get_typestore(store)
+
+
 CODES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 CLOUD = "sensor_msgs/msg/PointCloud2"
 INFO = "sensor_msgs/msg/CameraInfo"
@@ -25,8 +32,8 @@ PACKED = "sensor_msgs/msg/CompressedImage"
 
 
 def header(frame: str = "depth_camera_link") -> Any:
-    time = TYPES.types["builtin_interfaces/msg/Time"](sec=12, nanosec=34)
-    return TYPES.types["std_msgs/msg/Header"](stamp=time, frame_id=frame)
+    time = types_of().types["builtin_interfaces/msg/Time"](sec=12, nanosec=34)
+    return types_of().types["std_msgs/msg/Header"](stamp=time, frame_id=frame)
 
 
 def cloud(
@@ -63,14 +70,14 @@ def cloud(
         values["rgb"] = 0xFF000000 | r << 16 | g << 8 | b
     rows = values.view(np.uint8).reshape(height, width * step)
     data = np.concatenate([rows, np.full((height, row_padding), 171, np.uint8)], axis=1).ravel()
-    field = TYPES.types["sensor_msgs/msg/PointField"]
+    field = types_of().types["sensor_msgs/msg/PointField"]
     declared = [packed_as if name == "rgb" else kind_ for name, kind_ in zip(names, types, strict=True)]
     fields = [
         field(name=n, offset=o, datatype=CODES[t], count=1)
         for n, o, t in zip(names, offsets, declared, strict=True)
         if n != leave_out
     ]
-    return TYPES.types[CLOUD](
+    return types_of().types[CLOUD](
         header=header(),
         height=height,
         width=width,
@@ -89,8 +96,10 @@ def info(
     """The plane's lens as CameraInfo, its centre moved by ``shift_px``."""
     matrix = plane.LENS.matrix.copy()
     matrix[0, 2] += shift_px
-    roi = TYPES.types["sensor_msgs/msg/RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
-    return TYPES.types[INFO](
+    roi = types_of().types["sensor_msgs/msg/RegionOfInterest"](
+        x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+    )
+    return types_of().types[INFO](
         header=header(),
         height=plane.LENS.height,
         width=width,
@@ -106,7 +115,7 @@ def info(
 
 
 def image() -> Any:
-    return TYPES.types[IMAGE](
+    return types_of().types[IMAGE](
         header=header(), height=1, width=1, encoding="mono8", is_bigendian=0, step=1, data=np.zeros(1, np.uint8)
     )
 
@@ -118,7 +127,7 @@ def depth_image(stored_mm: np.ndarray, encoding: str = "16UC1", big: bool = Fals
     rows = np.ascontiguousarray(values.astype((">" if big else "<") + kind)).view(np.uint8)
     rows = np.pad(rows, ((0, 0), (0, padding)), constant_values=171)
     height, width = stored_mm.shape
-    return TYPES.types[IMAGE](
+    return types_of().types[IMAGE](
         header=header(),
         height=height,
         width=width,
@@ -141,7 +150,7 @@ def packed_depth(stored_mm: np.ndarray, encoding: str = "16UC1", form: str = "pn
     content = cv2.imencode(".png", values)[1].tobytes() if form == "png" else rvl(values)
     data = struct.pack("<iff", 0, a, b) + content
     name = f"{encoding}; compressedDepth {form}"
-    return TYPES.types[PACKED](header=header(), format=name, data=np.frombuffer(data, np.uint8))
+    return types_of().types[PACKED](header=header(), format=name, data=np.frombuffer(data, np.uint8))
 
 
 def rvl(values: np.ndarray) -> bytes:
@@ -174,7 +183,7 @@ def rvl(values: np.ndarray) -> bytes:
 
 
 def number(value: float) -> Any:
-    return TYPES.types["std_msgs/msg/Float32"](data=value)
+    return types_of().types["std_msgs/msg/Float32"](data=value)
 
 
 def write_ros1(path: Path, messages: Sequence[tuple[str, str, Any]], compression: str | None = None) -> Path:
@@ -186,8 +195,8 @@ def write_ros1(path: Path, messages: Sequence[tuple[str, str, Any]], compression
         made: dict[str, Any] = {}
         for i, (topic, kind, message) in enumerate(messages):
             if topic not in made:
-                made[topic] = writer.add_connection(topic, kind, typestore=ROS1)
-            content = ROS1.serialize_ros1(_in_ros1(message), kind)
+                made[topic] = writer.add_connection(topic, kind, typestore=types_of(Stores.ROS1_NOETIC))
+            content = types_of(Stores.ROS1_NOETIC).serialize_ros1(_in_ros1(message), kind)
             writer.write(made[topic], 10**9 + i * 33_333_333, content)
     return path
 
@@ -196,7 +205,7 @@ def _in_ros1(message: Any) -> Any:
     """A message of ROS 2 as one of ROS 1."""
     if not hasattr(message, "__msgtype__"):
         return [_in_ros1(one) for one in message] if isinstance(message, list) else message
-    kind = ROS1.types[message.__msgtype__]
+    kind = types_of(Stores.ROS1_NOETIC).types[message.__msgtype__]
     values = {name: _in_ros1(getattr(message, name, getattr(message, name.lower(), 0))) for name in _names(kind)}
     return kind(**values)
 
@@ -219,8 +228,8 @@ def write_bag(
         made: dict[str, Any] = {}
         for i, (topic, kind, message) in enumerate(messages):
             if topic not in made:
-                made[topic] = writer.add_connection(topic, kind, typestore=TYPES)
-            writer.write(made[topic], 10**9 + i * 33_333_333, TYPES.serialize_cdr(message, kind))
+                made[topic] = writer.add_connection(topic, kind, typestore=types_of())
+            writer.write(made[topic], 10**9 + i * 33_333_333, types_of().serialize_cdr(message, kind))
     return folder
 
 

@@ -127,17 +127,18 @@ def slam(noise_mm, size_mm, place_mm, first=6):
 
 
 @pytest.mark.parametrize(
-    ("found", "expected"),
+    ("numbers", "expected"),
     [
-        (slam(1.0, 2.0, 5.0), "borne out"),
-        (slam(0.1, 2.0, 5.0), "not borne out"),  # less noise
-        (slam(1.0, 0.01, 5.0), "not borne out"),  # better sizes
-        (slam(1.0, 2.0, 0.01), "not borne out"),  # better places
-        (slam(1.0, 2.0, 0.6), "undecided"),
-        (slam(1.0, 2.0, 5.0, first=12), "borne out"),  # it finds no hole at all
+        ((1.0, 2.0, 5.0), "borne out"),
+        ((0.1, 2.0, 5.0), "not borne out"),  # less noise
+        ((1.0, 0.01, 5.0), "not borne out"),  # better sizes
+        ((1.0, 2.0, 0.01), "not borne out"),  # better places
+        ((1.0, 2.0, 0.6), "undecided"),
+        ((1.0, 2.0, 5.0, 12), "borne out"),  # it finds no hole at all
     ],
 )
-def test_c10(found, expected):
+def test_c10(numbers, expected):
+    found = slam(*numbers)
     assert verdict("C10", in_units(found)).verdict == expected
     assert verdict("C10", in_units(found, 2)).verdict == "undecided"
 
@@ -169,19 +170,19 @@ def mapped(noise, size, first=4, exposures=None):
 
 
 @pytest.mark.parametrize(
-    ("found", "expected"),
+    ("numbers", "expected"),
     [
-        (mapped(0.3, -0.5), "borne out"),
-        (mapped(0.3, -0.5, exposures=0.15), "borne out"),
-        (mapped(0.3, -0.5, exposures=0.03), "not borne out"),  # the long exposure has less noise
-        (mapped(0.3, 0.5), "not borne out"),
-        (mapped(1.5, -0.5), "not borne out"),
-        (mapped(0.3, -0.5, first=5), "not borne out"),  # a hole fewer
-        (mapped(1.0, 0.0), "undecided"),
+        (dict(noise=0.3, size=-0.5), "borne out"),
+        (dict(noise=0.3, size=-0.5, exposures=0.15), "borne out"),
+        (dict(noise=0.3, size=-0.5, exposures=0.03), "not borne out"),  # the long exposure has less noise
+        (dict(noise=0.3, size=0.5), "not borne out"),
+        (dict(noise=1.5, size=-0.5), "not borne out"),
+        (dict(noise=0.3, size=-0.5, first=5), "not borne out"),  # a hole fewer
+        (dict(noise=1.0, size=0.0), "undecided"),
     ],
 )
-def test_h1(found, expected):
-    assert verdict("H1", found).verdict == expected
+def test_h1(numbers, expected):
+    assert verdict("H1", mapped(**numbers)).verdict == expected
 
 
 def test_h1_says_against_what_it_was_held():

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
-from sklearn.metrics import auc, roc_auc_score, roc_curve
 
 from harness import compare, score
 from harness.evaluation.study.record import read_record
@@ -49,6 +48,8 @@ def map_of(maps: Path, name: str) -> np.ndarray:
 
 
 def test_areas_are_those_of_scikit_learn(folder, maps, tmp_path):
+    from sklearn.metrics import auc, roc_auc_score, roc_curve
+
     assert run(maps, folder, tmp_path / "out", *RATE) == 0
     scores, damaged, weights, boards = [], [], [], []
     for name in (name for name in names_in(folder) if "/test/" in name):
