@@ -13,7 +13,7 @@ that the data hardly distinguish from the best (`near_models`): 95.6 to 99 % (``
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -189,6 +189,13 @@ def value_and_gradient(data: HitsAndMisses, place: np.ndarray) -> tuple[float, n
     return float(data.hits @ np.log(p_hit) + data.misses @ np.log(p_miss)), gradient
 
 
+def _of_shares(data: HitsAndMisses, share: np.ndarray, miss: np.ndarray, floor: float, ceiling: float) -> np.ndarray:
+    """Log-likelihoods (m,) of curves between floor and ceiling that hit and miss these shares (m, n) of the way."""
+    p_hit = np.maximum(floor + (ceiling - floor) * share, 1e-300)
+    p_miss = np.maximum((1.0 - ceiling) + (ceiling - floor) * miss, 1e-300)
+    return np.asarray(np.log(p_hit) @ data.hits + np.log(p_miss) @ data.misses)
+
+
 def _search(
     data: HitsAndMisses, plain: np.ndarray, floor: tuple[float, float], ceiling: tuple[float, float]
 ) -> tuple[np.ndarray, float]:
@@ -205,15 +212,17 @@ def _search(
         value, gradient = value_and_gradient(data, place)
         return -value, -gradient
 
-    def least(places: Iterable[np.ndarray]) -> tuple[float, list[float]]:
-        return min((loss(at)[0], at.tolist()) for at in places)
-
-    levels = list(product(floors, ceilings))
-    best = sorted(least(np.array([-b1 * m, min(b1, STEEPEST), f, c]) for f, c in levels) for m, b1 in rises)
+    middle, slope = np.array(rises).T
+    along = np.stack([-slope * middle, np.minimum(slope, STEEPEST)], axis=1)
+    share, miss, _ = np.exp(logs_of_link(data.link, along @ data.design.T))
+    levels = np.array([*product(floors, ceilings)])
+    values = np.array([_of_shares(data, share, miss, *level) for level in levels.tolist()])
+    best = np.argsort(-values.max(axis=0), kind="stable")[:STARTS]
+    starts = np.hstack([along[best], levels[values.argmax(axis=0)[best]]])
     limits = ((-STEEPEST * 10, STEEPEST * 10), (1e-6, STEEPEST), floor, ceiling)
     how: dict[str, Any] = {"jac": True, "method": "L-BFGS-B", "bounds": limits}
     how["options"] = {"ftol": 1e-13, "gtol": 1e-8, "maxiter": 500}
-    ends = (optimize.minimize(loss, start, **how) for _, start in best[:STARTS])
+    ends = (optimize.minimize(loss, start, **how) for start in starts)
     likeliest = min(ends, key=lambda end: end.fun)
     return likeliest.x, -float(likeliest.fun)
 
