@@ -1,9 +1,8 @@
 """A unit's fixed pattern as a map over its sensor: its file, and the correction of a cloud by it.
 
-The pattern is taken for an error of range along each pixel's ray that is the same in every capture. Not modelled: a
-pattern that changes with distance, temperature or brightness (`detectors.flat_captures` tests the first two), and what
-a depth engine's filter mixes at the edge of a hole.
-"""
+The pattern is assumed to be a range error along each pixel's ray that is the same in every capture. Not modelled: a
+pattern that changes with distance, temperature or brightness (`detectors.flat_captures` tests the first two), and the
+mixing of pixels by a depth engine's filter at the edge of a hole."""
 
 from __future__ import annotations
 
@@ -33,7 +32,7 @@ AGAIN = "run python -m harness.flatfield on captures of this camera in this mode
 
 
 class FlatFieldConfig(Config):
-    """A flat field to record: ``frames`` of a plane across the axis, ``distance_m`` away."""
+    """A flat field to record: ``frames`` of a plane across the optical axis at ``distance_m``."""
 
     frames: int = Field(ge=LEAST_FRAMES, le=10_000)
     distance_m: float = Field(gt=0, le=100)

@@ -181,13 +181,14 @@ def reference() -> str:
     for title, keys in sections.items():
         lines += ["", f"## {title}"]
         places: dict[str, list[str]] = {}
-        for path, slot in keys:
+        for path, slot, model in keys:
             place, _, key = path.rpartition(".")
             default, note = default_at(slot), (slot.field.description if slot.field else "") or ""
             legal = "a mapping" if slot.models else (legal_at(slot) or "any value").removesuffix(f" ({note})")
             cells = f"`{key}`", legal, plain(default[0]) if default else "required", note
             row = "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
-            places.setdefault(place, ["| key | legal | default | meaning |", "|---|---|---|---|"]).append(row)
+            head = inspect.cleandoc(model.__doc__ or ""), "", "| key | legal | default | meaning |", "|---|---|---|---|"
+            places.setdefault(place, [*head]).append(row)
         for place, rows in places.items():
             lines += ["", *([f"### `{place}`", ""] if place else []), *rows]
     return "\n".join(lines)

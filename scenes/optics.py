@@ -169,12 +169,12 @@ class NoiseFreeView:
 
 
 class RenderConfig(Config):
-    """Effort for the indirect light. ``bounces`` 0 leaves direct light only."""
+    """Effort for the simulation of indirect light. ``bounces: 0`` leaves direct light only."""
 
     bounces: int = Field(10, ge=0, le=32, description="reflections beyond the first; albedo 0.6 leaves 0.4 % after 10")
-    face_spacing_mm: float = Field(80.0, gt=0, description="grid of nodes on the face")
-    face_samples: int = Field(8192, ge=8, description="paths for each node on the face")
-    hole_noise_mm: float = Field(0.1, gt=0, description="deviation of range, aimed at in pixels off the face")
-    hole_samples: int = Field(8192, ge=8, description="paths for each of those pixels at most")
-    rest_samples: int = Field(16, ge=8, description="paths for each pixel around the board")
+    face_spacing_mm: float = Field(80.0, gt=0, description="spacing of the nodes on the face")
+    face_samples: int = Field(8192, ge=8, description="light paths for each node on the face")
+    hole_noise_mm: float = Field(0.1, gt=0, description="aim for the noise of range in pixels off the face")
+    hole_samples: int = Field(8192, ge=8, description="most light paths for each of those pixels")
+    rest_samples: int = Field(16, ge=8, description="light paths for each pixel around the board")
     seed: int = Field(1, ge=0, le=1_000_000)

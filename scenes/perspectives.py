@@ -70,8 +70,8 @@ MAX_VIEWS = 200
 
 
 class _Guess(Config):
-    """Error of the nominal pose of every view but the first, from which a registration starts: turned about a random
-    axis through the target's centre, and shifted in a random direction."""
+    """Errors of the nominal poses, from which a registration starts. Every nominal pose but the first is rotated about
+    a random axis through the target's centre, and shifted in a random direction."""
 
     guess_error_deg: Annotated[float, Field(ge=0.0, le=45.0)] = 3.0
     guess_error_mm: Annotated[float, Field(ge=0.0, le=500.0)] = 10.0
@@ -80,36 +80,36 @@ class _Guess(Config):
 
 class _Spread(_Guess):
     count: Annotated[int, Field(ge=1, le=MAX_VIEWS)]
-    spread_deg: Annotated[float, Field(gt=0.0, le=120.0)] = Field(description="from the outermost view to the opposite")
-    distance_jitter_mm: float = Field(0.0, ge=0.0, le=500.0, description="deviation of distances; not of the first")
-    aim_jitter_mm: float = Field(0.0, ge=0.0, le=500.0, description="the same of aims, sideways and upwards")
+    spread_deg: Annotated[float, Field(gt=0.0, le=120.0)] = Field(description="angle between the outermost views")
+    distance_jitter_mm: float = Field(0.0, ge=0.0, le=500.0, description="deviation of distances but the first")
+    aim_jitter_mm: float = Field(0.0, ge=0.0, le=500.0, description="deviation of the aim, to the sides and up or down")
 
 
 class ArcViews(_Spread):
-    """Views on an arc about the target's centre. The first is the target's own pose, then come the ends, then the
-    middles of what is left, nearer ones first: fewer views are always the first of more."""
+    """Views on an arc about the target's centre. The first is the target's own pose; then come the ends, then the
+    middles of the gaps, nearest first, so that fewer views are always the first of more."""
 
     kind: Literal["arc"]
-    about: Literal["x", "y"] = Field("y", description="board axis about which the arc turns")
+    about: Literal["x", "y"] = Field("y", description="the board's axis about which the arc turns")
 
 
 class GridViews(_Spread):
-    """Views on a square grid of two angles, in the same order: centre, corners and edges, then ever finer."""
+    """Views on a square grid of two angles: first the centre, then corners and edges, then ever finer."""
 
     kind: Literal["grid"]
 
 
 class HandHeldViews(_Guess):
-    """A walk about the target's own pose, each co-ordinate a sum of three slow sines; the order is that in time."""
+    """A hand-held walk about the target's own pose: each co-ordinate is a sum of three slow sines over time."""
 
     kind: Literal["hand_held"]
     count: Annotated[int, Field(ge=1, le=MAX_VIEWS)]
-    sway_deg: Annotated[float, Field(ge=0.0, le=60.0)] = Field(10.0, description="greatest turn about each axis")
-    sway_mm: Annotated[float, Field(ge=0.0, le=500.0)] = Field(40.0, description="greatest shift along each axis")
+    sway_deg: Annotated[float, Field(ge=0.0, le=60.0)] = Field(10.0, description="largest rotation about each axis")
+    sway_mm: Annotated[float, Field(ge=0.0, le=500.0)] = Field(40.0, description="largest shift along each axis")
 
 
 class ListedViews(_Guess):
-    """Poses of the target as they are listed; the first is the reference."""
+    """Views at the listed poses of the target; the first is the reference."""
 
     kind: Literal["list"]
     poses: Annotated[tuple[PoseConfig, ...], Field(min_length=1, max_length=MAX_VIEWS)]
