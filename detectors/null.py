@@ -8,8 +8,7 @@ the maxima of normal noise in two dimensions are more. The data weigh the expone
 scales are integrated out.
 
 Not modelled: noise that is not symmetric beyond what `skew_of` sees in the core; damage towards the camera that is no
-larger than the noise; objects on clouds without a grid, or that neither stand out nor are seen in a picture.
-"""
+larger than the noise; objects on clouds without a grid, or that neither stand out nor are seen in a picture."""
 
 from __future__ import annotations
 

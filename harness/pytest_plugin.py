@@ -3,9 +3,8 @@
     def test_the_limit_holds(tofpod_gate):
         tofpod_gate("limit.yaml")
 
-runs the study beside the test and compares it with ``limit.baseline.json`` there, as `harness.check` does.
-``pytest --tofpod-update`` writes the baseline. Renders and finished trials are kept in pytest's cache folder.
-"""
+runs the study beside the test and compares it with ``limit.baseline.json`` there, as `harness.check` does. ``pytest
+--tofpod-update`` writes the baseline. Renders and finished trials are kept in pytest's cache folder."""
 
 from __future__ import annotations
 

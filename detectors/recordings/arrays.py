@@ -4,8 +4,7 @@ numbers too.
 The libraries that read them run within `files.limited_memory`. Arrays of objects, which would need pickle, are refused.
 A height map's pixels lie a stated pitch apart, and it is a cloud in parallel projection: x and y count from its middle,
 and z, which points away from the viewer, is `DISTANCE_M` at the median height. Without a stated unit, micrometres,
-millimetres or metres are taken, whichever gives the relief a plausible part of the extent.
-"""
+millimetres or metres are taken, whichever gives the relief a plausible part of the extent."""
 
 from __future__ import annotations
 

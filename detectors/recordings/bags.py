@@ -2,8 +2,7 @@
 
 ``rosbags`` unpacks chunks whole: it runs within `files.limited_memory`. A depth image needs the CameraInfo that its
 driver publishes beside it. Where rays of a CameraInfo pass through a cloud's points, z and that lens are used: a
-pixel's ray is then the same in all frames.
-"""
+pixel's ray is then the same in all frames."""
 
 from __future__ import annotations
 

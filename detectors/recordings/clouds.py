@@ -3,8 +3,7 @@
 Open3D drops the grid and fills a cut PLY up with zeros, so the header is read here: a PCD is organised where HEIGHT >
 1, a PLY where it states num_cols and num_rows. A list has a point a line: x y z, then an intensity, or red green blue,
 or both; a line of names may say otherwise. Its grid is stated by a comment or a first line of two whole numbers, or
-told by a lens with as many pixels, or a sensor's usual size on which x/z and y/z rise evenly.
-"""
+told by a lens with as many pixels, or a sensor's usual size on which x/z and y/z rise evenly."""
 
 from __future__ import annotations
 

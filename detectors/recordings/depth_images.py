@@ -2,8 +2,7 @@
 
 What decides the layout: a sub-folder ``depth`` (with ``color`` or ``rgb`` beside it), names that hold "depth", names
 that are numbers, else every 16-bit grey PNG. A ``depth.txt`` beside marks TUM RGB-D. A picture's kind is told by its
-first bytes, and Pillow reads its header: OpenCV would decode a header of 30,000 x 30,000 pixels into gigabytes.
-"""
+first bytes, and Pillow reads its header: OpenCV would decode a header of 30,000 x 30,000 pixels into gigabytes."""
 
 from __future__ import annotations
 

@@ -2,8 +2,7 @@
 
 k4arecorder writes tracks titled COLOR, DEPTH and IR (16-bit big-endian grey, depth in millimetres, 0 = none) and
 attaches the factory calibration. Phones store ARKit's depth, a confidence 0 to 2 of each pixel (0 is no return), the
-lens of the colour camera, and poses, by which the program warns of movement.
-"""
+lens of the colour camera, and poses, by which the program warns of movement."""
 
 from __future__ import annotations
 

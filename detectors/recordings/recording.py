@@ -59,8 +59,7 @@ class Recording:
     ``read`` yields the frames in order; each call starts again. ``shape``: (height, width). ``files``: all whose
     content can change a number. ``scale_m``: metres in one stored unit, and ``unit_from`` who says so: "" where the
     data shall decide. ``notes``: how the files were understood. ``warnings``: full sentences on what makes the
-    distances doubtful; every program shows them first. ``selection`` picks frames.
-    """
+    distances doubtful; every program shows them first. ``selection`` picks frames."""
 
     name: str
     read: Callable[[], Iterator[Frame]]

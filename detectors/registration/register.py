@@ -2,8 +2,7 @@
 
 Errors that a whole view shares (an offset, wiggling, the lens) show as a distance between registered views that noise
 does not explain. They widen the covariance and are noted; a view is refused only where they would blur the merged map
-by more than `BLUR_M`, or by more than a pixel where pixels are coarser.
-"""
+by more than `BLUR_M`, or by more than a pixel where pixels are coarser."""
 
 from __future__ import annotations
 
