@@ -108,8 +108,8 @@ def own_threshold(detector: Detector, cloud: Cloud, evidence: Evidence, false_ca
         share = f"{100 * hidden / known.sum():.0f} % of what is judged"
         doubts.append(f"{share} lies under or beside objects, and the rest may not stand for the whole")
     expected, searched = 2.0 * tail.expected(threshold), _only(evidence, ~rim)
-    told = (tail.peaks, tail.floor, objects, int(rim.sum()))
-    return OwnThreshold(threshold, expected, low, high, *told, searched, tuple(doubts))
+    counts = (tail.peaks, tail.floor, objects, int(rim.sum()))
+    return OwnThreshold(threshold, expected, low, high, *counts, searched, tuple(doubts))
 
 
 def each_object_once(cloud: Cloud, evidence: Evidence, found: tuple[Detection, ...]) -> tuple[Detection, ...]:

@@ -149,8 +149,8 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
         notes |= {"points": len(points), "registration_error_m": error_m, "without_counterpart": alone}
         residual_m, z_m = (on_grid(each, mask) for each in (points[:, 2] - feet[:, 2], feet[:, 2]))
         scale_m = median_of(deviation_m[judged])
-        told = tuple(filter(None, warnings))
-        return Evidence(np.abs(signed), residual_m, z_m, scale_m, notes, told, behind=signed > 0)
+        doubts = tuple(filter(None, warnings))
+        return Evidence(np.abs(signed), residual_m, z_m, scale_m, notes, doubts, behind=signed > 0)
 
     def places(self, points_m: np.ndarray) -> np.ndarray:
         """Return the places across the view, so that a rim and what lies deep behind it are one finding."""

@@ -144,8 +144,8 @@ def _answer(options: argparse.Namespace, surfaces: Sequence[LimitSurface], title
     for text in _warnings(row.surface.camera for row in rows):
         print(f"warning: {text}")
     verdicts = [row.answer.verdict(size_mm) for row in rows]
-    said = ", ".join(f"{name} for {verdicts.count(name)}" for name in ("no", "undecided") if name in verdicts)
-    of_all = f"{verdicts.count('yes')} of {many(len(rows), 'set-up')}" + (f" ({said})." if said else ".")
+    others = ", ".join(f"{name} for {verdicts.count(name)}" for name in ("no", "undecided") if name in verdicts)
+    of_all = f"{verdicts.count('yes')} of {many(len(rows), 'set-up')}" + (f" ({others})." if others else ".")
     asked_for = f"{damage_words(kind).capitalize()}s of {size_mm:g} mm at {distance_m:g} m"
     answer = f"{asked_for} are found nine times out of ten in {of_all}"
     errors = [row.surface.error for row in rows if np.isfinite(row.surface.error)]
@@ -172,9 +172,9 @@ def _chosen(options: argparse.Namespace, surfaces: Sequence[LimitSurface], kind:
             legal = [*(word for word, kind in KINDS.items() if name == "kind" and kind in there), *there]
             near = nearest(unknown[0], (*legal, *(KINDS if name == "kind" else ())))
             meant = f"; did you mean {near!r}?" if near and near != unknown[0] else ""
-            said = f"{option} {options.damage if name == 'kind' else ', '.join(unknown)}: not in the atlas{meant}"
+            what = f"{option} {options.damage if name == 'kind' else ', '.join(unknown)}: not in the atlas{meant}"
             fix = "run a study of damage that is not in the atlas, such as tofpod sweep crack"
-            raise UserError(said, legal=", ".join(legal), fix=fix if name == "kind" else None)
+            raise UserError(what, legal=", ".join(legal), fix=fix if name == "kind" else None)
     cameras = options.camera or [surface.camera for surface in surfaces]
     return [one for one in surfaces if one.kind == kind and one.detector == detector and one.camera in cameras]
 

@@ -57,8 +57,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     about = _about(experiment, options.licence, samples, command)
     if (out / INDEX).exists():
         if read_index(out)["content"] != about["content"]:
-            said = f"{out}: holds a data set of another experiment, number of boards or version of the code"
-            raise UserError(said, fix="name a new folder with --out")
+            what = f"{out}: holds a data set of another experiment, number of boards or version of the code"
+            raise UserError(what, fix="name a new folder with --out")
     elif out.is_dir() and any(out.iterdir()):
         raise UserError(f"{out}: is not empty, and no file is overwritten", fix="name a new folder with --out")
     write_text(out / INDEX, json.dumps({**about, "samples": None}, indent=1) + "\n")

@@ -63,8 +63,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     with in_use(cache), locked(folder), engine_of(asked, detectors) as engine:
         ideal = ideal_of_set_ups(plan, engine, rate)
         if unknown := [one.label for one in study.set_ups if (one.variant, one.frames) not in ideal]:
-            said = f"{folder}: {EXPERIMENT.name} has no set-up {unknown[0]}, which {STUDY.name} has"
-            raise UserError(said, fix="name a folder as the sweep left it, or run the study again")
+            what = f"{folder}: {EXPERIMENT.name} has no set-up {unknown[0]}, which {STUDY.name} has"
+            raise UserError(what, fix="name a folder as the sweep left it, or run the study again")
         rows = [efficiency_of(limit_of(one), ideal[one.variant, one.frames]) for one in study.set_ups]
         cameras, warnings = [point.config.simulated.camera for point in experiment.points], warnings_of(rows)
         names = ", ".join(dict.fromkeys(one.name for one in cameras))

@@ -32,15 +32,15 @@ def tofpod_gate(request: pytest.FixtureRequest) -> Callable[..., Path]:
 
         path = Path(request.path).parent / experiment
         assert request.config.cache is not None
-        out, said = request.config.cache.mkdir("tofpod"), io.StringIO()
+        out, printed = request.config.cache.mkdir("tofpod"), io.StringIO()
         arguments = [str(path), "--baseline", str(path.with_suffix(".baseline.json")), "--out", str(out)]
         arguments += [word for change in changes for word in ("--set", change)]
         arguments += ["--update"] if request.config.getoption("--tofpod-update") else []
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
             code = check.main(arguments)
         if code:
-            told = said.getvalue().replace("with --update", "with pytest --tofpod-update")
-            pytest.fail(told.strip(), pytrace=False)
+            message = printed.getvalue().replace("with --update", "with pytest --tofpod-update")
+            pytest.fail(message.strip(), pytrace=False)
         return load_experiment(path, changes).folder(out)
 
     return gate

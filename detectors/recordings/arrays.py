@@ -331,7 +331,7 @@ RELIEF = (5e-4, 0.5)
 
 
 def _open_height_map(path: Path, load: ArraysLoader, asked: Asked) -> Recording:
-    """Open a height map. Raises UserError where the array is no single map, or its unit cannot be told."""
+    """Open a height map. Raises UserError where the array is no single map, or its unit cannot be determined."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?(?:e-?\d+)?)\s*(um|mm|cm|m)", (asked.pitch or "").strip())
     pitch_m = float(match.group(1)) * UNITS_M[match.group(2)] if match else math.nan
     if not 1e-7 <= pitch_m <= 1:
@@ -355,8 +355,8 @@ def _open_height_map(path: Path, load: ArraysLoader, asked: Asked) -> Recording:
     read = partial(_map_frames, path, load, asked.array, pitch_m, scale_m if is_down else -scale_m)
     note = f"height map {name}: {width} x {height} pixels of {1e3 * pitch_m:.4g} mm; its numbers {direction}"
     notes = (note, f"the median height lies at z = {1e3 * DISTANCE_M:g} mm")
-    told = f"the map's relief, {relief:.4g} over {1e3 * side_m:.4g} mm (--unit states another)"
-    found = Recording(path.name, read, (height, width), scale_m, z_step_m, (path,), notes=notes, unit_from=told)
+    origin = f"the map's relief, {relief:.4g} over {1e3 * side_m:.4g} mm (--unit states another)"
+    found = Recording(path.name, read, (height, width), scale_m, z_step_m, (path,), notes=notes, unit_from=origin)
     return replace(found, projection="parallel")
 
 

@@ -127,9 +127,9 @@ def find_bag(path: Path) -> Bag:
         raise UserError(what, legal=LEGAL_BAG, fix="name that file itself, or run: ros2 bag reindex")
     fix = "copy it again, name the .db3 or .mcap itself, or run: ros2 bag reindex"
     with damage_told(f"{metadata}: is not a description of a ROS 2 bag, or is cut off", LEGAL_BAG, fix):
-        told = read_yaml(metadata).data["rosbag2_bagfile_information"]
-        files = tuple(path / Path(name).name for name in told["relative_file_paths"])
-        mode = str(told.get("compression_mode") or "none").lower()
+        info = read_yaml(metadata).data["rosbag2_bagfile_information"]
+        files = tuple(path / Path(name).name for name in info["relative_file_paths"])
+        mode = str(info.get("compression_mode") or "none").lower()
     if mode == "file":
         fix = f"unpack it (zstd -d {files[0] if files else path}) and name the unpacked file"
         raise UserError(f"{path}: its files are compressed as a whole", legal=LEGAL_BAG, fix=fix)
@@ -287,8 +287,8 @@ def _lens_of_images(bag: Bag, topic: str, shape: tuple[int, ...]) -> Lens:
         if isinstance(lens, Lens):
             return lens
         why.append(f"{info} {lens}")
-    told = "; ".join(why) or f"no CameraInfo lies beside {topic} (the bag's: {', '.join(every) or 'none'})"
-    what = f"{bag.path}: {told}: the lens of these depth images is unknown; without it they give no points"
+    reason = "; ".join(why) or f"no CameraInfo lies beside {topic} (the bag's: {', '.join(every) or 'none'})"
+    what = f"{bag.path}: {reason}: the lens of these depth images is unknown; without it they give no points"
     fix = f"pass --intrinsics FILE{', or the rectified topic by --topic' if why else ''}"
     raise UserError(what, legal=LEGAL_LENS, fix=fix)
 

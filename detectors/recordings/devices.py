@@ -287,11 +287,11 @@ def open_r3d(path: Path, asked: Asked) -> Recording:
             raise UserError(f"{path}: contains no Record3D capture ({held[:200]})", legal=LEGAL_R3D)
         content = _content(path, archive, "metadata")
     with damage_told(f"{path}: its metadata cannot be read", LEGAL_R3D):
-        told = strict_json(content)
-        k = np.array([float(x) for x in told["K"]]).reshape(3, 3).T
-        width, height = int(told.get("dw", 192)), int(told.get("dh", 256))
-        colour = int(told["w"]), int(told["h"])
-        poses = np.array(told.get("poses") or np.zeros((0, 7)), float).reshape(-1, 7)
+        info = strict_json(content)
+        k = np.array([float(x) for x in info["K"]]).reshape(3, 3).T
+        width, height = int(info.get("dw", 192)), int(info.get("dh", 256))
+        colour = int(info["w"]), int(info["h"])
+        poses = np.array(info.get("poses") or np.zeros((0, 7)), float).reshape(-1, 7)
     refuse_pixels(str(path), width, height)
     scale_m = asked.scale_m or UNITS_M["m"]
     scaled_lens = partial(_scaled, f"{path}: metadata", k, colour, (width, height))

@@ -55,13 +55,13 @@ def open_capture(paths: Sequence[Path], *, unit: str | None = None, **statements
             raise UserError(f"{path}: {odd or 'no such file or folder'}", legal=LEGAL_FORMATS)
     asked = Asked(metres_per_unit(unit) if unit else None, **statements)
     recording = replace(_opened(paths, asked), selection=asked.frames)
-    said = Unit(recording.scale_m, f"--unit {unit}" if unit else recording.unit_from)
-    if not said.origin:
-        said = _unit_not_stated(recording)
-        if said.scale_m != recording.scale_m:
-            recording = replace(_opened(paths, replace(asked, scale_m=said.scale_m)), selection=asked.frames)
+    stated = Unit(recording.scale_m, f"--unit {unit}" if unit else recording.unit_from)
+    if not stated.origin:
+        stated = _unit_not_stated(recording)
+        if stated.scale_m != recording.scale_m:
+            recording = replace(_opened(paths, replace(asked, scale_m=stated.scale_m)), selection=asked.frames)
     first, *second = islice(recording.frames(), 2)
-    given, doubts = recording.lens, [said.warning]
+    given, doubts = recording.lens, [stated.warning]
     if second and np.array_equal(first.z_m, second[0].z_m, equal_nan=True):
         doubts += ["the first two frames are equal: repeated frames do not lower noise, but are counted as if they did"]
     if recording.slopes is not None and first.xy_m is None:
@@ -71,7 +71,7 @@ def open_capture(paths: Sequence[Path], *, unit: str | None = None, **statements
         notes, warnings = [*notes, given.note], [*warnings, given.warning]
         recording = replace(recording, lens=given.plain)
     notes, warnings = list(filter(None, notes)), list(filter(None, warnings))
-    return replace(recording, unit_from=said.origin, notes=tuple(notes), warnings=tuple(warnings))
+    return replace(recording, unit_from=stated.origin, notes=tuple(notes), warnings=tuple(warnings))
 
 
 def _unit_not_stated(recording: Recording) -> Unit:

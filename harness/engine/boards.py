@@ -76,11 +76,11 @@ def categories_of(experiment: Experiment) -> dict[str, Point]:
     axes = [path for path in axes if any(value != values[path][0] for value in values[path])]
     names, found = names_of(axes), dict[str, Point]()
     for point in points.values():
-        said = []
+        words = []
         for path, own in ((path, point.values[path]) for path in axes):
             text = value_text(path, differing(own, (value for value in values[path] if value != own)))
-            said.append(f"{names[path]} {text}" if text[:1].isdigit() else text)
-        name = re.sub(r"[^A-Za-z0-9.]+", "_", " ".join(said)).strip("_.") or experiment.config.name
+            words.append(f"{names[path]} {text}" if text[:1].isdigit() else text)
+        name = re.sub(r"[^A-Za-z0-9.]+", "_", " ".join(words)).strip("_.") or experiment.config.name
         found[name if name not in found else f"{name}_{len(found)}"] = point
     return found
 
@@ -174,7 +174,7 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
         box = [int(n) for n in (columns.min(), rows.min(), np.ptp(columns) + 1, np.ptp(rows) + 1)]
         facts = {"pixels": len(rows), "bbox": box, "run_lengths": run_lengths(own), "line_m": one.line_m.tolist()}
         damages.append({**one.to_row(), "seen_depth_mm": known.seen_depth_m[one.id] / MM, **facts})
-    told = {
+    facts_of_board = {
         "file_name": f"{sample.category}/{sample.split}/{sample.label}/rgb/{file}.png",
         "height": window.shape[0],
         "width": window.shape[1],
@@ -188,7 +188,7 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
         "intensity_at_65535": white,
         "damages": damages,
     }
-    write_text(place / file / TRUTH, json.dumps(told, allow_nan=False) + "\n", durable=False)
+    write_text(place / file / TRUTH, json.dumps(facts_of_board, allow_nan=False) + "\n", durable=False)
 
 
 def read_index(folder: Path) -> dict[str, Any]:

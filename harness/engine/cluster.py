@@ -176,7 +176,7 @@ class ClusterEngine:
         """Call a function on a node; what it returns or raises becomes an event."""
 
         async def call() -> None:
-            said: Any = None
+            answer: Any = None
             # the scheduler reports a worker shortly before it can reach it
             for pause_s in (0.0,) if number is not None else (0.0, 0.2, 1.0, 3.0):
                 await asyncio.sleep(pause_s)
@@ -184,12 +184,12 @@ class ClusterEngine:
                     given = {"workers": [address], "on_error": "return", "asynchronous": True}
                     calling = self._client.run(function, *arguments, **given)
                     answers = await (calling if number is not None else asyncio.wait_for(calling, EXAMINED_S))
-                    said = answers.get(address, OSError("no answer"))
+                    answer = answers.get(address, OSError("no answer"))
                 except Exception as error:
-                    said = error
-                if not isinstance(said, OSError | KeyError):
+                    answer = error
+                if not isinstance(answer, OSError | KeyError):
                     break
-            self._events.put((address, number, said))
+            self._events.put((address, number, answer))
 
         asyncio.run_coroutine_threadsafe(call(), self._client.loop.asyncio_loop)
 
@@ -222,51 +222,51 @@ class ClusterEngine:
             self._gone(address)
         self._look_for_lack()
 
-    def _heed(self, address: str, number: int | None, said: Any) -> None:
+    def _heed(self, address: str, number: int | None, answer: Any) -> None:
         if number is None:
-            self._examined(address, said)
+            self._examined(address, answer)
             return
         one = self._nodes.get(address)
         bundle = None if one is None else one.bundles.pop(number, None)
         if one is None or bundle is None:
             return  # the node was given up in the meantime
         one.renders -= bundle.jobs[0].stage == "renders"
-        if isinstance(said, tuple):
-            for job, ended in zip(bundle.jobs, said, strict=True):
+        if isinstance(answer, tuple):
+            for job, ended in zip(bundle.jobs, answer, strict=True):
                 if job.stage == "trials":
                     self._mean_s += 0.1 * (ended.seconds - self._mean_s)
                 self._over(job, ended)
-        elif isinstance(said, UserError):  # its processes run other code, or cannot start
-            self._refuse(address, UserError(f"the worker at {_bare(address)}: {said.message}", fix=said.fix))
+        elif isinstance(answer, UserError):  # its processes run other code, or cannot start
+            self._refuse(address, UserError(f"the worker at {_bare(address)}: {answer.message}", fix=answer.fix))
             self._waiting[bundle.jobs[0].stage].extendleft(reversed(bundle.jobs))
             self._gone(address)
         else:
             self._look_for_nodes()
-            self._lost(bundle.jobs, f"its worker did not answer ({type(said).__name__}: {said})", address)
+            self._lost(bundle.jobs, f"its worker did not answer ({type(answer).__name__}: {answer})", address)
 
-    def _examined(self, address: str, said: NodeFacts | BaseException) -> None:
+    def _examined(self, address: str, answer: NodeFacts | BaseException) -> None:
         """Use a node, or print why it is not used."""
         if address not in self._asked:
             return
         where = f"the worker at {_bare(address)}"
-        if isinstance(said, ImportError | AttributeError):
+        if isinstance(answer, ImportError | AttributeError):
             fix = "install the same version of tofpod there and start its workers again"
-            self._refuse(address, UserError(f"{where} cannot run tofpod: {type(said).__name__}: {said}", fix=fix))
-        elif isinstance(said, BaseException):
+            self._refuse(address, UserError(f"{where} cannot run tofpod: {type(answer).__name__}: {answer}", fix=fix))
+        elif isinstance(answer, BaseException):
             # it died in the meantime, or the network failed; this says nothing about its installation
-            self._tell_once(f"{where} did not state its version ({type(said).__name__}: {said}); it is not used")
-        elif said.python.split(".")[:2] != list(platform.python_version_tuple()[:2]):
-            message = f"{where} runs Python {said.python}, this machine {platform.python_version()}"
+            self._tell_once(f"{where} did not state its version ({type(answer).__name__}: {answer}); it is not used")
+        elif answer.python.split(".")[:2] != list(platform.python_version_tuple()[:2]):
+            message = f"{where} runs Python {answer.python}, this machine {platform.python_version()}"
             self._refuse(address, UserError(message, fix="use the same Python on all"))
-        elif said.digests.get("trials") != self._digests.get("trials"):
+        elif answer.digests.get("trials") != self._digests.get("trials"):
             message = f"{where} runs another version of tofpod, of a plug-in, or of numpy, scipy, numba or OpenCV"
             fix = "install the same there, and start its workers again: they keep the code that they loaded"
             self._refuse(address, UserError(f"{message} than this machine", fix=fix))
-        elif said.sees != self._nonce:
+        elif answer.sees != self._nonce:
             message = f"{where} does not see {self._probe.parent}, where this machine keeps renders"
             self._refuse(address, UserError(message, fix="name a folder with --out that all machines share"))
         else:
-            self._nodes[address] = _Node(address, said, said.digests.get("renders") == self._digests.get("renders"))
+            self._nodes[address] = _Node(address, answer, answer.digests.get("renders") == self._digests.get("renders"))
 
     def _refuse(self, address: str, why: UserError) -> None:
         self._refused[address] = why
@@ -416,9 +416,9 @@ def _ends_of(bundle: Bundle, engine: LocalEngine, answers: Answers, worker: str)
         engine.put(job, bundle.limits, answers)
     ended: dict[str, Ended] = {}
     while len(ended) < len(bundle.jobs) and not answers.is_dropped:
-        said = answers.ended.get()
-        if isinstance(said, UserError):
+        answer = answers.ended.get()
+        if isinstance(answer, UserError):
             engine.drop(answers)
-            raise said
-        ended[said[0].name] = replace(said[1], worker=worker)
+            raise answer
+        ended[answer[0].name] = replace(answer[1], worker=worker)
     return tuple(ended[job.name] for job in bundle.jobs if job.name in ended)

@@ -43,10 +43,10 @@ def progress_display(
         disable=not stream.isatty(),
     )
     stages = {name: bars.add_task(name, counts="", rate="", failed="", left="") for name in ("renders", "trials")}
-    said, said_at = "", float("-inf")
+    last, said_at = "", float("-inf")
 
     def show(outcome: Outcome | None) -> None:
-        nonlocal said, said_at
+        nonlocal last, said_at
         if outcome is not None:
             for name, task in stages.items():
                 counts, state = getattr(outcome, name), bars.tasks[task]
@@ -64,8 +64,8 @@ def progress_display(
         if bars.disable and bars.tasks[0].fields["counts"] and (outcome is None or clock() >= said_at + PLAIN_EVERY_S):
             lines = (" ".join(filter(None, [task.description, *map(task.fields.get, names)])) for task in bars.tasks)
             text = ", ".join(lines)
-            if text != said:
-                said, said_at = text, clock()
+            if text != last:
+                last, said_at = text, clock()
                 print(text, file=stream, flush=True)
 
     with bars:

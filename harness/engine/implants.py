@@ -236,7 +236,7 @@ def judge_scans(
     Return tables, a set-up for each number of frames, and warnings. If a recording has two groups of that many frames
     or more, every second group sets the threshold; otherwise the same frames do both, and a warning says so."""
     rows: Rows = {name: [] for name in ("runs", "holes", *STUDY_TABLES)}
-    warnings, calibrated = [said for scan in scans if (said := scan.left_out(family))], {}
+    warnings, calibrated = [text for scan in scans if (text := scan.left_out(family))], {}
     for count in frames:
         groups = [(scan, slice(k, k + count)) for scan in scans for k in range(0, len(scan.frames) - count + 1, count)]
         if not groups:
@@ -247,7 +247,7 @@ def judge_scans(
             warnings.append(f"{count} frames: one average sets the threshold, shows the false calls and is damaged too")
         setting, quiet = setting[:MOST_SETTING] if judging.threshold is None else [], judged[:MOST_HOLE_FREE]
         own = [judging.threshold_of(scan.averaged(scan.frames[group])) for scan, group in setting]
-        warnings += dict.fromkeys(f"{count} frames: {said}" for _, doubts in own for said in doubts)
+        warnings += dict.fromkeys(f"{count} frames: {text}" for _, doubts in own for text in doubts)
         calibrated[count] = len(own)
         threshold = judging.threshold or float(np.median([value for value, _ in own]))
 

@@ -84,8 +84,8 @@ class Journal:
     def write(self, key: str, entry: Ended) -> None:
         """Append how a trial ended. Raises UserError if the folder cannot be written or the disk is full."""
         self._known()
-        said = {name: getattr(entry, name) for name in KEPT} | {"key": key, "seconds": round(entry.seconds, 4)}
-        text = f"{canonical_json(said)}\t{NOTHING if entry.value is None else entry.value}".encode()
+        fields = {name: getattr(entry, name) for name in KEPT} | {"key": key, "seconds": round(entry.seconds, 4)}
+        text = f"{canonical_json(fields)}\t{NOTHING if entry.value is None else entry.value}".encode()
         line = _digest(text) + b" " + text + b"\n"
         try:
             if self._own is None:  # ascending numbers sort segments by the time at which they were begun
@@ -171,8 +171,8 @@ def _parsed(line: bytes) -> tuple[str, Ended] | None:
         return None
     try:
         head, _, record = text.decode().partition("\t")
-        said = strict_json(head)
-        key, entry = said.pop("key"), Ended(value=None if record == NOTHING else record, **said)
+        fields = strict_json(head)
+        key, entry = fields.pop("key"), Ended(value=None if record == NOTHING else record, **fields)
     except (ValueError, TypeError, KeyError, AttributeError):
         return None
     is_whole = entry.state in STATES and (entry.value is not None) == (entry.state == "done")

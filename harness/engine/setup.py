@@ -166,8 +166,8 @@ def load_set_up(ref: SetUpRef) -> SetUp:
     if ref not in _kept:
         T_camera_board, view = ref.target.pose.T_camera_board, read_view(Path(ref.view_path))
         if view is None:
-            said = f"{ref.view_path}: the stored render is missing or damaged"
-            raise UserError(said, fix="run the same command again")
+            what = f"{ref.view_path}: the stored render is missing or damaged"
+            raise UserError(what, fix="run the same command again")
         unit, truth = SimulatedUnit(camera_of(ref.camera), ref.camera, view), truth_of(ref.target, T_camera_board)
         in_view = unit.camera.images(np.array([damage.centre_camera_m for damage in truth]).reshape(-1, 3))
         seen = tuple(damage for damage, there in zip(truth, in_view, strict=True) if there)

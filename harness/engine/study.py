@@ -156,8 +156,8 @@ def _write_report(
     facts = experiment.data
     found = summaries(tables, outcome.examples, with_claims=is_thesis(facts))
     write_tables(folder, as_files(found), provenance)
-    told = (provenance, resolved_yaml(experiment), title_of(experiment), facts)
-    write_report(folder, tables, outcome.examples, *told, found=found)
+    about = (provenance, resolved_yaml(experiment), title_of(experiment), facts)
+    write_report(folder, tables, outcome.examples, *about, found=found)
     return final_tables(tables, found)
 
 
@@ -166,8 +166,8 @@ def _nothing_to_report(experiment: Experiment, outcome: Outcome) -> int:
     name, detector = experiment.config.name, experiment.config.detector.name
     if bug := next((failure for failure in outcome.failures if failure.is_bug), None):
         count = outcome.trials.failed
-        told = f"no trial of {name} succeeded; {count} failed, the first as above (detector {detector!r})"
-        print(f"{bug.why}\n{told}", file=sys.stderr)
+        summary = f"no trial of {name} succeeded; {count} failed, the first as above (detector {detector!r})"
+        print(f"{bug.why}\n{summary}", file=sys.stderr)
         return 1
     own = [failure for failure in outcome.failures if failure.state != "skipped"]
     why = own[0].why if len({failure.in_short for failure in own}) == 1 else _reasons(outcome)
@@ -191,10 +191,10 @@ def _counts(outcome: Outcome) -> dict[str, int]:
 
 def _tell_failures(outcome: Outcome) -> None:
     if counts := _counts(outcome):
-        said = ", ".join(f"{count} {state}" for state, count in counts.items())
+        totals = ", ".join(f"{count} {state}" for state, count in counts.items())
         again = "the same command, with --retry-failed, runs them again"
         again = again if set(counts) - {"skipped"} else "the same command runs what was skipped"
-        print(f"{said}: {_reasons(outcome)}\n{again}", file=sys.stderr)
+        print(f"{totals}: {_reasons(outcome)}\n{again}", file=sys.stderr)
 
 
 def _provenance(
@@ -349,7 +349,7 @@ def without_limit(
     points: Iterable[Point], outcome: Outcome, failed: Mapping[str, list[Failure]], judged: Iterable[SetUpRecord]
 ) -> list[str]:
     """Return sentences on the points that are not among the ``judged`` set-ups, each with its most common failure."""
-    known, said = {(one.variant, one.frames) for one in judged}, dict[str, list[str]]()
+    known, by_cause = {(one.variant, one.frames) for one in judged}, dict[str, list[str]]()
     for point in (one for one in points if (one.variant, one.config.capture.frames) not in known):
         own = [one for one in failed.get(point.digest, ()) if one.state != "skipped"]
         causes = [one.in_short for one in own]
@@ -357,5 +357,5 @@ def without_limit(
         why = Counter([*causes, "its trials did not finish"]).most_common(1)[0][0]
         if own and all(one.state == "failed" and not one.is_bug for one in own):
             why = f"the camera sees no part of the board that can be judged ({why})"
-        said.setdefault(why, []).append(in_words(point.label))
-    return [f"no limit for {'; '.join(labels)}: {why}" for why, labels in said.items()]
+        by_cause.setdefault(why, []).append(in_words(point.label))
+    return [f"no limit for {'; '.join(labels)}: {why}" for why, labels in by_cause.items()]

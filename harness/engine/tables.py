@@ -42,8 +42,8 @@ def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> t
                 made.append(columns_of(rows, grids))
     paths = list(experiment.points[0].axes)
     names = names_of(paths)
-    said = [{"path": path, "name": names[path], "unit": unit_of(path)} for path in paths]
-    axes = pd.DataFrame(said, columns=["path", "name", "unit"])
+    rows_of_axes = [{"path": path, "name": names[path], "unit": unit_of(path)} for path in paths]
+    axes = pd.DataFrame(rows_of_axes, columns=["path", "name", "unit"])
     variants = _variants(experiment)
     placed = variants.set_index("variant")[paths]
 

@@ -233,10 +233,10 @@ class MapMaker:
         both = (registration.T_reference_view, self.guesses[number])
         (in_plane, across), guessed = (registration_error_m(T, self.truth[number], places_m, normal) for T in both)
         predicted = predicted_error_m(registration, places_m, normal)
-        told = ("method", "overlap", "pairs", "iterations", "converged", "seconds", "failure")
+        columns = ("method", "overlap", "pairs", "iterations", "converged", "seconds", "failure")
         return {
             "view": number,
-            **{name: getattr(registration, name) for name in told},
+            **{name: getattr(registration, name) for name in columns},
             "tre_mm": float(np.hypot(in_plane, across)) / MM,
             "tre_in_plane_mm": in_plane / MM,
             "tre_across_mm": across / MM,

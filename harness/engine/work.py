@@ -217,8 +217,8 @@ def _held(path: Path, *, shared: bool) -> Iterator[None]:
     with opened_lock(path) as file:
         answer = lock(file, shared=shared, wait=False)
         if answer == "busy":
-            said = f"{path.parent}: another sweep is running in this folder"
-            raise UserError(said, fix="wait for it, or name another folder with --out")
+            what = f"{path.parent}: another sweep is running in this folder"
+            raise UserError(what, fix="wait for it, or name another folder with --out")
         if answer == "no locks":
             print(f"{path.parent}: cannot be locked on this system: do not start a second sweep in it", file=sys.stderr)
         yield
@@ -290,8 +290,8 @@ def engine_options(options: argparse.Namespace) -> EngineOptions:
         raise UserError("--serial and --scheduler: ask for different engines", fix="leave one of them out")
     if options.memory_limit < LEAST_MEMORY_GB:
         legal = f"{LEAST_MEMORY_GB:g} GB or more; 1 GB is enough for most trials"
-        said = f"--memory-limit {options.memory_limit:g}: a process needs more than that to start"
-        raise UserError(said, legal=legal)
+        what = f"--memory-limit {options.memory_limit:g}: a process needs more than that to start"
+        raise UserError(what, legal=legal)
     limits = Limits(options.time_limit, round(1000 * options.memory_limit))
     shard = WHOLE if options.shard is None else Shard.of(options.shard)
     where = (options.scheduler, options.serial, shard, options.retry_failed, options.cache_limit)

@@ -225,10 +225,10 @@ def study_answer(limits: Sequence[SetUpLimit]) -> str:
     """Return a sentence for each set-up, or the range of limits of many. With a single unit, it begins by saying so."""
     if not limits:
         return "No set-up was inspected, so there is no answer."
-    said = _answer(limits)
+    answer = _answer(limits)
     if any(limit.over_units for limit in limits):
-        return said
-    return f"{ONE_UNIT}: {said[0].lower() if said.startswith(('Of ', 'None ')) else said[0]}{said[1:]}"
+        return answer
+    return f"{ONE_UNIT}: {answer[0].lower() if answer.startswith(('Of ', 'None ')) else answer[0]}{answer[1:]}"
 
 
 def _answer(limits: Sequence[SetUpLimit]) -> str:
@@ -236,8 +236,8 @@ def _answer(limits: Sequence[SetUpLimit]) -> str:
         return " ".join(limit_sentence(limit, again=number > 0) for number, limit in enumerate(limits))
     shown = sorted((one for one in limits if is_within_sizes(one, quoted(one))), key=lambda one: quoted(one).value)
     if not shown:
-        said = f"None of {len(limits)} set-ups demonstrates a limit (a90/95) within the sizes inspected"
-        return f"{said}{_sizes(*limits)}."
+        sentence = f"None of {len(limits)} set-ups demonstrates a limit (a90/95) within the sizes inspected"
+        return f"{sentence}{_sizes(*limits)}."
     kinds = sorted({one.record.inspected.limit_of for one in shown}, reverse=True)
     spans = []
     for kind in kinds:  # a depth is not compared with a diameter
@@ -284,33 +284,33 @@ def limit_sentence(limit: SetUpLimit, *, again: bool = False) -> str:
 
 def notes_of(limit: SetUpLimit) -> list[str]:
     """Return why there is no limit, or why it is cautious or doubtful."""
-    said = [] if limit.a90_95.demonstrated else [_reason(limit.a90_95)]
+    notes = [] if limit.a90_95.demonstrated else [_reason(limit.a90_95)]
     stated = limit.statement
     if stated is None:
-        said += [limit.a90_95.method] if limit.a90_95.demonstrated else []
+        notes += [limit.a90_95.method] if limit.a90_95.demonstrated else []
     else:
         if limit.a90_95.demonstrated and not is_within_sizes(limit):
-            said.append(f"a90/95 {BEYOND}, {limit.largest_mm:.3g} mm, and no inspection bears it out")
-        said += [note.partition(": see --")[0] for note in stated.notes if BEYOND not in note]
+            notes.append(f"a90/95 {BEYOND}, {limit.largest_mm:.3g} mm, and no inspection bears it out")
+        notes += [note.partition(": see --")[0] for note in stated.notes if BEYOND not in note]
     if limit.a50_mm <= 0:
-        said.append("the curve hardly rises with size: it would put sizes found below 0, which are not stated")
+        notes.append("the curve hardly rises with size: it would put sizes found below 0, which are not stated")
     if limit.boards_matter and limit.over_units is None:
         effect = f"design effect {limit.design_effect:.1f}"
-        said.append(f"damages of one board fare alike ({effect}): the limit over boards is the one to quote")
+        notes.append(f"damages of one board fare alike ({effect}): the limit over boards is the one to quote")
     only = limit.hits - (_kinds(limit) or (limit.hits,))[0]
     if only:
-        said.append(f"{only} of {limit.hits} hits by missing returns alone: nothing came back to measure")
+        notes.append(f"{only} of {limit.hits} hits by missing returns alone: nothing came back to measure")
     if limit.record.failed:
-        said.append(f"{limit.record.failed} trials failed and are missing")
-    return said
+        notes.append(f"{limit.record.failed} trials failed and are missing")
+    return notes
 
 
 def limit_notes(limits: Sequence[SetUpLimit]) -> list[str]:
     """Return notes on the limits: first those that all set-ups share, then a line for each set-up."""
     notes = [(limit.record.label, notes_of(limit)) for limit in limits]
-    shared = [one for one in notes[0][1] if all(one in said for _, said in notes)] if len(notes) > 1 else []
-    own = [("every set-up", shared), *((name, [one for one in said if one not in shared]) for name, said in notes)]
-    return [f"{name}: {'; '.join(said)}" for name, said in own if said]
+    shared = [one for one in notes[0][1] if all(one in these for _, these in notes)] if len(notes) > 1 else []
+    own = [("every set-up", shared), *((name, [one for one in these if one not in shared]) for name, these in notes)]
+    return [f"{name}: {'; '.join(these)}" for name, these in own if these]
 
 
 def _reason(bound: Bound) -> str:

@@ -100,11 +100,11 @@ def set_by(limits: Sequence[SetUpLimit]) -> list[SetBy]:
 def threshold_warnings(limits: Sequence[SetUpLimit]) -> list[str]:
     """Return warnings of calibrated thresholds that are too high for noise, or that one place on the sensor sets."""
     rows = set_by(limits)
-    said, crowded = [], [one for one in rows if (one.same_pixels or 0) > max(one.runs / 2, 1)]
+    warnings, crowded = [], [one for one in rows if (one.same_pixels or 0) > max(one.runs / 2, 1)]
     if crowded:
         counts = sorted({one.same_pixels or 0 for one in crowded})
         where = crowded[0].limit.record.label if len(crowded) == 1 else f"{len(crowded)} of {len(limits)} set-ups"
-        said.append(
+        warnings.append(
             f"{where}: {' to '.join(map(str, counts[:1] + counts[1:][-1:]))} of {crowded[0].runs} calibration boards "
             "have their highest score on the same pixels of the sensor: one place of this unit's fixed pattern sets "
             "the threshold (study.units draws several units)"
@@ -113,17 +113,17 @@ def threshold_warnings(limits: Sequence[SetUpLimit]) -> list[str]:
         threshold = one.limit.record.threshold
         if threshold > HIGH_THRESHOLD:
             where = one.place if one.place == OFF_BOARD else f"at x, y = {one.place} mm"
-            said.append(
+            warnings.append(
                 f"{one.limit.record.label}: the threshold is {threshold:.3g} deviations, above {HIGH_THRESHOLD:g}: "
                 f"something other than noise sets it (calibration board {one.board}, {where}), and the limit with it"
             )
-    return said
+    return warnings
 
 
 def threshold_note(record: StudyRecord) -> str:
     """Return how the thresholds were set."""
-    if told := record.provenance.get("thresholds"):
-        return str(told)
+    if stated := record.provenance.get("thresholds"):
+        return str(stated)
     if record.false_calls_per_m2 is None:
         return "Thresholds were given, not calibrated: the rates beside them are what came of it."
     wanted = record.false_calls_per_m2
@@ -149,12 +149,12 @@ OPERATING = Table(
 
 def operating_notes(results: Sequence[SetUpResult]) -> list[str]:
     """Return the definition of AU-PRO, and the set-ups for which it could not be computed."""
-    said = (
+    text = (
         "AU-PRO: mean over damages of the share of pixels above, against undamaged pixels above, up to a share of "
         f"{PRO_LIMIT:g} and divided by it, as MVTec AD does."
     )
     without = [one for one in results if one.pixels is not None and one.pixels.why]
-    return [said, *(f"{name_of(one.limit)}: no AU-PRO: {one.pixels.why}." for one in without if one.pixels)]
+    return [text, *(f"{name_of(one.limit)}: no AU-PRO: {one.pixels.why}." for one in without if one.pixels)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,8 +194,8 @@ def axis_groups(lines: Sequence[AxisLine]) -> list[AxisGroup]:
 
         def held(line: AxisLine, other: str, values: Sequence[Any]) -> str:
             """Return a label: a name such as ``kinect_v2`` explains itself, a number needs its key (``albedo=0.2``)."""
-            said = axis_value(other, differing(line.held[other], values))
-            return said if other == FRAMES or isinstance(line.held[other], str) else f"{names[other]}={said}"
+            words = axis_value(other, differing(line.held[other], values))
+            return words if other == FRAMES or isinstance(line.held[other], str) else f"{names[other]}={words}"
 
         labels = [
             ", ".join(held(line, other, taken[other]) for other in varied if other in line.held) for line in of_axis

@@ -265,8 +265,8 @@ def _found(row: Mapping[str, Any]) -> Cell:
 
     names = hole_list(row["found"]) if row["holes"] <= MOST_NAMES else ""
     undecided = hole_list(row["undecided"]) if row["holes"] <= MOST_NAMES else str(len(row["undecided"]))
-    said = "; ".join(part for part in (names, f"undecided {undecided}" if row["undecided"] else "") if part)
-    return Cell(f"{len(row['found'])} of {row['holes']}\n{said}".strip(), share=len(row["found"]) / row["holes"])
+    words = "; ".join(part for part in (names, f"undecided {undecided}" if row["undecided"] else "") if part)
+    return Cell(f"{len(row['found'])} of {row['holes']}\n{words}".strip(), share=len(row["found"]) / row["holes"])
 
 
 MOST_NAMES = 15

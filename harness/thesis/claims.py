@@ -116,15 +116,15 @@ def _c3(case: Case) -> tuple[Answer, str]:
     if rows.empty:
         return "undecided", "No hole is found with 50 frames."
     parts: list[bool | None] = []
-    said = []
+    ratios = []
     for _, row in rows.iterrows():
         bias, std = float(row["extent_bias_mm"]), float(row["extent_diameter_std_mm"])
         interval = standardised_bias(bias, std, int(row["extent_measured"]))
         ratio = bias / std if std > 0 else interval.low
         within, outside = interval.within(-1, 1), interval.above(1) or interval.below(-1)
         parts.append(True if within else False if outside else None)
-        said.append(f"hole {row['hole']} {f'{ratio:+.1f} ({span(interval, 1)})' if interval.known else '–'}")
-    return decide(parts), f"(mean - true)/std by the thesis' measure: {', '.join(said)}. {_between_units(case, rows)}"
+        ratios.append(f"hole {row['hole']} {f'{ratio:+.1f} ({span(interval, 1)})' if interval.known else '–'}")
+    return decide(parts), f"(mean - true)/std by the thesis' measure: {', '.join(ratios)}. {_between_units(case, rows)}"
 
 
 def _between_units(case: Case, rows: pd.DataFrame) -> str:
@@ -334,8 +334,8 @@ def claim_c11(summary: pd.DataFrame, axes: Sequence[str]) -> Verdict | None:
         judged = any(standings.values())
         answer = False if standings["behind"] else None if standings["open"] else bool(standings["ahead"])
         answers.append(answer if judged else None)
-        said = "; ".join(f"{word} at {', '.join(where)}" for word, where in standings.items() if where)
-        evidence += [f"Against {camera}: {said}."] if judged else []
+        text = "; ".join(f"{word} at {', '.join(where)}" for word, where in standings.items() if where)
+        evidence += [f"Against {camera}: {text}."] if judged else []
     return verdict_of("C11", decide(answers) if units >= FEWEST_UNITS else "undecided", " ".join(evidence))
 
 

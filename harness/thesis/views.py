@@ -44,14 +44,14 @@ def _c7(case: maps.MapCase) -> tuple[Answer, str]:
     planes = [_is_in_one_plane(pairs[method], noise_mm) for method in ("icp", "cpd")]
     ratio, low, high, n = maps.paired_ratio(pairs["icp"], pairs["cpd"], "tre_in_plane_mm")
     better = None if n < FEWEST_PAIRS else True if high < 1 else (False if low >= 1 else None)
-    said = []
+    errors = []
     for method, part in pairs.items():
         good = maps.trusted(part)
         plane, across = (float(good[f"tre_{way}_mm"].median()) for way in ("in_plane", "across"))
-        said.append(f"{method} {plane:.2f} and {across:.2f} mm, {len(part) - len(good)} of {len(part)}")
+        errors.append(f"{method} {plane:.2f} and {across:.2f} mm, {len(part) - len(good)} of {len(part)}")
     evidence = (
         f"With {maps.frames_text(alone.frames)}, median error in the plane, across it, and registrations that failed: "
-        f"{'; '.join(said)}. The noise of a single cloud's surface is {noise_mm:.2f} mm. In the plane, CPD has "
+        f"{'; '.join(errors)}. The noise of a single cloud's surface is {noise_mm:.2f} mm. In the plane, CPD has "
         f"{ratio:.2f} times the error of ICP ({maps.span(intervals.Interval(low, high))}, {many(n, 'pair')} of views)."
     )
     return decide([*planes, better]), evidence
@@ -111,7 +111,7 @@ def _c10(case: maps.MapCase) -> tuple[Answer, str]:
         rows = rows.assign(_error=rows[measured] - rows[true])
         return rows.pivot(index="repeat", columns="hole", values="_error").to_numpy(float)
 
-    parts, said = [], []
+    parts, texts = [], []
     for what, values, size, gap in (
         ("surface noise", [noise(each) for each in three], lambda v: float(v.mean()), intervals.mean_difference),
         ("size error", [errors(each, "extent_diameter_mm", "true_diameter_mm") for each in three], _rms, rms_gap),
@@ -122,14 +122,14 @@ def _c10(case: maps.MapCase) -> tuple[Answer, str]:
             parts += [interval.over(0) for interval in gaps]
             sizes = [size(each) for each in values]
             more = " and ".join(map(maps.span, gaps))
-            said.append(f"{what} {sizes[0]:.2f} mm against {sizes[1]:.2f} and {sizes[2]:.2f} (more by {more})")
+            texts.append(f"{what} {sizes[0]:.2f} mm against {sizes[1]:.2f} and {sizes[2]:.2f} (more by {more})")
     if not common:
         (_, most), *others = (_bounds(case, each) for each in three)
         parts.append(True if most == 0 and all(least > 0 for least, _ in others) else None)
-        said.append("no hole is measured by all three")
+        texts.append("no hole is measured by all three")
     evidence = (
         f"{slam.views} views of {many(slam.frames, 'frame')} against one and two of {many(alone.frames, 'frame')}: "
-        f"{'; '.join(said)}. Found: {', '.join(_found_text(case, each) for each in three)}."
+        f"{'; '.join(texts)}. Found: {', '.join(_found_text(case, each) for each in three)}."
     )
     return decide(parts), evidence
 
@@ -202,10 +202,10 @@ def _duel(case: maps.MapCase, mapped: maps.Map, rival: maps.Map, registration: s
         "ahead" if low > rival_high else "behind" if high < rival_low else "level" if sure else "open",
         *("ahead" if one.is_below else "behind" if one.interval.over(0) else "open" for one in (sizes, noise)),
     )
-    said = ", ".join(f"{respect} {standing}" for respect, standing in zip(RESPECTS, standings, strict=True))
+    each = ", ".join(f"{respect} {standing}" for respect, standing in zip(RESPECTS, standings, strict=True))
     text = (
         f"{mapped.views} views ({registration}, fusion) of {many(mapped.frames, 'frame')} against one of "
-        f"{many(rival.frames, 'frame')}: {said}. Found {_found_text(case, mapped)} against {_found_text(case, rival)}; "
+        f"{many(rival.frames, 'frame')}: {each}. Found {_found_text(case, mapped)} against {_found_text(case, rival)}; "
         f"|size error| {maps.change_text(sizes)}; surface noise {maps.ratio_text(noise)}."
     )
     return standings, text

@@ -140,8 +140,8 @@ def guessed_precision(camera: AnyCamera) -> str:
     if isinstance(camera, EmpiricalCamera) or (gain := camera.photons.signal_electrons).range is None:
         return ""
     low, high = (float(np.sqrt(gain.value / end)) for end in reversed(gain.range))
-    told = f"the precision of {camera.title} is not published: its noise is a guess"
-    return f"{told}, which may be {low:.2g} to {high:.2g} times as much"
+    what = f"the precision of {camera.title} is not published: its noise is a guess"
+    return f"{what}, which may be {low:.2g} to {high:.2g} times as much"
 
 
 def numbers_of_lens(lens: Lens) -> dict[str, Any]:

@@ -387,8 +387,8 @@ class TargetConfig(SetUpConfig):
             surfaces |= {"floor": room.floor_below_lens_m, "back_wall": room.back_wall_distance_m}
         lacking = [name for name, there in surfaces.items() if there and getattr(albedos, name) is None]
         if lacking:
-            told = f"other_wavelengths: at {albedos.wavelength_nm:g} nm there is no albedo for {', '.join(lacking)}"
-            raise UserError(told, legal="an albedo for every surface that the target has")
+            what = f"other_wavelengths: at {albedos.wavelength_nm:g} nm there is no albedo for {', '.join(lacking)}"
+            raise UserError(what, legal="an albedo for every surface that the target has")
         board = self.material.albedo_850 if albedos.board == "as_at_850" else albedos.board
         changed: dict[str, Any] = {"material": self.material.model_copy(update={"albedo_850": board})}
         changed["tapes"] = tuple(tape.model_copy(update={"albedo_850": albedos.tape}) for tape in self.tapes)

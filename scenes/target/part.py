@@ -54,10 +54,10 @@ def part_of(shape: custom.MeshConfig) -> tuple[np.ndarray, np.ndarray]:
     if shape.content and file_digest(Path(shape.file)) != shape.content:
         raise UserError(f"{shape.file}: has changed since the experiment was declared")
 
-    def refuse(wrong: np.ndarray, said: str, fix: str) -> None:
+    def refuse(wrong: np.ndarray, what: str, fix: str) -> None:
         if len(wrong):
             place = ", ".join(f"{each:.4g}" for each in mesh.vertices[wrong[0]].mean(axis=0))
-            where = f"{shape.file}: {said}: {len(wrong)}, the first at ({place}) {shape.unit} of the file"
+            where = f"{shape.file}: {what}: {len(wrong)}, the first at ({place}) {shape.unit} of the file"
             raise UserError(where, legal="a closed surface", fix=f"{fix} in a mesh editor, such as MeshLab")
 
     edges, counts = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
@@ -66,8 +66,8 @@ def part_of(shape: custom.MeshConfig) -> tuple[np.ndarray, np.ndarray]:
     if not len(mesh.faces):
         raise UserError(f"{shape.file}: is not a mesh: it holds no triangles", legal="a closed surface")
     if not mesh.is_winding_consistent:
-        said = f"{shape.file}: neighbouring triangles face opposite sides"
-        raise UserError(said, fix="orient its faces in a mesh editor, such as MeshLab (Re-Orient All Faces Coherently)")
+        what = f"{shape.file}: neighbouring triangles face opposite sides"
+        raise UserError(what, fix="orient its faces in a mesh editor, such as MeshLab (Re-Orient All Faces Coherently)")
     refuse(mesh.faces[crossing(mesh.triangles)], "triangles that cross others", "unite its overlapping shells")
     if mesh.volume < 0:
         mesh.invert()

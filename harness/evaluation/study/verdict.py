@@ -175,17 +175,17 @@ def not_comparable(first: StudyRecord, second: StudyRecord, one: SetUpRecord, ot
 
 def differences(one: SetUpRecord, other: SetUpRecord) -> tuple[str, ...]:
     """Describe differences that may be the cause."""
-    told = [(f"{of.detector} {of.detector_version}", f"frames {of.frames}") for of in (one, other)]
-    said = [f"{before} → {now.removeprefix('frames ')}" for before, now in zip(*told, strict=True) if before != now]
+    facts = [(f"{of.detector} {of.detector_version}", f"frames {of.frames}") for of in (one, other)]
+    changes = [f"{before} → {now.removeprefix('frames ')}" for before, now in zip(*facts, strict=True) if before != now]
     for axis in sorted({*one.axes, *other.axes}):
         before, now = one.axes.get(axis, "default"), other.axes.get(axis, "default")
         if before != now:
-            said.append(f"{axis} {before} → {now}")
+            changes.append(f"{axis} {before} → {now}")
     if one.targets_digest != other.targets_digest:
-        said.append("other boards")
+        changes.append("other boards")
     elif one.frames_digest != other.frames_digest:
-        said.append("other frames of the same boards")
-    return tuple(said)
+        changes.append("other frames of the same boards")
+    return tuple(changes)
 
 
 def _p_values(row: ComparedSetUps) -> tuple[Tails | None, Tails | None, Tails | None]:
