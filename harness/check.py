@@ -66,12 +66,12 @@ def main(options: argparse.Namespace, command: str) -> int:
         what = f"with {study.boards} boards no loss is significant at {100 * ALPHA:g} %: the check cannot fail"
         fix = "raise study.boards: 24 are needed to detect a threshold that is 1.2 times as high"
         raise UserError(what, legal=f"at least {needed} boards for {many(set_ups, 'set-up')}", fix=fix)
-    asked = engine_options(options)
-    if not asked.shard.is_whole:
+    engine = engine_options(options)
+    if not engine.shard.is_whole:
         raise UserError("--shard: a check needs the whole study", fix="run harness.sweep in shards, merge, then check")
     path = options.baseline or BASELINES / f"{experiment.config.name}.json"
     baseline = _baseline(path, update=options.update)  # before anything runs: a study takes minutes
-    code = run_study(experiment, options.out, asked, command)
+    code = run_study(experiment, options.out, engine, command)
     if code not in (0, 1):
         return code
     folder = experiment.folder(options.out)

@@ -22,7 +22,7 @@ import numpy as np
 from detectors.open3d_library import load_open3d
 from detectors.recordings.arrays import SENSOR_SIZES
 from detectors.recordings.distances import UNITS_M, frame_of
-from detectors.recordings.recording import NO_GRID, Asked, Recording, damage_told
+from detectors.recordings.recording import NO_GRID, Given, Recording, damage_told
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import TABLE_BYTES, bounded_bytes, refuse_pixels
 from harness.vocabulary.geometry import Frame, Lens
@@ -33,11 +33,11 @@ RASTER_CORRELATION = 0.999
 """Correlation of x/z with the column and y/z with the row on a true pixel grid: a distorted lens bends 1 %."""
 
 
-def open_clouds(paths: Sequence[Path], asked: Asked, name: str) -> Recording:
+def open_clouds(paths: Sequence[Path], given: Given, name: str) -> Recording:
     """Open clouds in the order given, each a frame. Raises UserError on a broken file."""
-    scale_m = asked.scale_m or UNITS_M["m"]
+    scale_m = given.scale_m or UNITS_M["m"]
     is_list = paths[0].suffix.lower() in POINT_LISTS
-    read = partial(_frames, tuple(paths), _read_list if is_list else _read_cloud, asked.lens, scale_m)
+    read = partial(_frames, tuple(paths), _read_list if is_list else _read_cloud, given.lens, scale_m)
     recording = Recording.begun(name, read, scale_m, files=tuple(paths))
     height, width = recording.shape
     note = NO_GRID if height == 1 else f"the points fill a grid of {width} x {height} pixels" * is_list

@@ -36,7 +36,7 @@ def damage_told(what: str, legal: str, fix: str = "copy or export it again") -> 
 
 
 @dataclass(frozen=True)
-class Asked:
+class Given:
     """The user's statements about a capture. ``scale_m``: metres in one stored unit, None for the format's usual one.
     ``intrinsics``: a file with the depth pixels' lens, which counts before one that comes with the frames; ``lens``:
     the same as a value. ``frames`` selects frames by number. ``topic`` of a ROS bag. ``array``: NAME or NAME:NUMBER in

@@ -113,9 +113,9 @@ def _map_examples(group: Group, thresholds: Mapping[str, float]) -> list[MappedE
         return []
     set_ups = [load_set_up(ref) for ref in batch.set_ups]
     _, task = next(group.trials(batch, thresholds))
-    asked = next(iter(last.values())).config.capture
+    config = next(iter(last.values())).config.capture
     captures = [capture_of(set_up, number, task, most) for number, set_up in enumerate(set_ups)]
-    clouds = [averages_of(capture, [most], asked.average, asked.exact, asked.flat_field) for capture in captures]
+    clouds = [averages_of(capture, [most], config.average, config.exact, config.flat_field) for capture in captures]
     maps = MapMaker(set_ups, clouds, group.poses, ("damaged", 0))
     chosen = [point for (count, _), point in last.items() if count in ends]
     return [_map_example(maps, point, thresholds[point.digest], group.learned.get(point.digest)) for point in chosen]
@@ -210,8 +210,8 @@ def study_example(shown: ShownDamage, thresholds: Mapping[str, float]) -> StudyE
     group, batch, point, limit, where, row, half_m = shown
     seen = limit.record.inspected
     (task,) = (task for _, task in group.trials(batch, thresholds) if task.repeat == int(seen.repeat[row]))
-    asked = next(found for found in task.points if found.digest == point.digest)
-    set_up, judged = load_set_up(task.set_ups[0]), _judged(task, asked, asked.frames)
+    of_point = next(found for found in task.points if found.digest == point.digest)
+    set_up, judged = load_set_up(task.set_ups[0]), _judged(task, of_point, of_point.frames)
     damage = next(found for found in set_up.truth if str(found.id) == str(seen.hole[row]))
     rim = _outline_px(set_up, damage)
     pitch_mm = float(np.mean(set_up.pitch_mm))

@@ -107,8 +107,8 @@ class Group:
     @cached_property
     def learners(self) -> tuple[Point, ...]:
         """The points whose detector learns."""
-        asked = ((point, point.config.detector) for point in self.points)
-        return tuple(point for point, detector in asked if learns(detector.name, detector.settings))
+        pairs = ((point, point.config.detector) for point in self.points)
+        return tuple(point for point, detector in pairs if learns(detector.name, detector.settings))
 
     @cached_property
     def learned(self) -> dict[str, str]:
@@ -162,10 +162,10 @@ class Group:
         points = [point for point in every if unjudged or given[point.digest] is not None]
         points = [point for point in points if point.digest not in without]
         learned = self.learned
-        asked = {one.digest: point_task(one, given[one.digest], learned.get(one.digest)) for one in points}
+        tasks = {one.digest: point_task(one, given[one.digest], learned.get(one.digest)) for one in points}
         count = max((self.repeats(batch, point) for point in points), default=0)
         for repeat in range(count) if repeats is None else repeats:
-            wanted = tuple(asked[point.digest] for point in points if repeat < self.repeats(batch, point))
+            wanted = tuple(tasks[point.digest] for point in points if repeat < self.repeats(batch, point))
             if wanted:
                 task = TrialTask(batch.before(repeat), self.seed, batch.role, repeat, wanted, self.poses, batch.board)
                 yield self._key(batch, task), task
@@ -189,9 +189,9 @@ class Group:
 def point_task(point: Point, threshold: float | None, learned: str | None) -> PointTask:
     """Return a point's part of a trial. ``threshold`` is None during calibration; ``learned`` as in `PointTask`."""
     capture, detector, matching = point.config.capture, point.config.detector, point.config.matching
-    asked = (detector.name, canonical_json(detector.settings), capture.average, matching.radius_mm * MM, threshold)
+    first = (detector.name, canonical_json(detector.settings), capture.average, matching.radius_mm * MM, threshold)
     further = (point.config.mapping, capture.exact, learned, capture.flat_field, matching.overlap)
-    return PointTask(point.digest, point.variant, capture.frames, *asked, *further)
+    return PointTask(point.digest, point.variant, capture.frames, *first, *further)
 
 
 @dataclass(frozen=True)
@@ -228,9 +228,9 @@ def _before_thresholds(group: Group) -> str:
     batches = (*group.learning, *group.first)
     if not batches or batches[-1].board is None:
         return group.points[0].frames_key
-    asked = [replace(point_task(point, None, None), digest="", variant="") for point in group.points]
+    tasks = [replace(point_task(point, None, None), digest="", variant="") for point in group.points]
     seen = [(batch.paths, [ref.camera for ref in batch.before(0)]) for batch in batches]
-    return repr([group.seed, group.poses, asked, [point.config.threshold for point in group.points], seen])
+    return repr([group.seed, group.poses, tasks, [point.config.threshold for point in group.points], seen])
 
 
 def _group(points: tuple[Point, ...], cache: Path, folder: Path) -> Group:

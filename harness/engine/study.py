@@ -340,8 +340,8 @@ def failures_by_point(
     every = [(group, batch) for group in plan.groups for batch in group.batches] if by_key else []
     for group, batch in every:
         for key, task in group.trials(batch, thresholds if batch in group.then else {}):
-            for asked in task.points if key in by_key else ():
-                found.setdefault(asked.digest, []).append(by_key[key])
+            for point in task.points if key in by_key else ():
+                found.setdefault(point.digest, []).append(by_key[key])
     return found
 
 

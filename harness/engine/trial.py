@@ -315,8 +315,8 @@ def run_trial(task: TrialTask) -> Rows:
     record: Rows = {name: [] for name in TABLES}
     by_average: dict[str, list[PointTask]] = {}
     for point in task.points:
-        asked = [point.average.to_data(), point.exact, point.flat_field and point.flat_field.to_data()]
-        by_average.setdefault(canonical_json(asked), []).append(point)
+        averaging = [point.average.to_data(), point.exact, point.flat_field and point.flat_field.to_data()]
+        by_average.setdefault(canonical_json(averaging), []).append(point)
     for points in by_average.values():
         began = time.perf_counter()
         clouds = [_clouds(set_up, number, task, points) for number, set_up in enumerate(set_ups)]
@@ -381,8 +381,8 @@ def _point_rows(
         of_map = {"views_used": used, "views_left_out": maps.count(mapping) - used}
         of_map["seconds_map"] = maps.seconds(mapping, point.frames)
         source = maps.key(mapping, point.frames)
-    asked = (point.detector, point.settings_json, point.threshold, point.radius_m)
-    key = canonical_json([source, *asked, point.learned, point.overlap])
+    judging = (point.detector, point.settings_json, point.threshold, point.radius_m)
+    key = canonical_json([source, *judging, point.learned, point.overlap])
     if key not in done:
         if maps is None or mapping is None:
             known = known_view(first, views[point.frames], hole_free=task.hole_free)
@@ -392,7 +392,7 @@ def _point_rows(
                 errors_m = face_errors_m(known, first.board_xy_m.reshape(-1, 2)[first.probes])
                 probes = [{"error_tenth_um": _tenth_um(errors_m)}]
         began = time.perf_counter()
-        judged = judge(known, *asked, overlap=point.overlap, hole_free=task.hole_free, learned=point.learned)
+        judged = judge(known, *judging, overlap=point.overlap, hole_free=task.hole_free, learned=point.learned)
         judged.run["seconds_detect"] = time.perf_counter() - began
         if task.board is None:
             done[key] = {"runs": [judged.run], "holes": judged.holes, "probes": probes}

@@ -45,9 +45,9 @@ class SimulatedUnit:
         """Sums of frames of the view without drawing each; None where frames must be drawn, or for other kinds."""
         if not isinstance(self.model, AmcwImager):
             return None
-        asked = np.zeros(self.view.range_m.shape, bool)
-        asked[self.cut] = True
-        return at_once(self.model, self.exposure, asked)
+        wanted = np.zeros(self.view.range_m.shape, bool)
+        wanted[self.cut] = True
+        return at_once(self.model, self.exposure, wanted)
 
     @cached_property
     def region(self) -> Region:

@@ -105,11 +105,11 @@ def compare_studies(first: StudyRecord, second: StudyRecord, alpha: float = ALPH
         signal = paired.signal_change(one, other) if same else None
         rows.append(ComparedSetUps(before, now, changed, paired.limit_change(before, now, same), hits, calls, signal))
     # A question that was not asked is no member of the family.
-    asked = [p for row in rows for p in _p_values(row)]
+    p_values = [p for row in rows for p in _p_values(row)]
     sides = []
     for side in (0, 1):
-        adjusted = iter(holm(p[side] for p in asked if p is not None))
-        sides.append([1.0 if p is None else float(next(adjusted)) for p in asked])
+        adjusted = iter(holm(p[side] for p in p_values if p is not None))
+        sides.append([1.0 if p is None else float(next(adjusted)) for p in p_values])
     p = list(zip(*sides, strict=True))
     judged = []
     for k, row in enumerate(rows):

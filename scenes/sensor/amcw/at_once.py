@@ -204,8 +204,8 @@ def windows_of(image: np.ndarray, side: int, beyond: float, pixels: np.ndarray) 
     return windows[np.divmod(pixels, image.shape[1])].reshape(-1, side * side)
 
 
-def at_once(imager: AmcwImager, exposure: AmcwExposure, asked: np.ndarray) -> AtOnce | None:
-    """Return the sums of frames at the pixels ``asked`` (h, w) bool; None where frames must be drawn: without noise
+def at_once(imager: AmcwImager, exposure: AmcwExposure, pixels: np.ndarray) -> AtOnce | None:
+    """Return the sums of frames at the pixels ``pixels`` (h, w) bool; None where frames must be drawn: without noise
     that hides the converter's steps, where a sample may saturate or not, or where many pixels hang on a gate."""
     largest = np.abs(exposure.means).max(axis=(0, 1))
     lost = largest - DEVIATIONS * exposure.sigma > exposure.limit
@@ -220,7 +220,7 @@ def at_once(imager: AmcwImager, exposure: AmcwExposure, asked: np.ndarray) -> At
     shape, n, unit = exposure.shape, exposure.sigma.size, imager.camera.unit
     light = light_of_samples(exposure, float(knee), imager.gains)
 
-    # each pixel that is asked for after the filter, and how noise moves it
+    # each requested pixel after the filter, and how noise moves it
     noise_free = np.stack([light.phasor.real, light.phasor.imag]).astype(f4)
     noise_free[:, :, lost] = 0
     strength = light.amplitude if window.by_amplitude else light.bright
@@ -229,12 +229,12 @@ def at_once(imager: AmcwImager, exposure: AmcwExposure, asked: np.ndarray) -> At
     even = even_pixels(edge, light, window, shape, wild | lost)
     filtered = unknown_filtered(len(light.turn), n)
     of_even = fill_even(even, alone.reshape(len(alone), 3, n), edge, light, window, shape, filtered)
-    # what the engine looks at in the finished image of the pixels asked for is one pixel farther
-    rest = np.flatnonzero(~even & ndimage.binary_dilation(asked, np.ones((3, 3), bool)).ravel())
+    # what the engine looks at in the finished image of the requested pixels is one pixel farther
+    rest = np.flatnonzero(~even & ndimage.binary_dilation(pixels, np.ones((3, 3), bool)).ravel())
     moved = linearised(rest, light, window, shape, wild, lost, filtered)
     farthest_m = (unit.jump_mm.value + JITTERS * unit.jitter_mm.value + abs(unit.drift_mm.value)) * MM
     certain = certainty(filtered, imager.engine, lost, shape, farthest_m)
-    wanted = ~(certain.always | certain.never) & asked.ravel()
+    wanted = ~(certain.always | certain.never) & pixels.ravel()
     if wanted.mean() > MOST_LISTED:
         return None
 
