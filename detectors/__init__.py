@@ -1,7 +1,6 @@
 """The path from frames to findings; it runs on real captures without Mitsuba and does not import scenes.
 
-Detectors are found by name: the built-in ones below, others through the entry point group ``tofpod.detectors``.
-"""
+Detectors are found by name: the built-in ones below, others through the entry point group ``tofpod.detectors``."""
 
 from __future__ import annotations
 

@@ -33,19 +33,18 @@ class AverageConfig(Config):
     many. A frame *jumps* if the median over pixels of its difference to the reference exceeds the larger of
     ``jump_sigmas`` standard errors and ``jump_mm`` (ten times the wander of a static Azure Kinect). It is *disturbed*
     if more than ``disturbed_fraction`` of its pixels (beyond 1.5 times what the reference frames show) lost their range
-    or changed by more than the larger of ``changed_sigmas`` of one frame's noise and ``changed_mm``.
-    """
+    or changed by more than the larger of ``changed_sigmas`` of one frame's noise and ``changed_mm``."""
 
     method: Literal["mean", "median", "clipped"] = "mean"
     frames: int | None = Field(default=None, ge=1)
-    judge_frames: bool = True
+    judge_frames: bool = Field(True, description="leaves out frames that jump or are disturbed")
     jump_mm: float = Field(default=3.0, gt=0)
     jump_sigmas: float = Field(default=6.0, gt=0)
     changed_mm: float = Field(default=6.0, gt=0)
     changed_sigmas: float = Field(default=6.0, gt=0)
     disturbed_fraction: float = Field(default=0.05, gt=0, le=1)
     clip_sigmas: float = Field(default=5.0, ge=2)
-    median_memory_mb: float = Field(default=2000.0, gt=0)
+    median_memory_mb: float = Field(default=2000.0, gt=0, description="most memory that the median may use")
 
 
 MOST_LEFT_OUT = 0.25  # share of the frames from which on more than an accident disturbed a recording

@@ -203,8 +203,8 @@ def _solved(
     shapes_m[there] = (found[pixels:] * np.sqrt(shape_m2))[cell]
     variance_m2 = np.full(pixels, pattern_m2)
     for _ in range(BELIEF_STEPS):
-        told = 1 / (noise_m2 + variance_m2[pixel])
-        left_m2 = 1 / (1 / shape_m2 + np.bincount(cell, told, cells)[cell] - told)
+        precision = 1 / (noise_m2 + variance_m2[pixel])
+        left_m2 = 1 / (1 / shape_m2 + np.bincount(cell, precision, cells)[cell] - precision)
         variance_m2 = 1 / (1 / pattern_m2 + np.bincount(pixel, 1 / (noise_m2 + left_m2), pixels))
     unseen = ~there.any(axis=0)
     error_m, variance_m2 = (np.where(unseen, np.nan, each.reshape(unseen.shape)) for each in (error_m, variance_m2))
@@ -244,21 +244,21 @@ def _change(rests: np.ndarray, variances: np.ndarray, one: Sequence[int], other:
 
 def _with_doubts(found: Separated) -> Separated:
     """Return the same with warnings, and a variance that holds for a pattern that is not stable."""
-    said, captures, field, rms_m = [], found.captures, found.field, found.field.rms_m
+    notes, captures, field, rms_m = [], found.captures, found.field, found.field.rms_m
     if len(captures) == 1 or not _moved(captures):
-        told = "one capture" if len(captures) == 1 else "nothing shows that the camera moved between the captures"
-        told += ": the surface's shape cannot be separated from the pattern and is assumed to be flat"
-        said.append(f"{told} (move the camera by {LEAST_SHIFT_M / MM:.0f} mm; if along the surface, state --poses)")
+        why = "one capture" if len(captures) == 1 else "nothing shows that the camera moved between the captures"
+        why += ": the surface's shape cannot be separated from the pattern and is assumed to be flat"
+        notes.append(f"{why} (move the camera by {LEAST_SHIFT_M / MM:.0f} mm; if along the surface, state --poses)")
     parts = ((found.in_time, "from the first captures to the last"), (found.in_range, "with distance"))
     known = [(part, apart) for part, apart in parts if part is not None and part.difference_m > SURE * part.noise_m]
     changes = [(part, apart) for part, apart in known if part.excess_m > STABLE_SHARE * rms_m]
     # of two parts that scatter by t each, the mean is off a third one by 3/2 t^2, and their difference is 2 t^2
     variance_m2 = field.variance_m2 + 0.75 * max((part.excess_m for part, _ in changes), default=0.0) ** 2
     if changes:
-        told = " and ".join(f"{apart} by {part.excess_m / MM:.2g} mm" for part, apart in changes)
+        why = " and ".join(f"{apart} by {part.excess_m / MM:.2g} mm" for part, apart in changes)
         also = "" if found.separated else ", or the surface is not flat (state --poses to separate the two)"
-        said.append(f"the pattern, {rms_m / MM:.2g} mm, is not stable: it changes {told} beyond its noise{also}")
-    return replace(found, field=replace(field, variance_m2=variance_m2, warnings=tuple(said)))
+        notes.append(f"the pattern, {rms_m / MM:.2g} mm, is not stable: it changes {why} beyond its noise{also}")
+    return replace(found, field=replace(field, variance_m2=variance_m2, warnings=tuple(notes)))
 
 
 def _moved(captures: Sequence[FlatCapture]) -> bool:

@@ -1,9 +1,8 @@
 """A unit's fixed pattern as a map over its sensor: its file, and the correction of a cloud by it.
 
-The pattern is taken for an error of range along each pixel's ray that is the same in every capture. Not modelled: a
-pattern that changes with distance, temperature or brightness (`detectors.flat_captures` tests the first two), and what
-a depth engine's filter mixes at the edge of a hole.
-"""
+The pattern is assumed to be a range error along each pixel's ray that is the same in every capture. Not modelled: a
+pattern that changes with distance, temperature or brightness (`detectors.flat_captures` tests the first two), and the
+mixing of pixels by a depth engine's filter at the edge of a hole."""
 
 from __future__ import annotations
 
@@ -33,7 +32,7 @@ AGAIN = "run python -m harness.flatfield on captures of this camera in this mode
 
 
 class FlatFieldConfig(Config):
-    """A flat field to record: ``frames`` of a plane across the axis, ``distance_m`` away."""
+    """A flat field to record: ``frames`` of a plane across the optical axis at ``distance_m``."""
 
     frames: int = Field(ge=LEAST_FRAMES, le=10_000)
     distance_m: float = Field(gt=0, le=100)
@@ -76,17 +75,17 @@ def corrected(cloud: Cloud, field: FlatField) -> Cloud:
 
 def doubts(cloud: Cloud, field: FlatField, name: str | Path) -> tuple[str, ...]:
     """Return full sentences on doubts about the correction of a cloud; ``name``: the flat field's."""
-    said = [f"the flat field {name}: {warning}" for warning in field.warnings]
+    notes = [f"the flat field {name}: {warning}" for warning in field.warnings]
     known = np.isfinite(field.error_m[cloud.region.within(field.lens.whole)])
     share = float(known[cloud.valid].mean()) if cloud.valid.any() else 1.0
     if share < WELL_COVERED:
-        said.append(f"the flat field {name} covers {100 * share:.0f} % of the valid pixels; others are not corrected")
+        notes.append(f"the flat field {name} covers {100 * share:.0f} % of the valid pixels; others are not corrected")
     distance_m = float(np.median(cloud.points_m[cloud.valid][:, 2])) if cloud.valid.any() else np.nan
     near, far = field.distances_m
     if distance_m * NEAR_ENOUGH < near or distance_m > far * NEAR_ENOUGH:
         measured = f"{near:.2f} m" if far < near * 1.01 else f"{near:.2f} to {far:.2f} m"
-        said.append(f"the flat field {name} was measured at {measured}, this capture is at {distance_m:.2f} m")
-    return tuple(said)
+        notes.append(f"the flat field {name} was measured at {measured}, this capture is at {distance_m:.2f} m")
+    return tuple(notes)
 
 
 def _refuse_other(cloud: Cloud, field: FlatField) -> None:
@@ -131,14 +130,14 @@ def load_flat_field(path: Path) -> FlatField:
         refuse_pixels(str(path), lens.width, lens.height)
         maps: list[Any] = [held[name].astype(np.float32) for name in ("error_m", "variance_m2")]
         near, far = held["distances_m"].astype(float).tolist()
-        told = json.loads(str(held["warnings"]))
+        warnings = json.loads(str(held["warnings"]))
         error_m, variance_m2 = maps
         known = np.isfinite(error_m)
         sound = error_m.shape == variance_m2.shape == (lens.height, lens.width) and len(lens.distortion) == 8
         sound = sound and known.any() and bool((variance_m2[known] >= 0).all()) and 0 < near <= far < np.inf
-        if not (sound and all(isinstance(each, str) for each in told)):
+        if not (sound and all(isinstance(each, str) for each in warnings)):
             raise ValueError("its arrays do not belong together")
     except (KeyError, ValueError, TypeError) as error:
         why = f"it has no {error}" if isinstance(error, KeyError) else str(error)[:200]
         raise UserError(f"{path}: not a flat field ({why})", legal="a file of harness.flatfield", fix=AGAIN) from error
-    return FlatField(error_m, variance_m2, lens, (near, far), tuple(told))
+    return FlatField(error_m, variance_m2, lens, (near, far), tuple(warnings))

@@ -53,8 +53,7 @@ class MissingReturns:
     outline's pixels without any return. ``dropouts``: rate of scattered missing pixels. ``least_points``: size from
     which on a cluster is a finding, ``expected`` the number of such chance clusters. ``detections``: kind "no return",
     largest first; the score is the Gaussian deviation as improbable as the expected number of chance clusters as large,
-    at most 37.
-    """
+    at most 37."""
 
     outline: np.ndarray
     unseen: np.ndarray
@@ -86,8 +85,7 @@ class Measurement:
     ``length_m``, ``width_m``, ``along`` (3,): sides of a rectangle with the second moments of the residual, less the
     camera's blur, and the direction of the longer one; of a slot its size, of a round hole of diameter d 0.87 d each.
     ``extent_*``: the thesis' measure from the extreme points. ``model_*``: from the model of a blurred hole, with
-    standard errors. ``depth_m`` is measured along the viewing axis from the fitted surface, positive behind it.
-    """
+    standard errors. ``depth_m`` is measured along the viewing axis from the fitted surface, positive behind it."""
 
     u_px: float
     v_px: float

@@ -63,7 +63,7 @@ class FilterConfig(Config):
 
 
 class LocalConfig(FilterConfig):
-    """``surface``: chosen by evidence where neither shape nor degree is given. ``hole_model``: measures sizes."""
+    """``surface``: ``shape: auto`` unless shape or degree is given. ``hole_model``: measures sizes."""
 
     @model_validator(mode="before")
     @classmethod
@@ -212,8 +212,7 @@ def _scored(
 
     From the narrowest filter to the widest: a pixel that is sure in one, by a share from 0 to 1, takes no part in the
     wider ones of other pixels; a strong pixel takes no part in surroundings and noise. A sure pixel's score still grows
-    with the width, where narrower means confirm it (`_strongest`).
-    """
+    with the width, where narrower means confirm it (`_strongest`)."""
     seen = weights > 0
     # in units of the typical pixel's noise: single precision is then enough
     unit_m = max(sigma_of(residual[seen]), float(np.sqrt(sum(rounding_m2))), 1e-9)

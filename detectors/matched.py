@@ -18,8 +18,7 @@ Not modelled: slots that no template fits; slots within `RIM_PX` of outlines and
 distortion where a surface is steep; missing returns but for the few that are no findings by themselves
 (`detectors.missing`). The denominator takes the share of a template's whitened energy on known pixels for t' C^-1 t, by
 a rectangle that spreads as widely; places where less than `LEAST_SEEN` of it is seen are not judged by that template.
-Scores of slots are taken on every second pixel.
-"""
+Scores of slots are taken on every second pixel."""
 
 from __future__ import annotations
 
@@ -93,7 +92,7 @@ a Gaussian has it. Wider means are near Gaussian, and too few of them are indepe
 
 
 class MatchedConfig(FilterConfig):
-    """``surface``: the thesis' polynomial unless ``shape: auto`` is asked for. ``hole_model``: measures sizes."""
+    """``surface``: the thesis' polynomial unless its ``shape`` is given. ``hole_model``: measures sizes."""
 
 
 class MatchedDetector(LocalDetector):

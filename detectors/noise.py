@@ -49,8 +49,7 @@ def rounding_variances(cloud: Cloud, mask: np.ndarray) -> tuple[float, float]:
 
     Rounding to a step q errs by q / sqrt(12). Noise before the rounding turns part of that into noise, which averages
     out, and leaves a fixed pattern b^2 (`rounding_left_m2`): after n frames b^2 + (q^2 / 12 - b^2) / n. All stays where
-    the averaged z still lies on the steps, as a median does. Without a step, z is taken to be stored as float32.
-    """
+    the averaged z still lies on the steps, as a median does. Without a step, z is taken to be stored as float32."""
     z = cloud.points_m[..., 2][mask]
     step = cloud.z_step_m if cloud.z_step_m > 0 else float(np.finfo(np.float32).eps) * float(np.abs(z).max())
     whole = step**2 / 12.0

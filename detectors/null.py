@@ -8,8 +8,7 @@ the maxima of normal noise in two dimensions are more. The data weigh the expone
 scales are integrated out.
 
 Not modelled: noise that is not symmetric beyond what `skew_of` sees in the core; damage towards the camera that is no
-larger than the noise; objects on clouds without a grid, or that neither stand out nor are seen in a picture.
-"""
+larger than the noise; objects on clouds without a grid, or that neither stand out nor are seen in a picture."""
 
 from __future__ import annotations
 
@@ -109,8 +108,8 @@ def own_threshold(detector: Detector, cloud: Cloud, evidence: Evidence, false_ca
         share = f"{100 * hidden / known.sum():.0f} % of what is judged"
         doubts.append(f"{share} lies under or beside objects, and the rest may not stand for the whole")
     expected, searched = 2.0 * tail.expected(threshold), _only(evidence, ~rim)
-    told = (tail.peaks, tail.floor, objects, int(rim.sum()))
-    return OwnThreshold(threshold, expected, low, high, *told, searched, tuple(doubts))
+    counts = (tail.peaks, tail.floor, objects, int(rim.sum()))
+    return OwnThreshold(threshold, expected, low, high, *counts, searched, tuple(doubts))
 
 
 def each_object_once(cloud: Cloud, evidence: Evidence, found: tuple[Detection, ...]) -> tuple[Detection, ...]:

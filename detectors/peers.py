@@ -2,8 +2,7 @@
 
 `m3c2` asks py4dgeo for the distance to a surface and its level of detection; `plane_ransac` takes Open3D's plane;
 `fpfh_memory` compares features of shape with those of undamaged targets. Each has the settings and the formula of its
-source; none knows the camera's noise.
-"""
+source; none knows the camera's noise."""
 
 from __future__ import annotations
 
@@ -42,8 +41,8 @@ MOST_ALONE = 0.01
 
 
 class PlaneRansacConfig(ScoreMapConfig):
-    """``inlier_mm``: distance from the plane up to which a point supports it, some three deviations of one frame of a
-    continuous-wave camera. ``iterations``: most triples of points that are tried; ``seed`` draws them."""
+    """``inlier_mm``: distance up to which a point supports the plane; the default is about three deviations of a single
+    frame of a continuous-wave camera. ``iterations``: most triples of points that are tried; ``seed`` draws them."""
 
     crop: CropConfig = Field(default_factory=AutoCrop)
     inlier_mm: float = Field(default=2.0, gt=0)
@@ -86,12 +85,12 @@ class PlaneRansacDetector(ScoreMapDetector[PlaneRansacConfig]):
 
 
 class M3c2Config(ScoreMapConfig):
-    """``reference``: a capture of the same target without damage, any that ``harness.detect`` reads, in the frame of
-    the clouds; without it the distance is to ``surface``, fitted to the cloud itself. ``registration_error_mm``: how
-    well the two agree where nothing has changed; none: by the scatter of the distances. ``cylinder_radius_mm``: half of
-    the scale over which points are averaged: 4 mm hold some 20 of the pixels of an Azure Kinect at 0.7 m, as Lague et
-    al. ask for. ``normal_radius_mm``: of the neighbourhood that a normal is fitted to, 20 times a noise of 1 mm.
-    ``reach_mm``: half of a cylinder's length; deeper points have no counterpart."""
+    """``reference``: a capture of the same target without damage, in any format that ``harness.detect`` reads and in
+    the frame of the clouds; without it, distances are to ``surface``, fitted to the cloud itself.
+    ``registration_error_mm``: the error between both; null: estimated from the scatter of the distances.
+    ``cylinder_radius_mm``: half of the scale over which points are averaged; 4 mm holds some 20 pixels of an Azure
+    Kinect at 0.7 m, as Lague et al. recommend. ``normal_radius_mm``: radius of the neighbourhood for a normal, 20 times
+    a noise of 1 mm. ``reach_mm``: half of a cylinder's length; points deeper than it have no counterpart."""
 
     crop: CropConfig = Field(default_factory=AutoCrop)
     surface: SurfaceConfig = Field(default_factory=SurfaceConfig)
@@ -150,8 +149,8 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
         notes |= {"points": len(points), "registration_error_m": error_m, "without_counterpart": alone}
         residual_m, z_m = (on_grid(each, mask) for each in (points[:, 2] - feet[:, 2], feet[:, 2]))
         scale_m = median_of(deviation_m[judged])
-        told = tuple(filter(None, warnings))
-        return Evidence(np.abs(signed), residual_m, z_m, scale_m, notes, told, behind=signed > 0)
+        doubts = tuple(filter(None, warnings))
+        return Evidence(np.abs(signed), residual_m, z_m, scale_m, notes, doubts, behind=signed > 0)
 
     def places(self, points_m: np.ndarray) -> np.ndarray:
         """Return the places across the view, so that a rim and what lies deep behind it are one finding."""
@@ -204,9 +203,10 @@ def _py4dgeo() -> Any:
 
 
 class FpfhMemoryConfig(ScoreMapConfig):
-    """``normal_neighbours``, ``feature_neighbours``: points in the sphere of a normal and of a feature, at a typical
-    place, and ``pool_px``: side of the square over which features are averaged (30, 100 and 8 in the paper's program).
-    ``memory``: features of undamaged targets that are kept. ``surface``: what sizes are measured from."""
+    """``normal_neighbours``, ``feature_neighbours``: typical number of points in the sphere of a normal and of a
+    feature. ``pool_px``: side of the square over which features are averaged. The paper's program has 30, 100 and 8.
+    ``memory``: number of features of undamaged targets that are kept. ``surface``: the surface from which sizes are
+    measured."""
 
     crop: CropConfig = Field(default_factory=AutoCrop)
     surface: SurfaceConfig = Field(default_factory=SurfaceConfig)

@@ -1,6 +1,6 @@
-"""The thesis' detector: points farther from a surface than k deviations, in clusters at 10 mm. The text's variant:
-robust cubic, robust deviations of the residual. The script's: ``surface: {method: least_squares, drop_cross_terms:
-true}, scale: raw_z_std``, at k = 1.2. `highest_before` excludes outliers that are not damage, as the text also asks."""
+"""The thesis' detector: it clusters points that lie more than k deviations from a surface. The defaults follow the
+text: a robust cubic and a robust deviation of the residual. Its script uses ``surface: {method: least_squares,
+drop_cross_terms: true}, scale: raw_z_std`` with k = 1.2. `highest_before` follows the text's rule against outliers."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from harness.vocabulary.geometry import Cloud
 
 
 class ThesisConfig(ScoreMapConfig):
-    """``scale``: the deviation that one unit of score means: ``mad`` (median |residual| / 0.6745), ``residual_std``,
-    ``raw_z_std``, or ``highest_before``: the largest residual of this cloud towards the camera, where no hole can be; k
-    = 1 then leaves out what is as large behind the surface. With a shape other than ``polynomial`` it is the local
-    noise. ``use_variance``: where a map states each point's variance, one unit of score is a multiple of each point's
-    own deviation (but for ``raw_z_std``)."""
+    """``scale`` is the unit of score: ``mad`` (median |residual| / 0.6745), ``residual_std``, ``raw_z_std``, or
+    ``highest_before``, the cloud's largest residual towards the camera, where no hole can be; k = 1 then requires a
+    residual behind the surface to exceed it. With a shape other than ``polynomial``, the unit is the local noise.
+    ``use_variance``: where a map states each point's variance, the unit is proportional to each point's own deviation
+    (not with ``raw_z_std``)."""
 
     crop: CropConfig = Field(default_factory=BoxCrop)
     surface: SurfaceConfig = Field(default_factory=SurfaceConfig)
@@ -32,7 +32,7 @@ class ThesisConfig(ScoreMapConfig):
 
 
 class ThesisDetector(ScoreMapDetector[ThesisConfig]):
-    """The thesis' detector: points k deviations off a surface through the cropped cloud, in clusters."""
+    """The thesis' detector: clusters of points that lie k deviations off a surface through the cropped cloud."""
 
     settings_type: ClassVar[type[ThesisConfig]] = ThesisConfig
     name = "thesis"
@@ -40,7 +40,7 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
 
     @property
     def default_threshold(self) -> float | None:
-        """Threshold k that the thesis states: 1 of the cloud's own highest residual, none of other scales."""
+        """The threshold k that the thesis states: 1 with ``highest_before``, none with other scales."""
         return 1.0 if self.settings.scale == "highest_before" else None
 
     def analyse(self, cloud: Cloud) -> Evidence:
@@ -68,7 +68,7 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
         return Evidence(score, residual_m, z_m, float(np.median(scale)), notes)
 
     def _before_background(self, cloud: Cloud, mask: np.ndarray) -> Evidence:
-        """Analyse with a surface whose shape is chosen: one unit of score is the noise round about each pixel."""
+        """Analyse with a surface whose shape is chosen. One unit of score is the noise around each pixel."""
         behind = background(cloud, mask, self.settings.surface)
         unit, stated = np.maximum(behind.noise_m, rounding_floor(cloud, mask)), self._stated_deviation(cloud, mask)
         if stated is not None:

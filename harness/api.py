@@ -87,8 +87,8 @@ def render(
     True
     """
     config = settings_of(CameraConfig, {"name": camera, "unit_seed": unit_seed}, "camera")
-    facts, asked = camera_of(config), settings_of(RenderConfig, work, "render")
-    view, _ = cached_view(target.at_wavelength(facts.optics.wavelength_nm), facts.optics, asked, Path(cache))
+    facts, settings = camera_of(config), settings_of(RenderConfig, work, "render")
+    view, _ = cached_view(target.at_wavelength(facts.optics.wavelength_nm), facts.optics, settings, Path(cache))
     return SimulatedUnit(facts, config, view)
 
 
@@ -135,8 +135,8 @@ def detect(cloud: Cloud, detector: str = DEFAULT_DETECTOR, threshold: float | No
     chosen = {"surface": {"shape": "auto"}} if detector == DEFAULT_DETECTOR else {}
     finder = load_detector(detector, chosen | settings)
     evidence = analysed(finder, cloud)
-    asked = argparse.Namespace(threshold=threshold, quiet_capture=None, false_calls=None)
-    used, _, evidence = threshold_of(asked, finder, cloud, evidence, lambda: (float("nan"), ""))
+    options = argparse.Namespace(threshold=threshold, quiet_capture=None, false_calls=None)
+    used, _, evidence = threshold_of(options, finder, cloud, evidence, lambda: (float("nan"), ""))
     return judged(finder, cloud, evidence, used)
 
 

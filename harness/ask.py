@@ -54,14 +54,14 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.tables.schema import write_table
     from scenes.sensor.camera import load_camera
 
-    asked = sum(given is not None for given in (options.size, options.distance))
-    if asked == 1 or (not asked and options.out is None):
+    ends = sum(given is not None for given in (options.size, options.distance))
+    if ends == 1 or (not ends and options.out is None):
         legal = "--damage hole --size 5mm --distance 1m, or --out DIR for the whole atlas"
         raise UserError("a question needs --size and --distance", legal=legal)
     limits, about = _read(options.atlas or shipped("baselines") / STORED)
     surfaces = surfaces_of(limits)
     titles = {name: load_camera(name).title for name in dict.fromkeys(surface.camera for surface in surfaces)}
-    if asked:
+    if ends:
         _answer(options, surfaces, titles, about)
     if options.out is not None:
         from harness.report.atlas import atlas_html, save_atlas_png
@@ -116,12 +116,12 @@ def _answer(options: argparse.Namespace, surfaces: Sequence[LimitSurface], title
 
     size_mm, distance_m = 1e3 * length_m("--size", options.size), length_m("--distance", options.distance)
     kind = KINDS.get(options.damage, options.damage)
-    asked = _chosen(options, surfaces, kind)
+    chosen = _chosen(options, surfaces, kind)
     given = {"distance_m": [distance_m], "frames": [options.frames], "albedo": [options.albedo], "depth_mm": [None]}
     if options.depth is not None:
         given["depth_mm"] = [1e3 * length_m("--depth", options.depth)]
     for axis, values in given.items():
-        computed = sorted({value for surface in asked for value in surface.grid.get(axis, ())})
+        computed = sorted({value for surface in chosen for value in surface.grid.get(axis, ())})
         option = f"--{axis.partition('_')[0]}"
         if values == [None]:
             if axis == "depth_mm" and len(computed) > 1:
@@ -132,20 +132,20 @@ def _answer(options: argparse.Namespace, surfaces: Sequence[LimitSurface], title
     places = [dict(zip(filter(given.get, given), each, strict=True)) for each in product(*filter(None, given.values()))]
     rows, whose = [], dict[str, set[str]]()
     for place in places:
-        found, why = rows_at(asked, titles, place, size_mm)
+        found, why = rows_at(chosen, titles, place, size_mm)
         rows += found
         for reason, title in why:
             whose.setdefault(reason, set()).add(title)
-    all_asked = {titles[surface.camera] for surface in asked}
-    refused = [reason if of == all_asked else f"{', '.join(sorted(of))}: {reason}" for reason, of in whose.items()]
+    all_chosen = {titles[surface.camera] for surface in chosen}
+    refused = [reason if of == all_chosen else f"{', '.join(sorted(of))}: {reason}" for reason, of in whose.items()]
     if not rows:
-        fix = f"compute it: {_exactly(asked[0], places[0], about)}"
+        fix = f"compute it: {_exactly(chosen[0], places[0], about)}"
         raise UserError("the atlas does not reach so far: " + "; ".join(refused), fix=fix)
     for text in _warnings(row.surface.camera for row in rows):
         print(f"warning: {text}")
     verdicts = [row.answer.verdict(size_mm) for row in rows]
-    said = ", ".join(f"{name} for {verdicts.count(name)}" for name in ("no", "undecided") if name in verdicts)
-    of_all = f"{verdicts.count('yes')} of {many(len(rows), 'set-up')}" + (f" ({said})." if said else ".")
+    others = ", ".join(f"{name} for {verdicts.count(name)}" for name in ("no", "undecided") if name in verdicts)
+    of_all = f"{verdicts.count('yes')} of {many(len(rows), 'set-up')}" + (f" ({others})." if others else ".")
     asked_for = f"{damage_words(kind).capitalize()}s of {size_mm:g} mm at {distance_m:g} m"
     answer = f"{asked_for} are found nine times out of ten in {of_all}"
     errors = [row.surface.error for row in rows if np.isfinite(row.surface.error)]
@@ -172,9 +172,9 @@ def _chosen(options: argparse.Namespace, surfaces: Sequence[LimitSurface], kind:
             legal = [*(word for word, kind in KINDS.items() if name == "kind" and kind in there), *there]
             near = nearest(unknown[0], (*legal, *(KINDS if name == "kind" else ())))
             meant = f"; did you mean {near!r}?" if near and near != unknown[0] else ""
-            said = f"{option} {options.damage if name == 'kind' else ', '.join(unknown)}: not in the atlas{meant}"
+            what = f"{option} {options.damage if name == 'kind' else ', '.join(unknown)}: not in the atlas{meant}"
             fix = "run a study of damage that is not in the atlas, such as tofpod sweep crack"
-            raise UserError(said, legal=", ".join(legal), fix=fix if name == "kind" else None)
+            raise UserError(what, legal=", ".join(legal), fix=fix if name == "kind" else None)
     cameras = options.camera or [surface.camera for surface in surfaces]
     return [one for one in surfaces if one.kind == kind and one.detector == detector and one.camera in cameras]
 

@@ -72,10 +72,10 @@ def main(options: argparse.Namespace, command: str) -> int:
     if options.like:
         with_lens(options.like, captures[0].lens)  # of another size it cannot be refitted
     found = characteristics(captures, poses)
-    told = (options.rate, "stated by the user", "U") if options.rate else (30.0, "assumed", "M")
+    rate_of = (options.rate, "stated by the user", "U") if options.rate else (30.0, "assumed", "M")
     if options.like and not options.rate:
-        told = (load_camera(options.like).unit.frames_per_second.value, f"of {options.like}", "M")
-    rate = Stated("unit", "frames_per_second", *told)
+        rate_of = (load_camera(options.like).unit.frames_per_second.value, f"of {options.like}", "M")
+    rate = Stated("unit", "frames_per_second", *rate_of)
     names = ", ".join(capture.name for capture in captures)
     print("fitting the camera file ..", file=sys.stderr)
     camera = write_camera(options.out / CAMERA_FILE, options.title, options.like, found, options.albedo, rate)

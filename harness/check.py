@@ -63,15 +63,15 @@ def main(options: argparse.Namespace, command: str) -> int:
         raise UserError(f"{options.experiment}: has no `study`", fix="name an experiment with one: it measures limits")
     needed = fewest_boards(set_ups)
     if study.boards < needed:  # no loss could ever be told from chance, and the gate would pass everything
-        said = f"with {study.boards} boards no loss is significant at {100 * ALPHA:g} %: the check cannot fail"
+        what = f"with {study.boards} boards no loss is significant at {100 * ALPHA:g} %: the check cannot fail"
         fix = "raise study.boards: 24 are needed to detect a threshold that is 1.2 times as high"
-        raise UserError(said, legal=f"at least {needed} boards for {many(set_ups, 'set-up')}", fix=fix)
-    asked = engine_options(options)
-    if not asked.shard.is_whole:
+        raise UserError(what, legal=f"at least {needed} boards for {many(set_ups, 'set-up')}", fix=fix)
+    engine = engine_options(options)
+    if not engine.shard.is_whole:
         raise UserError("--shard: a check needs the whole study", fix="run harness.sweep in shards, merge, then check")
     path = options.baseline or BASELINES / f"{experiment.config.name}.json"
     baseline = _baseline(path, update=options.update)  # before anything runs: a study takes minutes
-    code = run_study(experiment, options.out, asked, command)
+    code = run_study(experiment, options.out, engine, command)
     if code not in (0, 1):
         return code
     folder = experiment.folder(options.out)
@@ -95,9 +95,9 @@ def main(options: argparse.Namespace, command: str) -> int:
         print("the check fails: if it is intended, run it again with --update and commit the baseline", file=sys.stderr)
         return 1
     if apart := comparison.marked("not comparable"):
-        said = "; ".join(f"{row.label}: {row.why}" for row in apart)
+        what = "; ".join(f"{row.label}: {row.why}" for row in apart)
         fix = "run the check again with --update and commit the baseline"
-        raise UserError(f"{path}: cannot serve as a baseline: {said}", fix=fix)
+        raise UserError(f"{path}: cannot serve as a baseline: {what}", fix=fix)
     return 0
 
 

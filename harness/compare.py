@@ -46,9 +46,9 @@ def main(options: argparse.Namespace, command: str) -> int:
     first, second = read_record(options.first), read_record(options.second)
     if not any(one is not None and other is not None for one, other in paired_set_ups(first, second)):
         both = " / ".join("; ".join(one.label for one in study.set_ups) for study in (first, second))
-        said = f"no set-ups can be paired: none has the same name and frames in both studies: {both}"
+        what = f"no set-ups can be paired: none has the same name and frames in both studies: {both}"
         legal = "set-ups of the same name, or at the same values on the axes, and frames; or one set-up in each"
-        raise UserError(said, legal=legal, fix="run both studies with the same `sweep`, or each with a single set-up")
+        raise UserError(what, legal=legal, fix="run both studies with the same `sweep`, or each with a single set-up")
     comparison = compare_studies(first, second, options.alpha)
     show(compare_parts(comparison))
     if options.out is not None:

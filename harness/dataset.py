@@ -49,16 +49,16 @@ def main(options: argparse.Namespace, command: str) -> int:
     from scenes.render.cache import in_use
 
     if not FEWEST <= options.boards <= MOST or options.jobs < 1:
-        asked = f"--boards {options.boards} --jobs {options.jobs}: out of range"
-        raise UserError(asked, legal=f"{FEWEST} to {MOST} boards, 1 process or more")
+        fault = f"--boards {options.boards} --jobs {options.jobs}: out of range"
+        raise UserError(fault, legal=f"{FEWEST} to {MOST} boards, 1 process or more")
     experiment, out = load_experiment(options.experiment, options.overrides), options.out
     cache = options.results / ".cache" / "renders"
     samples = samples_of(experiment, options.boards, cache)
     about = _about(experiment, options.licence, samples, command)
     if (out / INDEX).exists():
         if read_index(out)["content"] != about["content"]:
-            said = f"{out}: holds a data set of another experiment, number of boards or version of the code"
-            raise UserError(said, fix="name a new folder with --out")
+            what = f"{out}: holds a data set of another experiment, number of boards or version of the code"
+            raise UserError(what, fix="name a new folder with --out")
     elif out.is_dir() and any(out.iterdir()):
         raise UserError(f"{out}: is not empty, and no file is overwritten", fix="name a new folder with --out")
     write_text(out / INDEX, json.dumps({**about, "samples": None}, indent=1) + "\n")
@@ -92,12 +92,12 @@ def _about(experiment: Experiment, licence: str, samples: list[Sample], command:
             "boards": dict(Counter(f"{sample.split}/{sample.label}" for sample in own)),
         }
     calibrate = experiment.config.threshold.calibrate
-    asked = [[sample.name, sample.render.path.stem] for sample in samples]
+    boards = [[sample.name, sample.render.path.stem] for sample in samples]
     points = [[point.frames_key, point.config.capture.to_data()] for point in experiment.points]
     return {
         "dataset_version": DATASET_VERSION,
         "name": experiment.config.name,
-        "content": digest([source_digest(("harness.engine.boards",), PACKAGES), asked, points]),
+        "content": digest([source_digest(("harness.engine.boards",), PACKAGES), boards, points]),
         "licence": licence,
         "false_calls_per_m2": (calibrate and calibrate.false_calls_per_m2) or 1.0,
         "hit_radius_mm": experiment.config.matching.radius_mm,

@@ -82,10 +82,10 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def _refuse_what_does_not_belong(options: argparse.Namespace) -> None:
-    told = [f"--{name}" for name in ("a50", "a90", "link", "log", "unit") if getattr(options, name) is not None]
-    if options.study is not None and told:
-        fix = f"leave one out: {told[0]} or --study"
-        raise UserError(f"{told[0]} and --study: the study has a curve, in mm", fix=fix)
+    belonging = [f"--{name}" for name in ("a50", "a90", "link", "log", "unit") if getattr(options, name) is not None]
+    if options.study is not None and belonging:
+        fix = f"leave one out: {belonging[0]} or --study"
+        raise UserError(f"{belonging[0]} and --study: the study has a curve, in mm", fix=fix)
     missing = [f"--{name}" for name in ("a50", "a90", "sizes") if getattr(options, name) is None]
     if options.study is None and missing:
         legal = "--a50 SIZE --a90 SIZE --sizes FROM TO, or --study DIR"
@@ -131,13 +131,13 @@ def _check(options: argparse.Namespace, guess: Guess) -> None:
         (wrong is None, f"--targets {wrong}", f"{LEAST} to {MOST}; MIL-HDBK-1823A asks for 60 at least"),
         (LEAST <= options.studies <= MOST_STUDIES, f"--studies {options.studies}", f"{LEAST} to {MOST_STUDIES}"),
     )
-    for holds, said, legal in rules:
+    for holds, what, legal in rules:
         if not holds:
-            raise UserError(said, legal=legal)
+            raise UserError(what, legal=legal)
     if options.goal is not None and not options.goal > a90:
         fix = "no study can demonstrate a limit below the true a90: improve the detector, or state a larger goal"
-        said = f"--goal {options.goal:g} is not above the guess's own {a90:.4g}"
-        raise UserError(said, legal=f"more than {a90:.4g}", fix=fix)
+        what = f"--goal {options.goal:g} is not above the guess's own {a90:.4g}"
+        raise UserError(what, legal=f"more than {a90:.4g}", fix=fix)
     if options.false_calls_per_m2 is not None and options.board_m2 is None and board_m2 is None:
         raise UserError("--false-calls-per-m2 needs --board-m2, the area of a board", legal="square metres")
 

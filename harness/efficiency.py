@@ -42,8 +42,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.vocabulary.provenance import RESULTS_VERSION, record
     from scenes.render.cache import in_use
 
-    asked = engine_options(options)
-    if not asked.shard.is_whole:
+    run_options = engine_options(options)
+    if not run_options.shard.is_whole:
         raise UserError("--shard: efficiency needs the whole study", fix="leave it out")
     folder = options.results.resolve()
     study = read_record(folder)
@@ -60,11 +60,11 @@ def main(options: argparse.Namespace, command: str) -> int:
     cache = folder.parents[1] / ".cache" / "renders"
     plan = plan_of(experiment, cache)
     detectors = {point.config.detector.name for point in experiment.points}
-    with in_use(cache), locked(folder), engine_of(asked, detectors) as engine:
+    with in_use(cache), locked(folder), engine_of(run_options, detectors) as engine:
         ideal = ideal_of_set_ups(plan, engine, rate)
         if unknown := [one.label for one in study.set_ups if (one.variant, one.frames) not in ideal]:
-            said = f"{folder}: {EXPERIMENT.name} has no set-up {unknown[0]}, which {STUDY.name} has"
-            raise UserError(said, fix="name a folder as the sweep left it, or run the study again")
+            what = f"{folder}: {EXPERIMENT.name} has no set-up {unknown[0]}, which {STUDY.name} has"
+            raise UserError(what, fix="name a folder as the sweep left it, or run the study again")
         rows = [efficiency_of(limit_of(one), ideal[one.variant, one.frames]) for one in study.set_ups]
         cameras, warnings = [point.config.simulated.camera for point in experiment.points], warnings_of(rows)
         names = ", ".join(dict.fromkeys(one.name for one in cameras))

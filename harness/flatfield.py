@@ -70,9 +70,9 @@ def main(options: argparse.Namespace, command: str) -> int:
     show([FLAT_CAPTURES.grid(captures, terminal=True), FLAT_FIGURES.grid(figures, terminal=True)])
     data, picture = (options.out.with_suffix(suffix) for suffix in (".json", ".png"))
     save_flat_field(options.out, field)
-    told = {"results_version": RESULTS_VERSION, "answer": answer, "warnings": field.warnings}
-    told |= {"figures": FLAT_FIGURES.data(figures), "captures": FLAT_CAPTURES.data(captures)}
-    write_json(data, {**told, "provenance": record(command)})
+    about = {"results_version": RESULTS_VERSION, "answer": answer, "warnings": field.warnings}
+    about |= {"figures": FLAT_FIGURES.data(figures), "captures": FLAT_CAPTURES.data(captures)}
+    write_json(data, {**about, "provenance": record(command)})
     save_png(picture, (7.0, 5.4), lambda figure: _draw(figure, error_m, answer))
     print(f"wrote {options.out}, {data.name}, {picture.name}")
     return 0
@@ -109,8 +109,8 @@ def _captures(options: argparse.Namespace) -> tuple[Lens, list[FlatCapture], lis
         if recording.lens is None:
             raise UserError(f"{path}: the lens is not known", fix="name a file or a camera with --intrinsics")
         if recording.lens != first.lens:
-            said = f"{path}: has another lens than {options.paths[0]}"
-            raise UserError(said, legal="captures of one unit and mode")
+            what = f"{path}: has another lens than {options.paths[0]}"
+            raise UserError(what, legal="captures of one unit and mode")
     found = []
     for recording, pose in zip(recordings, poses, strict=True):
         for part in _halves(recording) if len(recordings) == 1 else (recording,):

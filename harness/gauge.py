@@ -115,8 +115,8 @@ def _laid_out(options: argparse.Namespace, sizes: np.ndarray) -> Gauge:
         raise UserError(f"--board {options.board}: is not a size", legal="WIDTHxHEIGHT in mm: 270x175") from error
     side, apart = MARK_MM, options.apart
     if not 0 < options.diameters[1] < apart - 4:
-        said = f"--apart {apart:g}: holes of {options.diameters[1]:g} mm overlap"
-        raise UserError(said, legal="at least their diameter plus 5 mm")
+        what = f"--apart {apart:g}: holes of {options.diameters[1]:g} mm overlap"
+        raise UserError(what, legal="at least their diameter plus 5 mm")
     inset = np.array([width, height]) / 2 - side / 2 - CLEAR_MM
     corners = inset * [(-1, 1), (1, 1), (1, -1), (-1, -1)]
     rim = options.diameters[1] / 2 + EDGE_MM

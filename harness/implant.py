@@ -121,10 +121,10 @@ def main(options: argparse.Namespace, command: str) -> int:
     warnings = (*(doubt for scan in scans for doubt in scan.recording.warnings), *warnings)
 
     area_m2 = sum(scan.area_m2 for scan in scans)
-    said = f"{len(scans)} recording{'s' * (len(scans) > 1)} of {longest} frames, {area_m2:.3g} m² judged"
+    recordings = f"{len(scans)} recording{'s' * (len(scans) > 1)} of {longest} frames, {area_m2:.3g} m² judged"
     facts = {
         "implanted": [
-            *_shares(options, said, [one.depth_mm for each in made for one in each.implants]),
+            *_shares(options, recordings, [one.depth_mm for each in made for one in each.implants]),
             *(f"Note: {note}." for note in dict.fromkeys(note for one in opened for note in one.notes)),
         ],
         "recordings": [str(path) for path in options.paths],
@@ -135,7 +135,7 @@ def main(options: argparse.Namespace, command: str) -> int:
         "family": family.to_data(),
     }
     origin = record(command) | {"warnings": [COMPARED, *warnings], "seed": options.seed, "failures": []}
-    title = f"Virtual damage in {said}"
+    title = f"Virtual damage in {recordings}"
     expected = options.false_calls or asked.DEFAULT_FALSE_CALLS
     calls = f"{expected:g} false calls a capture: the median over groups of frames."
     own = f"Set by the undamaged frames as harness.detect sets it, by noise towards the camera, for {calls}"
@@ -194,11 +194,11 @@ def _family(options: argparse.Namespace, scans: list[Scan]) -> DrawnTargetConfig
     return settings_of(DrawnTargetConfig, data, "the virtual damage (--damage, --diameters, --depths, --lengths)")
 
 
-def _shares(options: argparse.Namespace, said: str, peaks_mm: list[float]) -> list[str]:
+def _shares(options: argparse.Namespace, recordings: str, peaks_mm: list[float]) -> list[str]:
     """Return sentences on what is measured and simulated, and for what the limit holds; ``peaks_mm``: depths shown."""
     low, middle, high = np.quantile(peaks_mm, (0.1, 0.5, 0.9))
     return [
-        f"Measured: {said}, with their surface, noise, fixed pattern, texture and missing returns.",
+        f"Measured: {recordings}, with their surface, noise, fixed pattern, texture and missing returns.",
         f"Simulated: the damage, by the model of {options.camera}, on the tangent plane at its place, with an albedo "
         f"of {options.albedo:g}; noise is added where the damage weakens the light, never taken off.",
         f"Virtual damage shows a depth of {middle:.2g} mm at the median ({low:.2g} to {high:.2g} mm for eight in ten). "

@@ -83,10 +83,10 @@ def grid_of(kind: str, rows: Sequence[Row]) -> Grid:
         heads = ("version", "what it does")
     lines = []
     for row in rows:
-        said = _camera_cells(row) if "title" in row else (row.get("version") or "-", row.get("about", ""))
+        cells = _camera_cells(row) if "title" in row else (row.get("version") or "-", row.get("about", ""))
         if "broken" in row:
-            said = ("-",) * (len(heads) - 1) + (f"broken: {row['broken']}",)
-        lines.append((row["name"], f"{row['package']} {row['package_version']}".strip(), *said))
+            cells = ("-",) * (len(heads) - 1) + (f"broken: {row['broken']}",)
+        lines.append((row["name"], f"{row['package']} {row['package_version']}".strip(), *cells))
     return Grid.of(("name", "package", *heads), lines, left=2 + len(heads))
 
 
@@ -181,13 +181,14 @@ def reference() -> str:
     for title, keys in sections.items():
         lines += ["", f"## {title}"]
         places: dict[str, list[str]] = {}
-        for path, slot in keys:
+        for path, slot, model in keys:
             place, _, key = path.rpartition(".")
             default, note = default_at(slot), (slot.field.description if slot.field else "") or ""
             legal = "a mapping" if slot.models else (legal_at(slot) or "any value").removesuffix(f" ({note})")
             cells = f"`{key}`", legal, plain(default[0]) if default else "required", note
             row = "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
-            places.setdefault(place, ["| key | legal | default | meaning |", "|---|---|---|---|"]).append(row)
+            head = inspect.cleandoc(model.__doc__ or ""), "", "| key | legal | default | meaning |", "|---|---|---|---|"
+            places.setdefault(place, [*head]).append(row)
         for place, rows in places.items():
             lines += ["", *([f"### `{place}`", ""] if place else []), *rows]
     return "\n".join(lines)
@@ -235,9 +236,9 @@ def limit_text(limits: list[dict[str, Any]]) -> str:
 def differs_text(differs: dict[str, Any]) -> str:
     """Return the settings that tell a run from others of its experiment, at most `SHOWN_SETTINGS`."""
     names = names_of(differs)
-    said = [f"{names[path]}={value_text(path, value)}" for path, value in differs.items()]
-    more = len(said) - SHOWN_SETTINGS
-    return ", ".join(said[:SHOWN_SETTINGS]) + (f" and {more} more" if more > 0 else "")
+    parts = [f"{names[path]}={value_text(path, value)}" for path, value in differs.items()]
+    more = len(parts) - SHOWN_SETTINGS
+    return ", ".join(parts[:SHOWN_SETTINGS]) + (f" and {more} more" if more > 0 else "")
 
 
 def _settings(run: Path) -> dict[str, Any]:
@@ -255,10 +256,10 @@ def _limits(run: Path) -> list[dict[str, Any]]:
     rows = []
     try:
         for row in csv.DictReader(io.StringIO(bounded_bytes(run / "limits.csv", TEXT_BYTES).decode())):
-            size, said = row["a90_95_mm"], {"set_up": row["set_up"][:60], "verdict": row["a90_95_verdict"][:40]}
-            if not all(word.isprintable() for word in said.values()):
+            size, names = row["a90_95_mm"], {"set_up": row["set_up"][:60], "verdict": row["a90_95_verdict"][:40]}
+            if not all(word.isprintable() for word in names.values()):
                 return []
-            rows.append({**said, "a90_95_mm": float(size) if size else None})
+            rows.append({**names, "a90_95_mm": float(size) if size else None})
     except (UserError, OSError, ValueError, KeyError, TypeError, csv.Error):
         return []
     return rows
@@ -275,8 +276,8 @@ def described(run: Path) -> dict[str, Any]:
     row: dict[str, Any] = {"path": str(run), "experiment": run.parent.name, "digest": run.name, "state": "broken"}
     row |= {"note": "", "size_bytes": size_bytes, "date": None}
     try:
-        said = strict_json(bounded_bytes(run / PROVENANCE.name, TEXT_BYTES), nan=True)
-        if not isinstance(said, dict):
+        facts = strict_json(bounded_bytes(run / PROVENANCE.name, TEXT_BYTES), nan=True)
+        if not isinstance(facts, dict):
             raise ValueError("is no provenance")
     except FileNotFoundError:  # a run that is not over
         records = 0
@@ -288,13 +289,13 @@ def described(run: Path) -> dict[str, Any]:
         return row | {"state": state, "note": f"{state}: {many(records, 'record')}"}
     except (UserError, ValueError, OSError) as error:
         return row | {"note": f"broken: provenance.json: {error}"}
-    trials = said.get("trials")
+    trials = facts.get("trials")
     trials = trials if isinstance(trials, dict) else {}
     counts = [trials.get(name) for name in ("done", "resumed", "failed")]
     done, resumed, failed = (count if type(count) is int and count >= 0 else 0 for count in counts)
     state = "running" if in_use(run) else "unfinished" if failed else "complete"
     note = f"{state}: {many(done + resumed, 'trial')}" + (f", {failed} failed" if failed else "")
-    version, started = said.get("results_version"), said.get("started")
+    version, started = facts.get("results_version"), facts.get("started")
     if type(version) is int and version != RESULTS_VERSION:
         note += f" (results version {version}, this tofpod writes {RESULTS_VERSION})"
     date = started[:40] if isinstance(started, str) and started.isprintable() else None
@@ -330,8 +331,8 @@ def files_below(folder: Path) -> Iterator[Path]:
 def latest_run(parent: Path) -> str | None:
     """Return the name of the run that ``parent/latest`` points to; None where there is no such link of tofpod's."""
     path = Path(parent) / LATEST
-    said = os.readlink(path) if path.is_symlink() else ""
-    return said if DIGEST_NAME.fullmatch(said) else None
+    target = os.readlink(path) if path.is_symlink() else ""
+    return target if DIGEST_NAME.fullmatch(target) else None
 
 
 def point_to(run: Path) -> None:

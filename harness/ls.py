@@ -102,8 +102,8 @@ def _list_results(options: argparse.Namespace) -> int:
             for run in shown
         ]
         for run, line in zip(shown, Grid.of(("run", "date", "size", "state"), rows, left=4).lines()[1:], strict=True):
-            said = (limit_text(run["limits"]), differs_text(run["differs"]))
-            print("\n".join([f"    {line}", *(f"      {text}" for text in said if text)]))
+            cells = (limit_text(run["limits"]), differs_text(run["differs"]))
+            print("\n".join([f"    {line}", *(f"      {text}" for text in cells if text)]))
     return 0
 
 

@@ -48,15 +48,15 @@ def main(options: argparse.Namespace, command: str) -> int:
             print(f"{folder}: {counts['copied'] - before} trials copied")
     print(f"{goal.folder}: {counts['copied']} trials copied, {counts['known']} were already there")
     if damaged:
-        told = f"{len(damaged)} damaged or older records left out, to be run again"
-        print(f"{told}: {', '.join(damaged[:3])}", file=sys.stderr)
+        note = f"{len(damaged)} damaged or older records left out, to be run again"
+        print(f"{note}: {', '.join(damaged[:3])}", file=sys.stderr)
     if counts["alike"]:
         alike = f"{counts['alike']} trials differ in the last digits, as between different processors"
         print(f"{alike}; the first copied was kept")
     if different:
-        told = f"{len(different)} trials have different results in different folders, the first copied was kept"
+        note = f"{len(different)} trials have different results in different folders, the first copied was kept"
         why = "The machines disagree (different processors or versions?)"
-        print(f"{told}: {', '.join(different[:3])}. {why}", file=sys.stderr)
+        print(f"{note}: {', '.join(different[:3])}. {why}", file=sys.stderr)
         return 1
     out = into.parent.parent
     print(f"next: the sweep's command without --shard, with --out {out}: it runs what is missing and writes the report")

@@ -39,8 +39,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     put("--left", type=float, metavar="Y", help="signals at or below this value are censored (noise)")
     put("--right", type=float, metavar="Y", help="signals at or above this value are censored (saturation)")
     put("--log-signal", action=switch, help=f"use the logarithm of the signals, or not {least}")
-    told = "with --prior: model-assisted POD (MAPOD), a simulated curve corrected by these hits and misses"
-    put = parser.add_argument_group(told).add_argument
+    about = "with --prior: model-assisted POD (MAPOD), a simulated curve corrected by these hits and misses"
+    put = parser.add_argument_group(about).add_argument
     prior = "folder of a study, simulated or by virtual damage (harness.implant)"
     put("--prior", type=Path, metavar="STUDY", help=prior)
     put("--set-up", metavar="NAME", help='set-up of the study: "50 frames"')
@@ -121,8 +121,8 @@ def _stated(options: argparse.Namespace) -> PodStatement:
             raise UserError(f"--{name.replace('_', '-')} belongs to --prior", fix="add --prior, or leave it out")
     of_hits, legal = options.hit is not None, "--hit COL with 0 and 1, or --ahat COL with signals and --decision Y"
     if of_hits == (options.ahat is not None):
-        said = "one of them, not both" if of_hits else "no column states what was found"
-        raise UserError(f"--hit and --ahat: {said}", legal=legal, fix="name one column; none is guessed")
+        what = "one of them, not both" if of_hits else "no column states what was found"
+        raise UserError(f"--hit and --ahat: {what}", legal=legal, fix="name one column; none is guessed")
     other = "--ahat" if of_hits else "--hit"
     for name in ("decision", "left", "right", "log_signal") if of_hits else ("link",):
         if getattr(options, name) is not None:

@@ -3,9 +3,8 @@
     def test_the_limit_holds(tofpod_gate):
         tofpod_gate("limit.yaml")
 
-runs the study beside the test and compares it with ``limit.baseline.json`` there, as `harness.check` does.
-``pytest --tofpod-update`` writes the baseline. Renders and finished trials are kept in pytest's cache folder.
-"""
+runs the study beside the test and compares it with ``limit.baseline.json`` there, as `harness.check` does. ``pytest
+--tofpod-update`` writes the baseline. Renders and finished trials are kept in pytest's cache folder."""
 
 from __future__ import annotations
 
@@ -33,15 +32,15 @@ def tofpod_gate(request: pytest.FixtureRequest) -> Callable[..., Path]:
 
         path = Path(request.path).parent / experiment
         assert request.config.cache is not None
-        out, said = request.config.cache.mkdir("tofpod"), io.StringIO()
+        out, printed = request.config.cache.mkdir("tofpod"), io.StringIO()
         arguments = [str(path), "--baseline", str(path.with_suffix(".baseline.json")), "--out", str(out)]
         arguments += [word for change in changes for word in ("--set", change)]
         arguments += ["--update"] if request.config.getoption("--tofpod-update") else []
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
             code = check.main(arguments)
         if code:
-            told = said.getvalue().replace("with --update", "with pytest --tofpod-update")
-            pytest.fail(told.strip(), pytrace=False)
+            message = printed.getvalue().replace("with --update", "with pytest --tofpod-update")
+            pytest.fail(message.strip(), pytrace=False)
         return load_experiment(path, changes).folder(out)
 
     return gate

@@ -114,12 +114,12 @@ def _found(predictions: Path, dataset: Path, samples: list[str]) -> dict[str, Pa
         elif fault := _fault(files[name][0], *read_arrays(dataset, name, "inspected")):
             faults.setdefault("invalid", []).append(f"{name} ({fault})")
     if faults:
-        said = [
+        lines = [
             f"{len(names)} maps are {what}: {', '.join(names[:MOST_NAMED])}{', ...' * (len(names) > MOST_NAMED)}"
             for what, names in faults.items()
         ]
         legal = "for each board of validation and test one .npy or .tiff of real numbers, of the pictures' size"
-        raise UserError(f"{predictions}: {'; '.join(said)}", legal=legal, fix="write maps for all boards anew")
+        raise UserError(f"{predictions}: {'; '.join(lines)}", legal=legal, fix="write maps for all boards anew")
     return {name: files[name][0] for name in wanted}
 
 

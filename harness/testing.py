@@ -198,8 +198,8 @@ def is_silent_at_the_quiet_threshold(make: Make, cloud: Cloud) -> None:
     for threshold in look.thresholds():
         found = look.find(threshold)
         strongest = found[0].score if found else float("nan")
-        told = f"at a threshold of {threshold:g} the strongest finding scores {strongest:g}, but {quiet:g} is quiet"
-        require(strongest == quiet, told)
+        what = f"at a threshold of {threshold:g} the strongest finding scores {strongest:g}, but {quiet:g} is quiet"
+        require(strongest == quiet, what)
 
 
 def finds_no_more_at_higher_thresholds(make: Make, cloud: Cloud) -> None:
@@ -311,8 +311,8 @@ def _sound(look: Look) -> None:
         require(image.shape == shape, f"`{name}` is an array of {image.shape}; the cloud's grid is {shape}")
         require(image.dtype.kind == "f", f"`{name}` holds {image.dtype}, which cannot hold NaN")
     score, scale = evidence.score, float(evidence.scale_m)
-    told = int(np.isfinite(score[~look.cloud.valid]).sum())
-    require(told == 0, f"{told} pixels without a point have a score; NaN is wanted there")
+    count = int(np.isfinite(score[~look.cloud.valid]).sum())
+    require(count == 0, f"{count} pixels without a point have a score; NaN is wanted there")
     require(not np.isinf(score).any(), "a score is infinite")
     require(np.isfinite(score).any(), "no pixel has a score; where a cloud cannot be judged, a UserError is wanted")
     require(np.isfinite(scale) and scale > 0, f"`scale_m` is {scale:g}: it must be a length above 0")

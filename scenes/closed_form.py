@@ -1,4 +1,4 @@
-"""Views known in closed form: endless planes under one emitter, direct light only. Used for calibration and checks."""
+"""Views in closed form: endless planes under one emitter, with direct light only. For calibration and checks."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from harness.vocabulary.geometry import Region
 from scenes.optics import NoiseFreeView, Optics, footprint_of, wave_numbers
 from scenes.sensor.camera import AnyCamera
 
-WHITE = 0.8  # the colour albedo of closed-form surfaces; no sensor uses it
-Covers = Callable[[np.ndarray], np.ndarray]  # of slopes (..., 2) from the lens: whether the front is there; not for NaN
+WHITE = 0.8  # albedo of closed-form surfaces in red, green and blue; no sensor uses it
+Covers = Callable[[np.ndarray], np.ndarray]  # slopes (..., 2), without NaN, to whether the front is there
 
 
 @dataclass(frozen=True)
 class Plane:
-    """The plane z = distance + slope_x x + slope_y y in the camera's frame, metres."""
+    """The plane z = distance + slope_x x + slope_y y, in the camera's frame and in metres."""
 
     distance_m: float
     slope_x: float = 0.0
@@ -26,7 +26,7 @@ class Plane:
 
     @property
     def normal(self) -> np.ndarray:
-        """(3,) unit normal, towards the camera."""
+        """Unit normal (3,), towards the camera."""
         return np.array([self.slope_x, self.slope_y, -1.0]) / np.sqrt(self.slope_x**2 + self.slope_y**2 + 1)
 
     def z_along_m(self, slopes: np.ndarray) -> np.ndarray:
@@ -39,17 +39,17 @@ class Plane:
 def plane_view(
     camera: AnyCamera, region: Region, distance_m: float, albedo: float, slope_x: float = 0.0, slope_y: float = 0.0
 ) -> NoiseFreeView:
-    """Return the plane z = distance + slope_x x + slope_y y, Lambertian, direct light only, sampled at pixel centres.
-    Amplitude: albedo cos(incidence) / d^2 with d from the emitter. The footprint's extent and the cone are left out."""
+    """Return a view of the plane z = distance + slope_x x + slope_y y, Lambertian, direct light only, sampled at pixel
+    centres. Amplitude: albedo cos(incidence) / d^2 with d from the emitter. Left out: the footprint, the cone."""
     plane, slopes = Plane(distance_m, slope_x, slope_y), camera.nominal_lens.region_slopes(region)
     points, amplitude, _ = _lit(slopes, plane, albedo, camera.optics)
     return image_view(camera, region, points[..., 2], amplitude)
 
 
 def image_view(camera: AnyCamera, region: Region, z_m: np.ndarray, light: np.ndarray) -> NoiseFreeView:
-    """Return what a depth image shows, sampled at pixel centres: ``z_m`` (h, w), NaN where there is nothing, and the
-    ``light`` (h, w) that comes back from each pixel, in a view's units. Both may be (k, h, w): parts of pixels on
-    different surfaces, of which the first counts as its range. Direct light only."""
+    """Return a view from a depth image, sampled at pixel centres, with direct light only. ``z_m`` (h, w): NaN where
+    there is nothing. ``light`` (h, w): the light that returns from each pixel, in a view's units. Both may be (k, h,
+    w): parts of pixels on different surfaces, the first of which determines its range."""
     optics, slopes = camera.optics, camera.nominal_lens.region_slopes(region)
     z_m, light = (each.reshape(-1, *region.shape) for each in (z_m, light))
     points = np.concatenate([slopes, np.ones((*region.shape, 1))], axis=-1) * z_m[..., None]
@@ -63,18 +63,18 @@ def image_view(camera: AnyCamera, region: Region, z_m: np.ndarray, light: np.nda
 def layered_view(
     camera: AnyCamera, region: Region, front: Plane, back: Plane, covers: Covers, albedo: float
 ) -> NoiseFreeView:
-    """Return a part of the plane ``front`` (where it ``covers``) before the endless plane ``back``, both Lambertian of
-    one albedo. Each pixel sums phasors over its footprint; a point of the back is dark where the front hides the
-    emitter. Surfaces: "front", "back". Left out: the front's thickness, light between the planes, the cone."""
+    """Return a view of a part of the plane ``front`` (where it ``covers``) before the endless plane ``back``, both
+    Lambertian with the same albedo. Each pixel sums phasors over its footprint; the front casts a shadow on the back.
+    Surfaces: "front", "back". Not modelled: the front's thickness, light between the planes, the emitter's cone."""
     lens, optics, waves = camera.nominal_lens, camera.optics, wave_numbers(camera.optics.frequencies_hz)
     footprint = footprint_of(lens, region, optics.beam_fwhm_rad)
 
     def meet(rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Tell whether rays (..., 2) meet the front; where they end, light, path in m, and if in the front's shadow."""
+        """Return for rays (..., 2): whether they meet the front, their ends, light, path in m, and if in the shadow."""
         on_front = covers(rays)
         front_points, front_light, front_path = _lit(rays, front, albedo, optics)
         points, light, path_m = _lit(rays, back, albedo, optics)
-        # the way from the back to the emitter crosses the front's plane, n . p = -distance, at p + t way
+        # the line from the back to the emitter meets the front's plane, n . p = -distance, at p + t way
         way, normal = optics.emitter_m - points, np.array([front.slope_x, front.slope_y, -1.0])
         with np.errstate(divide="ignore", invalid="ignore"):
             t = (-front.distance_m - points @ normal) / (way @ normal)
@@ -88,7 +88,7 @@ def layered_view(
 
     phasor, (intensity, share) = np.zeros((len(waves), *region.shape), complex), np.zeros((2, *region.shape))
     pixels = np.ones(region.shape, bool)
-    for sub_rays in (footprint.coarse, footprint.fine):  # fine where a footprint or a neighbour's meets an edge
+    for sub_rays in (footprint.coarse, footprint.fine):  # fine where a pixel's or a neighbour's footprint meets an edge
         rows, cols = np.nonzero(pixels)
         on_front, _, light, path_m, shadowed = meet(sub_rays(rows, cols))
         for line, wave in enumerate(waves):
@@ -106,7 +106,7 @@ def layered_view(
 
 def _lit(slopes: np.ndarray, plane: Plane, albedo: float, optics: Optics) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return where rays (..., 2) meet a plane (..., 3), the amplitude there, and the length of the light's path to the
-    lens in metres; a ray that never meets the plane has no point, and no light."""
+    lens in metres; a ray that does not meet the plane has no point and no light."""
     points = np.concatenate([slopes, np.ones((*slopes.shape[:-1], 1))], axis=-1) * plane.z_along_m(slopes)[..., None]
     to_emitter = optics.emitter_m - points
     leg_out = np.linalg.norm(to_emitter, axis=-1)

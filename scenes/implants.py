@@ -1,10 +1,10 @@
 """Virtual damage for a real scan: the change that a damage would make to a camera's measurement.
 
-A small board stands where the scan's surface is and is rendered twice: with one damage and without. The camera's model
-turns both renders into frames with the same draws of noise; the recorded frames keep their own errors.
+A small board is placed where the scan's surface is and is rendered with and without the damage. The camera's model
+turns both renders into frames with the same random numbers; recorded frames keep their own errors.
 
-Not modelled: the surface's bend within the small board, texture at the damage, light that reaches it by way of other
-surfaces, and a damage that makes pixels quieter: recorded noise is never removed. Range is not rounded again."""
+Not modelled: the surface's curvature within the small board, texture at the damage, light that reaches it by way of
+other surfaces, and damage that lowers noise: recorded noise is never removed. Ranges are not rounded again."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from scenes.sensor.camera import NO_EFFECTS, CameraConfig, camera_of, number_pat
 from scenes.sensor.source import SimulatedUnit
 from scenes.target import custom
 
-LEAST_DRAWS = 48  # frames drawn with and without the damage: they tell how much noisier it makes a pixel
-FINEST_STEP_MM = 1e-3  # rounding step of the frames drawn; that of the recording is in its own range already
-BEYOND_PX = 2  # pixels beyond the reach of the camera's filter about the damage's rim that may change
-AROUND_PX = 8  # pixels of the small board beyond those: its rim disturbs both renders alike
+LEAST_DRAWS = 48  # frames drawn with and without the damage, to find how much noisier it makes a pixel
+FINEST_STEP_MM = 1e-3  # rounding step of the drawn frames; recorded ranges already contain the camera's own
+BEYOND_PX = 2  # pixels beyond the reach of the camera's filter around the damage's rim that may change
+AROUND_PX = 8  # further pixels of the small board; its rim disturbs both renders alike
 
 
 @dataclass(frozen=True)
 class Implant:
-    """A damage's difference on a ``region`` (h, w) of the recording's pixels. ``shift_m`` (h, w): change of z.
-    ``noise_m`` (t, h, w): noise to add to frame t. ``lost`` (t, h, w) bool: what the damage makes invalid there."""
+    """The difference that a damage makes on a ``region`` (h, w) of the recording's pixels. ``shift_m`` (h, w): change
+    of z. ``noise_m`` (t, h, w): noise to add to frame t. ``lost`` (t, h, w) bool: pixels that it makes invalid."""
 
     region: Region
     shift_m: np.ndarray
@@ -44,8 +44,8 @@ class Implant:
         return float(np.abs(self.shift_m).max()) / MM
 
     def put_into(self, frame: Frame, number: int, z_m: np.ndarray, reason: np.ndarray) -> None:
-        """Change ``z_m`` and ``reason`` (H, W), copies of those of the recording's frame, in place. Of its pixels those
-        without range stay so; ``number``: of the frame among those drawn, counted from 0, again from 0 beyond them."""
+        """Change ``z_m`` and ``reason`` (H, W), copies of those of a recording's frame, in place; pixels without range
+        stay so. ``number``: of the frame among those drawn, from 0; beyond them, they are used again from the first."""
         cut = np.s_[self.region.row0 : self.region.row1, self.region.col0 : self.region.col1]
         draw = number % len(self.noise_m)
         lost = self.lost[draw] & np.isfinite(frame.z_m[cut])
@@ -54,8 +54,8 @@ class Implant:
 
 
 def unit_config(name: str, lens: Lens) -> tuple[CameraConfig, bool]:
-    """Return the camera without what a recording has of its own (pattern, offset, drift, jumps, rounding), and whether
-    its pixels are the recording's: then with the recording's ``lens``, else with its own."""
+    """Return the camera without the parts that the recording contains (pattern, offset, drift, jumps, rounding), and
+    whether its pixels are those of the recording: if so it has the recording's ``lens``, otherwise its own."""
     facts = camera_of(CameraConfig(name=name))
     same = (facts.nominal_lens.width, facts.nominal_lens.height) == (lens.width, lens.height)
     numbers = {"engine.output_step_mm": FINEST_STEP_MM, **(numbers_of_lens(lens) if same else {})}
@@ -64,7 +64,7 @@ def unit_config(name: str, lens: Lens) -> tuple[CameraConfig, bool]:
     return CameraConfig(name=name, effects=effects, numbers={k: v for k, v in numbers.items() if k in known}), same
 
 
-KINDS = ("holes", "dents", "flaws")  # lists of a declaration that hold damage
+KINDS = ("holes", "dents", "flaws")  # fields of a declaration that list damage
 
 
 def local_board(
@@ -91,7 +91,7 @@ def implant_of(
     config: CameraConfig, same: bool, lens: Lens, board: custom.TargetConfig, frames: int, seed: int, cache: Path
 ) -> Implant:
     """Return the difference that the damage of `local_board` makes to ``frames`` frames (or more) of a recording with
-    this lens; ``config``, ``same`` of `unit_config`. Raises UserError where the board leaves the view."""
+    this lens. ``config``, ``same``: those of `unit_config`. Raises UserError if the board leaves the view."""
     camera = camera_of(config)
     declared = board.at_wavelength(camera.optics.wavelength_nm)
     count, drawn, smooth = max(frames, LEAST_DRAWS), [], []
@@ -102,9 +102,9 @@ def implant_of(
         drawn.append(np.stack([frame.z_m for frame in unit.capture(count, seed, "implant").frames()]).astype(float))
         smooth.append(next(quiet.capture(1, seed).frames()).z_m.astype(float))
     with np.errstate(invalid="ignore", divide="ignore"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of pixels that no frame shows
+        warnings.simplefilter("ignore", RuntimeWarning)  # pixels that no frame shows
         means, spreads = zip(*((np.nanmean(z, axis=0), np.nanvar(z, axis=0)) for z in drawn), strict=True)
-        # without noise there is no scatter of the mean; a pixel at a gate may need noise to be valid
+        # without noise the mean has no scatter; a pixel at a gate may need noise to be valid
         middle = [np.where(np.isfinite(z), z, mean) for z, mean in zip(smooth, means, strict=True)]
         more = np.sqrt(np.clip(1.0 - spreads[1] / spreads[0], 0.0, 1.0))
         noise_m = more * (drawn[0] - means[0])
@@ -114,7 +114,7 @@ def implant_of(
     lost = near & np.isnan(drawn[0]) & np.isfinite(drawn[1])
     if same:
         return Implant(region, shift_m, noise_m, lost)
-    # the recording was aligned to other pixels: each takes its value between those of the camera that it lies among
+    # the recording is aligned to other pixels: interpolate between the camera's pixels
     half = board.board.width_mm / 2 * MM
     corners = np.array([(x, y, 0.0) for x in (-half, half) for y in (-half, half)])
     ends = lens.project(transform_points(board.pose.T_camera_board, corners))
@@ -131,7 +131,7 @@ def implant_of(
 
 
 def side_mm(damage: custom.AnyDamage, distance_m: float, config: CameraConfig) -> float:
-    """Return the side of a board that holds a damage, the reach of the camera's filter around it, and a rim."""
+    """Return the side of a board with space for a damage, the reach of the camera's filter around it, and a rim."""
     camera = camera_of(config)
     pitch_mm = distance_m / MM / min(camera.nominal_lens.fx, camera.nominal_lens.fy)
     return 2 * damage.reach_mm + 2 * (camera.optics.margin_px + BEYOND_PX + AROUND_PX) * pitch_mm

@@ -1,4 +1,4 @@
-"""Cameras as the render needs them (lens, light, footprints), and the view that a sensor gets. Slopes: x/z, y/z."""
+"""Cameras as the renderer sees them (lens, light, footprints), and the view that a sensor gets. Slopes: x/z, y/z."""
 
 from __future__ import annotations
 
@@ -58,26 +58,26 @@ class Optics:
 
 
 def wave_numbers(frequencies_hz: tuple[float, ...]) -> np.ndarray:
-    """Return (f,) 2 pi f / c in rad per metre of full path, for the speed of light in air."""
+    """Return 2 pi f / c (f,) in rad per metre of full path, for the speed of light in air."""
     return 2 * np.pi * np.array(frequencies_hz, float) / SPEED_OF_LIGHT_AIR
 
 
 COARSE = 4  # sub-rays per side on a smooth surface: the midpoint rule leaves 1e-4 mm
 FINE = 256  # sub-rays where a footprint meets an edge: one of them is 0.4 % of a step
-BEAM_REACH = 3.0  # deviations of a beam within which an edge is looked for: 1 % of the light lies beyond
+BEAM_REACH = 3.0  # deviations of a beam within which edges are considered: 1 % of the light lies beyond
 GOLDEN = (np.sqrt(5) - 1) / 2
 
 
 def footprint_of(lens: Lens, region: Region, beam_fwhm_rad: float | None) -> Quadrilaterals:
-    """Return the footprint of a region's pixels, beams where they have a width."""
+    """Return the footprints of a region's pixels: beams if the camera has a beam width."""
     return Beams(lens, region, beam_fwhm_rad / FWHM_PER_DEVIATION) if beam_fwhm_rad else Quadrilaterals(lens, region)
 
 
 class Quadrilaterals:
-    """An imager's pixels: the area between their corners, evenly weighted; slopes are linear in it, to 1e-7. Fine
-    sub-rays lie on a golden lattice: an edge along rows or columns passes them one by one."""
+    """An imager's pixels: the areas between their corners, evenly weighted; slopes are linear within, to 1e-7. Fine
+    sub-rays form a golden lattice, so that an edge along rows or columns crosses them one by one."""
 
-    reach_px = 0  # pixels around an edge that have a part of it in their footprint, besides the edge's own
+    reach_px = 0  # distance from an edge within which footprints contain a part of it, besides the edge's own pixels
 
     def __init__(self, lens: Lens, region: Region) -> None:
         # slopes (h + 1, w + 1, 2) of the corners of the region's pixels
@@ -85,7 +85,7 @@ class Quadrilaterals:
         self.corner = lens.slopes(u, v)
 
     def coarse(self, rows: np.ndarray, cols: np.ndarray, side: int = COARSE) -> np.ndarray:
-        """Return slopes (n, side^2, 2) of the centres of side x side strata of pixels, a grid by rows."""
+        """Return slopes (n, side^2, 2) of the centres of side x side cells of each pixel, row by row."""
         place = (np.arange(side) + 0.5) / side
         fy, fx = np.meshgrid(place, place, indexing="ij")
         return self._placed(rows, cols, fx.ravel(), fy.ravel())
@@ -104,13 +104,13 @@ class Quadrilaterals:
 
 class Beams(Quadrilaterals):
     """A scanner's beams: round Gaussians in angle about the pixels' central rays. Fine sub-rays lie on a sunflower's
-    spiral (Vogel, Mathematical Biosciences 44, 1979) at the radii of equal shares: a knife edge takes its share of the
-    Gaussian within 0.02. The coarse grid has the Gaussian's second moments. Angles are taken as tangents."""
+    spiral (Vogel, Mathematical Biosciences 44, 1979) at radii of equal shares: a knife edge cuts off its share of the
+    Gaussian to 0.02. The coarse grid has the Gaussian's second moments. Angles are approximated by tangents."""
 
     def __init__(self, lens: Lens, region: Region, deviation_rad: float) -> None:
         super().__init__(lens, region)
         self._slopes, self._deviation_rad = lens.region_slopes(region), deviation_rad
-        # Away from the axis an angle spans more slope, and so more pixels, by 1 + slope^2.
+        # away from the axis, an angle spans a larger slope, and so more pixels, by 1 + slope^2
         widest = 1 + float((self._slopes**2).sum(axis=-1).max())
         self.reach_px = 1 + int(np.ceil(BEAM_REACH * deviation_rad * widest * max(lens.fx, lens.fy)))
 
@@ -130,7 +130,7 @@ class Beams(Quadrilaterals):
         return self.turned(rows, cols, spiral - spiral.mean(axis=0))
 
     def turned(self, rows: np.ndarray, cols: np.ndarray, angles: np.ndarray) -> np.ndarray:
-        """Return slopes (n, m, 2) of directions off the central ones by angles (m, 2) across the beam."""
+        """Return slopes (n, m, 2) of directions at angles (m, 2) from the central rays, across the beam."""
         centre = np.concatenate([self._slopes[rows, cols], np.ones((len(rows), 1))], axis=-1)
         centre /= np.linalg.norm(centre, axis=-1, keepdims=True)
         across = np.cross([0.0, 1.0, 0.0], centre)
@@ -169,12 +169,12 @@ class NoiseFreeView:
 
 
 class RenderConfig(Config):
-    """Effort for the indirect light. ``bounces`` 0 leaves direct light only."""
+    """Effort for the simulation of indirect light. ``bounces: 0`` leaves direct light only."""
 
     bounces: int = Field(10, ge=0, le=32, description="reflections beyond the first; albedo 0.6 leaves 0.4 % after 10")
-    face_spacing_mm: float = Field(80.0, gt=0, description="grid of nodes on the face")
-    face_samples: int = Field(8192, ge=8, description="paths for each node on the face")
-    hole_noise_mm: float = Field(0.1, gt=0, description="deviation of range, aimed at in pixels off the face")
-    hole_samples: int = Field(8192, ge=8, description="paths for each of those pixels at most")
-    rest_samples: int = Field(16, ge=8, description="paths for each pixel around the board")
+    face_spacing_mm: float = Field(80.0, gt=0, description="spacing of the nodes on the face")
+    face_samples: int = Field(8192, ge=8, description="light paths for each node on the face")
+    hole_noise_mm: float = Field(0.1, gt=0, description="aim for the noise of range in pixels off the face")
+    hole_samples: int = Field(8192, ge=8, description="most light paths for each of those pixels")
+    rest_samples: int = Field(16, ge=8, description="light paths for each pixel around the board")
     seed: int = Field(1, ge=0, le=1_000_000)

@@ -1,5 +1,5 @@
-"""Several views of one target: its pose for each, how well that is known beforehand, and whether a camera sees it. The
-room moves with the camera, as if the target were turned on a table."""
+"""Several views of one target: its pose in each, the error of the nominal poses, and whether a camera sees it. The room
+moves with the camera, as if the target were turned on a table."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from scenes.target.checks import NEAREST_M
 from scenes.target.custom import PoseConfig, TargetConfig
 from scenes.target.truth import OUTLINE_STEPS, face_grid_m, face_of
 
-CHECKED_STEPS = 16  # places along each side of a face at which its range is checked: studies check it in 64 poses
+CHECKED_STEPS = 16  # points along each side of a face at which its range is checked; studies check it in 64 poses
 
 
 def check_in_view(config: TargetConfig, optics: Optics) -> None:
-    """Raise UserError where all of the face, or all damage, is out of the camera's field of view, or all of the face
-    out of its range. A face partly out of view or range is legal; damage out of view is not a target."""
+    """Raise UserError if all of the face or all damage is out of the camera's field of view, or all of the face out of
+    its range. A face may be partly out of view or range; damage out of view is not a target."""
     face = _face_before_lens(config, CHECKED_STEPS)
     places = np.array([damage.centre_m for damage in config.damages]).reshape(-1, 2)
     centres = transform_points(config.pose.T_camera_board, face_of(config.board).point(*places.T))
-    if not len(centres) or not optics.lens.images(centres).any():  # where damage is in view, a part of the face is
+    if not len(centres) or not optics.lens.images(centres).any():  # if damage is in view, so is a part of the face
         seen_region(config, optics)
         if len(centres):
             message = f"none of the target's {len(centres)} damages is in view of {optics.title}"
@@ -41,8 +41,8 @@ def check_in_view(config: TargetConfig, optics: Optics) -> None:
 
 
 def seen_region(config: TargetConfig, optics: Optics) -> Region:
-    """Return the pixels on which the face lies: all of the sensor's where a part of the face is out of view. Raises
-    UserError where all of it is, or where it reaches behind the lens."""
+    """Return the pixels on which the face lies, or the whole sensor if a part of the face is out of view. Raises
+    UserError if all of it is, or if it reaches behind the lens."""
     lens, face = optics.lens, _face_before_lens(config, OUTLINE_STEPS).reshape(-1, 3)
     in_view = lens.images(face)
     if not in_view.any():
@@ -56,7 +56,7 @@ def seen_region(config: TargetConfig, optics: Optics) -> Region:
 
 
 def _face_before_lens(config: TargetConfig, steps: int) -> np.ndarray:
-    """(n, n, 3): the face in the camera's frame. Raises UserError where it reaches behind the lens."""
+    """Return points (n, n, 3) of the face in the camera's frame. Raises UserError if it reaches behind the lens."""
     face = transform_points(config.pose.T_camera_board, face_grid_m(config.board, steps=steps))
     nearest_m = float(face[..., 2].min())
     if nearest_m <= NEAREST_M:
@@ -70,8 +70,8 @@ MAX_VIEWS = 200
 
 
 class _Guess(Config):
-    """Error of the nominal pose of every view but the first, from which a registration starts: turned about a random
-    axis through the target's centre, and shifted in a random direction."""
+    """Errors of the nominal poses, from which a registration starts. Every nominal pose but the first is rotated about
+    a random axis through the target's centre, and shifted in a random direction."""
 
     guess_error_deg: Annotated[float, Field(ge=0.0, le=45.0)] = 3.0
     guess_error_mm: Annotated[float, Field(ge=0.0, le=500.0)] = 10.0
@@ -80,36 +80,36 @@ class _Guess(Config):
 
 class _Spread(_Guess):
     count: Annotated[int, Field(ge=1, le=MAX_VIEWS)]
-    spread_deg: Annotated[float, Field(gt=0.0, le=120.0)] = Field(description="from the outermost view to the opposite")
-    distance_jitter_mm: float = Field(0.0, ge=0.0, le=500.0, description="deviation of distances; not of the first")
-    aim_jitter_mm: float = Field(0.0, ge=0.0, le=500.0, description="the same of aims, sideways and upwards")
+    spread_deg: Annotated[float, Field(gt=0.0, le=120.0)] = Field(description="angle between the outermost views")
+    distance_jitter_mm: float = Field(0.0, ge=0.0, le=500.0, description="deviation of distances but the first")
+    aim_jitter_mm: float = Field(0.0, ge=0.0, le=500.0, description="deviation of the aim, to the sides and up or down")
 
 
 class ArcViews(_Spread):
-    """Views on an arc about the target's centre. The first is the target's own pose, then come the ends, then the
-    middles of what is left, nearer ones first: fewer views are always the first of more."""
+    """Views on an arc about the target's centre. The first is the target's own pose; then come the ends, then the
+    middles of the gaps, nearest first, so that fewer views are always the first of more."""
 
     kind: Literal["arc"]
-    about: Literal["x", "y"] = Field("y", description="board axis about which the arc turns")
+    about: Literal["x", "y"] = Field("y", description="the board's axis about which the arc turns")
 
 
 class GridViews(_Spread):
-    """Views on a square grid of two angles, in the same order: centre, corners and edges, then ever finer."""
+    """Views on a square grid of two angles: first the centre, then corners and edges, then ever finer."""
 
     kind: Literal["grid"]
 
 
 class HandHeldViews(_Guess):
-    """A walk about the target's own pose, each co-ordinate a sum of three slow sines; the order is that in time."""
+    """A hand-held walk about the target's own pose: each co-ordinate is a sum of three slow sines over time."""
 
     kind: Literal["hand_held"]
     count: Annotated[int, Field(ge=1, le=MAX_VIEWS)]
-    sway_deg: Annotated[float, Field(ge=0.0, le=60.0)] = Field(10.0, description="greatest turn about each axis")
-    sway_mm: Annotated[float, Field(ge=0.0, le=500.0)] = Field(40.0, description="greatest shift along each axis")
+    sway_deg: Annotated[float, Field(ge=0.0, le=60.0)] = Field(10.0, description="largest rotation about each axis")
+    sway_mm: Annotated[float, Field(ge=0.0, le=500.0)] = Field(40.0, description="largest shift along each axis")
 
 
 class ListedViews(_Guess):
-    """Poses of the target as they are listed; the first is the reference."""
+    """Views at the listed poses of the target; the first is the reference."""
 
     kind: Literal["list"]
     poses: Annotated[tuple[PoseConfig, ...], Field(min_length=1, max_length=MAX_VIEWS)]
@@ -124,8 +124,8 @@ def view_count(views: AnyViews) -> int:
 
 
 def poses_of(views: AnyViews, pose: PoseConfig) -> tuple[PoseConfig, ...]:
-    """Return the target's pose before the camera for each view; the first is ``pose`` itself unless poses are listed.
-    Raises pydantic.ValidationError where a tilt would pass what a pose may have."""
+    """Return the target's pose in front of the camera for each view; the first is ``pose`` itself unless poses are
+    listed. Raises pydantic.ValidationError if a tilt exceeds the limits of a pose."""
     if isinstance(views, ListedViews):
         return views.poses
     if isinstance(views, HandHeldViews):
@@ -135,7 +135,7 @@ def poses_of(views: AnyViews, pose: PoseConfig) -> tuple[PoseConfig, ...]:
         turns = [(share, 0.0) if views.about == "x" else (0.0, share) for share in _shares(views.count)]
     for number, (turn_x, turn_y) in enumerate(turns):
         aside = up = distance = 0.0
-        if number > 0:  # the first view keeps its own place
+        if number > 0:  # the first view keeps its pose
             distance = float(random_stream(views.seed, "distance jitter", number).standard_normal())
             aside, up = random_stream(views.seed, "aim jitter", number).standard_normal(2).tolist()
         shifts = aside * views.aim_jitter_mm, up * views.aim_jitter_mm, distance * views.distance_jitter_mm
@@ -144,14 +144,14 @@ def poses_of(views: AnyViews, pose: PoseConfig) -> tuple[PoseConfig, ...]:
 
 
 def T_reference_view_of(poses: tuple[PoseConfig, ...], number: int) -> np.ndarray:
-    """4x4: a view's camera frame to the first view's, exactly."""
+    """Return the exact 4x4 matrix from a view's camera frame to the first view's."""
     return poses[0].T_camera_board @ invert(poses[number].T_camera_board)
 
 
 def guessed_T_reference_view(
     views: AnyViews, poses: tuple[PoseConfig, ...], number: int, *labels: str | int
 ) -> np.ndarray:
-    """4x4: the nominal pose with the error that ``views`` states, in directions drawn from its seed and ``labels``."""
+    """Return the 4x4 nominal pose: the exact one with the error that ``views`` states, in random directions."""
     from scipy.spatial.transform import Rotation
 
     T_reference_view = T_reference_view_of(poses, number)
@@ -167,7 +167,7 @@ def guessed_T_reference_view(
 
 
 def _shares(wanted: int) -> list[float]:
-    """Return 0, 1, -1, 1/2, -1/2, 1/4, -1/4, 3/4 ...: of half the spread, odd multiples of powers of two."""
+    """Return 0, 1, -1, 1/2, -1/2, 1/4, -1/4, 3/4 ... of half the spread: odd multiples of powers of two."""
     shares, step = [0.0, 1.0, -1.0], 0.5
     while len(shares) < wanted:
         shares += [sign * step * odd for odd in range(1, round(1 / step), 2) for sign in (1.0, -1.0)]
@@ -188,7 +188,7 @@ def _grid(wanted: int) -> list[tuple[float, float]]:
 
 @lru_cache(maxsize=16)
 def _walk(views: HandHeldViews) -> tuple[tuple[float, ...], ...]:
-    """Return for each view: turns about x, y, z in degrees, shifts along x, y, z in mm; none at the first."""
+    """Return for each view the rotations about x, y, z in degrees and shifts along x, y, z in mm; 0 for the first."""
     rng = random_stream(views.seed, "hand-held")
     phases, cycles = rng.uniform(0, 2 * np.pi, (6, 3)), rng.uniform(0.3, 1.5, (6, 3))
     time = np.linspace(0.0, 1.0, views.count) if views.count > 1 else np.zeros(1)
@@ -196,7 +196,7 @@ def _walk(views: HandHeldViews) -> tuple[tuple[float, ...], ...]:
     paths -= paths[:, :1]
     greatest = np.maximum(np.abs(paths).max(axis=1, keepdims=True), 1e-12)
     reach = np.array([views.sway_deg] * 3 + [views.sway_mm] * 3)[:, None]
-    # a hand does not roll or move nearer as far as it sways
+    # a hand rolls, and moves towards the target, less than it sways
     reach[[2, 5]] *= 0.5
     return tuple(tuple(step) for step in (paths / greatest * reach).T.tolist())
 

@@ -12,8 +12,7 @@ because at damage views see different parts of it. Views that look through the s
 
 Not modelled: errors that all views share in all pixels, or registrations to one reference; a pattern that is not the
 same all over the sensor; changes of the blur. Where views are no farther apart than the pattern is long, its sill is an
-extrapolation.
-"""
+extrapolation."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """The map's frame and cells, and views placed in it: where each ray meets the target's surface, how far off it ends.
 
 Samples are resampled to a grid in triangles of neighbours, which leaves no gaps and no beats between two grids; it
-blurs by a tent whose variance is a sixth of the spacing squared.
-"""
+blurs by a tent whose variance is a sixth of the spacing squared."""
 
 from __future__ import annotations
 

@@ -13,24 +13,26 @@ from harness.vocabulary.config import Config
 
 
 class GridMerge(Config):
-    """The thesis' merge (MATLAB's pcmerge): all points, averaged within cubes of a grid. Frame: the first view's."""
+    """The thesis' merge (MATLAB's pcmerge): the mean of all points in each cube of a grid, in the first view's
+    frame."""
 
     kind: Literal["grid"] = "grid"
-    step_mm: float = Field(default=0.1, gt=0, le=50)
+    step_mm: float = Field(default=0.1, gt=0, le=50, description="side of a cube")
 
 
 class FusedMerge(Config):
-    """A map over the fitted surface: inverse-variance mean of the views, its variance and count of each cell."""
+    """A map over the fitted surface. Each cell holds the views' inverse-variance mean, its variance and their
+    number."""
 
     kind: Literal["fusion"] = "fusion"
-    cell_mm: float | None = Field(default=None, gt=0, le=50, description="none: the first view's pixel pitch")
+    cell_mm: float | None = Field(default=None, gt=0, le=50, description="null: the first view's pixel pitch")
 
 
 class VolumeMerge(Config):
-    """A truncated signed distance field (Open3D's VoxelBlockGrid). Frame: the first view's."""
+    """A truncated signed distance field (Open3D's VoxelBlockGrid), in the first view's frame."""
 
     kind: Literal["volume"] = "volume"
-    voxel_mm: float | None = Field(default=None, gt=0, le=50, description="none: the first view's pixel pitch")
+    voxel_mm: float | None = Field(default=None, gt=0, le=50, description="null: the first view's pixel pitch")
 
 
 MergeConfig = Annotated[GridMerge | FusedMerge | VolumeMerge, Field(discriminator="kind")]
@@ -38,9 +40,9 @@ AnyMerge = GridMerge | FusedMerge | VolumeMerge
 
 
 class MappingConfig(Config):
-    """Settings of crop (in each view's own frame), marks, registration and merge; ``views``: use the first so many."""
+    """Settings of crop (in each view's own frame), marks, registration and merge."""
 
-    views: int | None = Field(default=None, ge=1, le=1000)
+    views: int | None = Field(default=None, ge=1, le=1000, description="uses the first so many; null: all")
     crop: CropConfig = Field(default_factory=AutoCrop)
     marks: MarksConfig = Field(default_factory=ColourMarks)
     registration: RegistrationConfig = Field(default_factory=lambda: PlainRegistration(method="marks"))

@@ -3,8 +3,7 @@
 The slope of a mark's plane is fitted to the mark and its surroundings, the offset to the mark alone, which may be thick
 or ranged differently. The centroid is that of the pixels' rays cut by this plane, weighted by the surface that they
 cover and by their colour. Spots behind the surface are holes. Not modelled: a surface or tag that bends within the
-mark; a lens whose distortion is more than quadratic over one tag.
-"""
+mark; a lens whose distortion is more than quadratic over one tag."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Fiducial marks for a registration: their data, the rules that find them, and the conditions on a set of marks."""
+"""Fiducial marks for a registration: their data, settings of the rules that find them, and conditions on a set of
+marks."""
 
 from __future__ import annotations
 
@@ -14,25 +15,25 @@ from harness.vocabulary.geometry import MM
 
 LEAST_MARKS = 3
 OFF_LINE_SIGMAS, OFF_LINE_SHARE = 5.0, 0.02
-"""Marks lie on a line where their root mean square distance from it is less than so many standard deviations of one
-mark's place, or this part of that along it, where each millimetre of error at a mark would become 50 mm."""
+"""Marks count as lying on a line if their root mean square distance from it is less than so many standard deviations of
+a mark's position, or than this share of their spread along it: there, a millimetre of error at a mark becomes 50 mm."""
 
 
 class RedMarks(Config):
-    """The thesis' rule: pixels whose red channel exceeds the cropped cloud's mean by so many standard deviations."""
+    """The thesis' rule: pixels whose red exceeds the cropped cloud's mean by so many standard ``deviations``."""
 
     kind: Literal["red"] = "red"
     deviations: float = Field(default=2.6, gt=0, le=20)
 
 
 class ColourMarks(Config):
-    """Pixels whose chromaticity, or where that gives no three marks lightness, stands apart from the target's own."""
+    """Pixels whose chromaticity differs from the target's own, or whose lightness does if that gives too few marks."""
 
     kind: Literal["colour"] = "colour"
 
 
 class CodedMarks(Config):
-    """Printed codes (ArUco, AprilTag) of OpenCV's ``dictionary`` of that name, found in the cloud's colour."""
+    """Printed codes (ArUco, AprilTag) in the cloud's colour image; ``dictionary`` is OpenCV's name of their set."""
 
     kind: Literal["coded"] = "coded"
     dictionary: str = "DICT_6X6_50"
@@ -53,10 +54,10 @@ MarksConfig = Annotated[RedMarks | ColourMarks | CodedMarks, Field(discriminator
 
 @dataclass(frozen=True)
 class Mark:
-    """One mark in one view, camera frame, metres. ``centre_m`` (3,): its centroid on the surface. ``covariance_m2`` (3,
-    3): of that centroid, without errors that all pixels of the mark share (a range offset, a distortion of the lens).
-    ``normal`` (3,): of the surface there, towards the camera. ``pixels`` (n,): flat indices into the cloud's grid.
-    ``area_m2``: on the surface. ``code``: None of a piece of tape. ``doubt``: why it should not be relied on."""
+    """One mark in one view, camera frame, metres. ``centre_m`` (3,): its centroid on the surface. ``covariance_m2``
+    (3, 3): that of the centroid, without errors that all pixels of the mark share (a range offset, lens distortion).
+    ``normal`` (3,): the surface's there, towards the camera. ``pixels`` (n,): flat indices into the cloud's grid.
+    ``area_m2``: on the surface. ``code``: None for a piece of tape. ``doubt``: why it should not be relied on."""
 
     centre_m: np.ndarray
     covariance_m2: np.ndarray

@@ -7,8 +7,7 @@ sides, so a mirror image is no solution.
 
 Kabsch's closed form (1976; Umeyama 1991 for the sign) starts the rigid transform; Gauss-Newton on the full covariances
 gives the most probable one, and its covariance. Not modelled: marks that are seen twice, or moved between the views;
-errors that the points of one set share.
-"""
+errors that the points of one set share."""
 
 from __future__ import annotations
 

@@ -4,8 +4,7 @@ numbers too.
 The libraries that read them run within `files.limited_memory`. Arrays of objects, which would need pickle, are refused.
 A height map's pixels lie a stated pitch apart, and it is a cloud in parallel projection: x and y count from its middle,
 and z, which points away from the viewer, is `DISTANCE_M` at the median height. Without a stated unit, micrometres,
-millimetres or metres are taken, whichever gives the relief a plausible part of the extent.
-"""
+millimetres or metres are taken, whichever gives the relief a plausible part of the extent."""
 
 from __future__ import annotations
 
@@ -21,7 +20,7 @@ import numpy as np
 
 from detectors.recordings.distances import UNITS_M, default_metres, frame_of, refuse_narrow
 from detectors.recordings.intrinsics import lens_for
-from detectors.recordings.recording import Asked, Recording, damage_told
+from detectors.recordings.recording import Given, Recording, damage_told
 from harness.vocabulary import files
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import RAISE, refuse_bytes, refuse_pixels
@@ -183,26 +182,26 @@ Stack = tuple[np.ndarray, np.ndarray | None, np.ndarray | None, bool, str]
 """Distances (n, h, w) or points (n, h, w, 3), colour, amplitude; whether there is a pixel grid; a note on the axes."""
 
 
-def open_arrays(path: Path, asked: Asked) -> Recording:
+def open_arrays(path: Path, given: Given) -> Recording:
     """Open a file of arrays: frames, or with a pitch a height map. Raises UserError where none or several fit."""
-    load = RawLoader.stated(asked.raw) if asked.raw is not None else LOADERS[path.suffix.lower()]
-    if asked.pitch is not None:
-        return _open_height_map(path, load, asked)
-    distances, _, _, organised, note = _stack(path, load, asked)
+    load = RawLoader.stated(given.raw) if given.raw is not None else LOADERS[path.suffix.lower()]
+    if given.pitch is not None:
+        return _open_height_map(path, load, given)
+    distances, _, _, organised, note = _stack(path, load, given)
     left_over = load.refuse_doubtful(path, distances) if isinstance(load, RawLoader) else 0
     if distances.ndim == 3:
-        _refuse_other_planes(str(path), asked.array or "", distances, left_over)
+        _refuse_other_planes(str(path), given.array or "", distances, left_over)
     height, width = distances.shape[1:3]
     lens: Lens | None = None
     files: tuple[Path, ...] = ()
     if distances.ndim == 3:
         hint = "; of a height map, the distance between its pixels: --pitch 0.5mm"
-        lens, files = lens_for(str(path), asked, width, height, beside=[path.parent, path.parent.parent], hint=hint)
-    scale_m = asked.scale_m or default_metres(distances.dtype)
+        lens, files = lens_for(str(path), given, width, height, beside=[path.parent, path.parent.parent], hint=hint)
+    scale_m = given.scale_m or default_metres(distances.dtype)
 
     def read() -> Iterator[Frame]:
         # ``.npy`` is mapped, not read; ``.npz`` and ``.mat`` are unpacked whole
-        distances, *beside, _, _ = _stack(path, load, asked)
+        distances, *beside, _, _ = _stack(path, load, given)
         for i, stored in enumerate(distances):
             rgb, amplitude = (None if plane is None else plane[i] for plane in beside)
             yield frame_of(f"{path.name} frame {i}", np.asarray(stored), scale_m, rgb, amplitude)
@@ -212,13 +211,13 @@ def open_arrays(path: Path, asked: Asked) -> Recording:
     return Recording.begun(path.name, read, scale_m, is_whole, **more)
 
 
-def open_array_list(paths: Sequence[Path], asked: Asked, name: str) -> Recording:
+def open_array_list(paths: Sequence[Path], given: Given, name: str) -> Recording:
     """Open files of arrays of one kind as one capture, in the order given. Raises UserError as `open_arrays` does."""
-    first = open_arrays(paths[0], asked)
+    first = open_arrays(paths[0], given)
 
     def read() -> Iterator[Frame]:
         for path in paths:
-            yield from open_arrays(path, asked).read()
+            yield from open_arrays(path, given).read()
 
     return replace(first, name=name, read=read, files=(*paths, *first.files[1:]))
 
@@ -235,10 +234,10 @@ def _refuse_other_planes(name: str, key: str, frames: np.ndarray, left_over: int
         raise UserError(what, legal="frames of one scene, or one plane", fix=fix)
 
 
-def _stack(path: Path, load: ArraysLoader, asked: Asked) -> Stack:
+def _stack(path: Path, load: ArraysLoader, given: Given) -> Stack:
     """Find the distances among a file's arrays, with colour and amplitude, and put the frame axis first."""
     arrays = load(path)
-    name, array = _named_array(str(path), arrays, DISTANCE_NAMES, asked.array)
+    name, array = _named_array(str(path), arrays, DISTANCE_NAMES, given.array)
     if array.size == 0:
         raise UserError(f"{name}: is empty {array.shape}", legal=LEGAL_AXES)
     note = ""
@@ -247,7 +246,7 @@ def _stack(path: Path, load: ArraysLoader, asked: Asked) -> Stack:
     if _frames_are_last(array):
         note = f"{name} {array.shape}: the frames are assumed to lie along the last axis"
         array = np.moveaxis(array, -1, 0)
-    has_points, shape, organised = _axes(name, array.shape, asked.lens)
+    has_points, shape, organised = _axes(name, array.shape, given.lens)
     refuse_pixels(name, shape[2], shape[1])
     beside = {key.lower(): value for key, value in arrays.items() if value.dtype.kind in "biuf"}
 
@@ -283,10 +282,10 @@ def _apart(first: np.ndarray, second: np.ndarray) -> float:
     return float(np.median(np.abs(one - other) / one)) if both.any() else float("inf")
 
 
-def _named_array(name: str, arrays: Arrays, usual: Sequence[str], asked: str | None) -> tuple[str, np.ndarray]:
-    """Return (name, array): the one asked for as NAME[:NUMBER], else the one with a usual name, else the only one."""
+def _named_array(name: str, arrays: Arrays, usual: Sequence[str], given: str | None) -> tuple[str, np.ndarray]:
+    """Return (name, array): the one that NAME[:NUMBER] names, or else the one with a usual name, or the only one."""
     held = ", ".join(f"{key} {value.shape}".strip() for key, value in arrays.items()) or "nothing"
-    key, _, number = (asked or "").partition(":")
+    key, _, number = (given or "").partition(":")
     if not key:
         found = [key for key in arrays if key.lower() in usual]
         found = found or [key for key in arrays if "depth" in key.lower()] or list(arrays)
@@ -301,7 +300,7 @@ def _named_array(name: str, arrays: Arrays, usual: Sequence[str], asked: str | N
     if number:
         array = np.moveaxis(array, -1, 0) if _is_deep(array) and array.shape[2] != 3 else array
         if not number.isdigit() or array.ndim < 3 or int(number) >= len(array):
-            raise UserError(f"--array {asked}: no such part of {name} {array.shape}", legal="NAME, or NAME:0 onwards")
+            raise UserError(f"--array {given}: no such part of {name} {array.shape}", legal="NAME, or NAME:0 onwards")
         array, name = array[int(number)], f"{name if key else name + ': '}:{number}"
     refuse_narrow(name, array.dtype)
     return name, array
@@ -331,14 +330,14 @@ RELIEF = (5e-4, 0.5)
 """Plausible relief (1st to 99th percentile) over the map's shorter side: no two units, 1000 apart, fit."""
 
 
-def _open_height_map(path: Path, load: ArraysLoader, asked: Asked) -> Recording:
-    """Open a height map. Raises UserError where the array is no single map, or its unit cannot be told."""
-    match = re.fullmatch(r"(\d+(?:\.\d+)?(?:e-?\d+)?)\s*(um|mm|cm|m)", (asked.pitch or "").strip())
+def _open_height_map(path: Path, load: ArraysLoader, given: Given) -> Recording:
+    """Open a height map. Raises UserError where the array is no single map, or its unit cannot be determined."""
+    match = re.fullmatch(r"(\d+(?:\.\d+)?(?:e-?\d+)?)\s*(um|mm|cm|m)", (given.pitch or "").strip())
     pitch_m = float(match.group(1)) * UNITS_M[match.group(2)] if match else math.nan
     if not 1e-7 <= pitch_m <= 1:
         legal = "the distance between pixels with its unit, for instance 0.5mm, 200um or 0.001m"
-        raise UserError(f"--pitch {asked.pitch}: is not a length", legal=legal)
-    name, heights = _map_in(path, load, asked.array)
+        raise UserError(f"--pitch {given.pitch}: is not a length", legal=legal)
+    name, heights = _map_in(path, load, given.array)
     known = heights[np.isfinite(heights)].astype(np.float64)
     if known.size == 0:
         raise UserError(f"{name}: has no finite height", legal="numbers, and NaN where there is no height")
@@ -346,18 +345,18 @@ def _open_height_map(path: Path, load: ArraysLoader, asked: Asked) -> Recording:
     height, width = heights.shape
     side_m = min(height, width) * pitch_m
     plausible = (UNITS_M[u] for u in ("mm", "m", "um") if RELIEF[0] <= relief * UNITS_M[u] / side_m < RELIEF[1])
-    scale_m = next(plausible, None) if asked.scale_m is None else asked.scale_m
+    scale_m = next(plausible, None) if given.scale_m is None else given.scale_m
     if scale_m is None:
         what = f"{name}: the unit of its heights is not stated: they span {relief:.4g} over {1e3 * side_m:.4g} mm"
         raise UserError(what, fix="state it: --unit mm, --unit m or --unit um")
     is_down = name.rpartition(" ")[2].partition(":")[0].lower() in DOWN_NAMES
     direction = "grow away from the viewer, as its name says" if is_down else "grow towards the viewer: holes are low"
     z_step_m = 0.0 if (known % 1).any() else scale_m  # whole numbers were rounded, others were not
-    read = partial(_map_frames, path, load, asked.array, pitch_m, scale_m if is_down else -scale_m)
+    read = partial(_map_frames, path, load, given.array, pitch_m, scale_m if is_down else -scale_m)
     note = f"height map {name}: {width} x {height} pixels of {1e3 * pitch_m:.4g} mm; its numbers {direction}"
     notes = (note, f"the median height lies at z = {1e3 * DISTANCE_M:g} mm")
-    told = f"the map's relief, {relief:.4g} over {1e3 * side_m:.4g} mm (--unit states another)"
-    found = Recording(path.name, read, (height, width), scale_m, z_step_m, (path,), notes=notes, unit_from=told)
+    origin = f"the map's relief, {relief:.4g} over {1e3 * side_m:.4g} mm (--unit states another)"
+    found = Recording(path.name, read, (height, width), scale_m, z_step_m, (path,), notes=notes, unit_from=origin)
     return replace(found, projection="parallel")
 
 

@@ -2,8 +2,7 @@
 
 ``rosbags`` unpacks chunks whole: it runs within `files.limited_memory`. A depth image needs the CameraInfo that its
 driver publishes beside it. Where rays of a CameraInfo pass through a cloud's points, z and that lens are used: a
-pixel's ray is then the same in all frames.
-"""
+pixel's ray is then the same in all frames."""
 
 from __future__ import annotations
 
@@ -21,7 +20,7 @@ from detectors.recordings.depth_images import NOT_DEPTH
 from detectors.recordings.distances import UNITS_M, default_metres
 from detectors.recordings.intrinsics import KNOWN_MODELS, LEGAL_LENS, lens_for, read_lens
 from detectors.recordings.messages import DEPTH_NUMBERS, encoding_of, frame_of_message, stored_depth
-from detectors.recordings.recording import NO_GRID, Asked, Recording, damage_told
+from detectors.recordings.recording import NO_GRID, Given, Recording, damage_told
 from harness.vocabulary.declaration.yaml_source import MAX_BYTES, read_yaml
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Frame, Lens
@@ -128,9 +127,9 @@ def find_bag(path: Path) -> Bag:
         raise UserError(what, legal=LEGAL_BAG, fix="name that file itself, or run: ros2 bag reindex")
     fix = "copy it again, name the .db3 or .mcap itself, or run: ros2 bag reindex"
     with damage_told(f"{metadata}: is not a description of a ROS 2 bag, or is cut off", LEGAL_BAG, fix):
-        told = read_yaml(metadata).data["rosbag2_bagfile_information"]
-        files = tuple(path / Path(name).name for name in told["relative_file_paths"])
-        mode = str(told.get("compression_mode") or "none").lower()
+        info = read_yaml(metadata).data["rosbag2_bagfile_information"]
+        files = tuple(path / Path(name).name for name in info["relative_file_paths"])
+        mode = str(info.get("compression_mode") or "none").lower()
     if mode == "file":
         fix = f"unpack it (zstd -d {files[0] if files else path}) and name the unpacked file"
         raise UserError(f"{path}: its files are compressed as a whole", legal=LEGAL_BAG, fix=fix)
@@ -154,14 +153,14 @@ RAY_TOLERANCE_PX = 0.01
 """A lens counts where each point lies within this of its pixel's ray: far more than float32 leaves of it."""
 
 
-def open_bag(path: Path, asked: Asked) -> Recording:
+def open_bag(path: Path, given: Given) -> Recording:
     """Open a bag's depth images or clouds. Raises UserError where it is broken or empty, or a lens does not fit."""
     bag = find_bag(path)
-    chosen, note = _chosen_topic(bag, asked)
+    chosen, note = _chosen_topic(bag, given)
     if bag.first(chosen) is None:
         raise UserError(f"{path}: no message on {chosen}", legal="clouds or depth images", fix="record again")
-    recording = (_open_clouds if bag.topics[chosen] == CLOUD_TYPE else _open_images)(bag, chosen, asked)
-    files = (*bag.files, *filter(None, (bag.metadata, asked.intrinsics)))
+    recording = (_open_clouds if bag.topics[chosen] == CLOUD_TYPE else _open_images)(bag, chosen, given)
+    files = (*bag.files, *filter(None, (bag.metadata, given.intrinsics)))
     return replace(recording, files=files, notes=(note, *recording.notes))
 
 
@@ -172,11 +171,11 @@ def _frames(bag: Bag, topic: str, scale_m: float, by_lens: bool) -> Iterator[Fra
         yield replace(frame, xy_m=None) if by_lens else frame
 
 
-def _open_clouds(bag: Bag, topic: str, asked: Asked) -> Recording:
-    scale_m = asked.scale_m or UNITS_M["m"]
+def _open_clouds(bag: Bag, topic: str, given: Given) -> Recording:
+    scale_m = given.scale_m or UNITS_M["m"]
     first = next(_frames(bag, topic, scale_m, by_lens=False))
     height, width = first.z_m.shape
-    lens = read_lens(asked.intrinsics, width, height) if asked.intrinsics else asked.lens
+    lens = read_lens(given.intrinsics, width, height) if given.intrinsics else given.lens
     note = ""
     if lens is not None:
         if (lens.height, lens.width) != (height, width):
@@ -200,14 +199,14 @@ def _open_clouds(bag: Bag, topic: str, asked: Asked) -> Recording:
     return Recording.begun(bag.path.name, read, scale_m, **more)
 
 
-def _open_images(bag: Bag, topic: str, asked: Asked) -> Recording:
+def _open_images(bag: Bag, topic: str, given: Given) -> Recording:
     name, message = next(bag.messages(topic))
     stored = stored_depth(name, message)
     height, width = stored.shape
     is_whole = stored.dtype.kind == "u"
     own = partial(_lens_of_images, bag, topic, (height, width))
-    lens, _ = lens_for(str(bag.path), asked, width, height, own)
-    scale_m = asked.scale_m
+    lens, _ = lens_for(str(bag.path), given, width, height, own)
+    scale_m = given.scale_m
     unit_from = "ROS, which sets millimetres for integers and metres for floating point (REP 118)"
     for name, kind in bag.topics.items():
         # RealSense's viewer states the unit beside a sensor's streams
@@ -223,7 +222,7 @@ def _open_images(bag: Bag, topic: str, asked: Asked) -> Recording:
     return Recording.begun(bag.path.name, read, scale_m, is_whole, lens=lens, unit_from=unit_from)
 
 
-def _chosen_topic(bag: Bag, asked: Asked) -> tuple[str, str]:
+def _chosen_topic(bag: Bag, given: Given) -> tuple[str, str]:
     """Return the topic to read, and what the user should know of the others."""
     path, topics = bag.path, bag.topics
     clouds = [topic for topic, kind in topics.items() if kind == CLOUD_TYPE]
@@ -231,15 +230,15 @@ def _chosen_topic(bag: Bag, asked: Asked) -> tuple[str, str]:
     both = ", ".join([*clouds, *images])
     held = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items()) or "none"
     kinds = f"a topic with {CLOUD_TYPE} or depth images ({', '.join(DEPTH_NUMBERS)})"
-    if asked.topic is not None:
-        name = asked.topic if asked.topic in topics else f"/{asked.topic}"
+    if given.topic is not None:
+        name = given.topic if given.topic in topics else f"/{given.topic}"
         if name not in topics:
-            raise UserError(f"{path}: no topic {asked.topic}; its topics: {held}", legal=both or LEGAL_BAG)
+            raise UserError(f"{path}: no topic {given.topic}; its topics: {held}", legal=both or LEGAL_BAG)
         if topics[name] not in (CLOUD_TYPE, *IMAGE_TYPES):
             raise UserError(f"{path}: {name} holds {topics[name]}", legal=kinds)
         return name, ""
     usual = [topic for topic in clouds if topic.removeprefix("/") == USUAL_TOPIC] or clouds
-    has_lens = bool(asked.intrinsics or asked.lens)
+    has_lens = bool(given.intrinsics or given.lens)
     if len(images) == 1 and (not clouds or has_lens or _infos_of(bag, images[0])):
         others = f", with their lens, not the clouds on {', '.join(clouds)}; --topic chooses"
         return images[0], f"the depth images on {images[0]} are read{others}" if clouds else ""
@@ -288,8 +287,8 @@ def _lens_of_images(bag: Bag, topic: str, shape: tuple[int, ...]) -> Lens:
         if isinstance(lens, Lens):
             return lens
         why.append(f"{info} {lens}")
-    told = "; ".join(why) or f"no CameraInfo lies beside {topic} (the bag's: {', '.join(every) or 'none'})"
-    what = f"{bag.path}: {told}: the lens of these depth images is unknown; without it they give no points"
+    reason = "; ".join(why) or f"no CameraInfo lies beside {topic} (the bag's: {', '.join(every) or 'none'})"
+    what = f"{bag.path}: {reason}: the lens of these depth images is unknown; without it they give no points"
     fix = f"pass --intrinsics FILE{', or the rectified topic by --topic' if why else ''}"
     raise UserError(what, legal=LEGAL_LENS, fix=fix)
 

@@ -3,8 +3,7 @@
 Open3D drops the grid and fills a cut PLY up with zeros, so the header is read here: a PCD is organised where HEIGHT >
 1, a PLY where it states num_cols and num_rows. A list has a point a line: x y z, then an intensity, or red green blue,
 or both; a line of names may say otherwise. Its grid is stated by a comment or a first line of two whole numbers, or
-told by a lens with as many pixels, or a sensor's usual size on which x/z and y/z rise evenly.
-"""
+told by a lens with as many pixels, or a sensor's usual size on which x/z and y/z rise evenly."""
 
 from __future__ import annotations
 
@@ -23,7 +22,7 @@ import numpy as np
 from detectors.open3d_library import load_open3d
 from detectors.recordings.arrays import SENSOR_SIZES
 from detectors.recordings.distances import UNITS_M, frame_of
-from detectors.recordings.recording import NO_GRID, Asked, Recording, damage_told
+from detectors.recordings.recording import NO_GRID, Given, Recording, damage_told
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import TABLE_BYTES, bounded_bytes, refuse_pixels
 from harness.vocabulary.geometry import Frame, Lens
@@ -34,11 +33,11 @@ RASTER_CORRELATION = 0.999
 """Correlation of x/z with the column and y/z with the row on a true pixel grid: a distorted lens bends 1 %."""
 
 
-def open_clouds(paths: Sequence[Path], asked: Asked, name: str) -> Recording:
+def open_clouds(paths: Sequence[Path], given: Given, name: str) -> Recording:
     """Open clouds in the order given, each a frame. Raises UserError on a broken file."""
-    scale_m = asked.scale_m or UNITS_M["m"]
+    scale_m = given.scale_m or UNITS_M["m"]
     is_list = paths[0].suffix.lower() in POINT_LISTS
-    read = partial(_frames, tuple(paths), _read_list if is_list else _read_cloud, asked.lens, scale_m)
+    read = partial(_frames, tuple(paths), _read_list if is_list else _read_cloud, given.lens, scale_m)
     recording = Recording.begun(name, read, scale_m, files=tuple(paths))
     height, width = recording.shape
     note = NO_GRID if height == 1 else f"the points fill a grid of {width} x {height} pixels" * is_list

@@ -2,8 +2,7 @@
 
 What decides the layout: a sub-folder ``depth`` (with ``color`` or ``rgb`` beside it), names that hold "depth", names
 that are numbers, else every 16-bit grey PNG. A ``depth.txt`` beside marks TUM RGB-D. A picture's kind is told by its
-first bytes, and Pillow reads its header: OpenCV would decode a header of 30,000 x 30,000 pixels into gigabytes.
-"""
+first bytes, and Pillow reads its header: OpenCV would decode a header of 30,000 x 30,000 pixels into gigabytes."""
 
 from __future__ import annotations
 
@@ -22,7 +21,7 @@ from PIL import ImageFile, JpegImagePlugin, PngImagePlugin
 
 from detectors.recordings.distances import UNITS_M, frame_of
 from detectors.recordings.intrinsics import lens_for
-from detectors.recordings.recording import Asked, Recording, damage_told
+from detectors.recordings.recording import Given, Recording, damage_told
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import PICTURE_BYTES, bounded_bytes, refuse_pixels
 from harness.vocabulary.geometry import Frame
@@ -79,7 +78,7 @@ NOT_DEPTH = re.compile(
 """Words in the names of files and topics of other pictures that a depth camera writes in 16 bits or floating point."""
 
 
-def open_depth_folder(folder: Path, asked: Asked) -> Recording:
+def open_depth_folder(folder: Path, given: Given) -> Recording:
     """Open a folder of depth PNGs. Raises UserError where it has none, or their lens is unknown."""
     inner = folder / "depth"
     depths = depth_files(inner if inner.is_dir() else folder)
@@ -101,12 +100,12 @@ def open_depth_folder(folder: Path, asked: Asked) -> Recording:
     if pictures and (None in colours or len(pictures) != len(depths)):
         without = f"{colours.count(None)} depth pictures have no colour"
         note = f"{len(depths)} depth and {len(pictures)} colour pictures: {without}"
-    return open_depth_list(depths, asked, folder.name, root, colours, is_tum, note)
+    return open_depth_list(depths, given, folder.name, root, colours, is_tum, note)
 
 
 def open_depth_list(
     depths: Sequence[Path],
-    asked: Asked,
+    given: Given,
     name: str,
     root: Path | None = None,
     colours: Sequence[Path | None] = (),
@@ -117,7 +116,7 @@ def open_depth_list(
     ``colours``: the colour picture of each, if any. Raises UserError where their lens is not known."""
     root = root or depths[0].parent
     width, height = _depth_size(depths[0])
-    lens, lens_files = lens_for(str(root), asked, width, height, beside=(root, depths[0].parent, root.parent))
+    lens, lens_files = lens_for(str(root), given, width, height, beside=(root, depths[0].parent, root.parent))
     notes = [note]
     first = next((path for path in colours if path), None)
     if first is not None and (found := _colour(first).shape)[:2] != (height, width):
@@ -125,7 +124,7 @@ def open_depth_list(
         notes = [f"colour pictures of {found[1]} x {found[0]} pixels are not aligned with the depth and are not used"]
     if not any(lens.distortion):
         notes.append("no lens distortion is stated; the images are taken as undistorted")
-    scale_m = asked.scale_m or UNITS_M["tum" if is_tum else "mm"]
+    scale_m = given.scale_m or UNITS_M["tum" if is_tum else "mm"]
     is_whole = scale_m != UNITS_M["tum"]  # its unit of 0.2 mm is finer than the steps of most cameras
     files, unit_from = (*depths, *filter(None, colours), *lens_files), "depth.txt, which marks TUM RGB-D" * is_tum
     more = {"files": files, "lens": lens, "notes": tuple(notes), "unit_from": unit_from}

@@ -2,8 +2,7 @@
 
 k4arecorder writes tracks titled COLOR, DEPTH and IR (16-bit big-endian grey, depth in millimetres, 0 = none) and
 attaches the factory calibration. Phones store ARKit's depth, a confidence 0 to 2 of each pixel (0 is no return), the
-lens of the colour camera, and poses, by which the program warns of movement.
-"""
+lens of the colour camera, and poses, by which the program warns of movement."""
 
 from __future__ import annotations
 
@@ -28,7 +27,7 @@ from detectors.recordings.intrinsics import (
     lens_for,
     parse_calibration,
 )
-from detectors.recordings.recording import Asked, Recording, damage_told
+from detectors.recordings.recording import Given, Recording, damage_told
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import FRAME_PIXELS, TEXT_BYTES, bounded_bytes, refuse_bytes, refuse_pixels, strict_json
 from harness.vocabulary.geometry import Frame, Lens, transform_points
@@ -40,7 +39,7 @@ WAITING = 4
 """Captures held while their other pictures may still come; the recorder interleaves its tracks within one frame."""
 
 
-def open_mkv(path: Path, asked: Asked) -> Recording:
+def open_mkv(path: Path, given: Given) -> Recording:
     """Open a recording with its own calibration, or the lens given. Raises UserError where it has no depth."""
     _refuse_truncated(path)
     with _opened(path) as container:
@@ -62,10 +61,10 @@ def open_mkv(path: Path, asked: Asked) -> Recording:
         mode = stated or depth_mode_of_size(width, height) or "(not stated)"
         return None if cameras is None else depth_lens(str(path), cameras, mode)
 
-    lens, lens_files = lens_for(str(path), asked, width, height, own)
+    lens, lens_files = lens_for(str(path), given, width, height, own)
     colour = colour_camera(str(path), cameras, *sizes["COLOR"]) if cameras is not None and "COLOR" in sizes else None
     note = "colour sampled at each depth point's place in the colour picture, without a test for occlusion"
-    scale_m = asked.scale_m or UNITS_M["mm"]
+    scale_m = given.scale_m or UNITS_M["mm"]
     read, notes = partial(_frames, path, scale_m, lens, colour), () if colour is None else (note,)
     more = {"files": (path, *lens_files), "lens": lens, "notes": notes}
     return Recording.begun(path.name, read, scale_m, True, unit_from="k4arecorder, which writes millimetres", **more)
@@ -173,7 +172,7 @@ BLUR_PX = 0.5  # motion over this much of a pixel spreads an edge further than t
 
 def _recording(
     path: Path,
-    asked: Asked,
+    given: Given,
     read: Callable[[], Iterator[Frame]],
     size: tuple[int, int],
     scaled_lens: Callable[[], Lens],
@@ -183,11 +182,11 @@ def _recording(
     writer: str,
 ) -> Recording:
     """Return the recording of either program. ``size``: width, height; ``poses``: places, quaternions, their source."""
-    lens, lens_files = lens_for(str(path), asked, *size, scaled_lens)
-    notes = () if lens_files or asked.lens else (f"lens scaled from the colour pixels to {size[0]} x {size[1]}",)
+    lens, lens_files = lens_for(str(path), given, *size, scaled_lens)
+    notes = () if lens_files or given.lens else (f"lens scaled from the colour pixels to {size[0]} x {size[1]}",)
     first_m = next(read()).z_m
     median_m = float(np.median(first_m[np.isfinite(first_m)])) if np.isfinite(first_m).any() else 1.0
-    warnings = _motion_warnings(*poses, asked.frames, lens, median_m)
+    warnings = _motion_warnings(*poses, given.frames, lens, median_m)
     more = {"files": (*files, *lens_files), "lens": lens, "notes": notes, "warnings": warnings}
     return Recording.begun(path.name, read, scale_m, "milli" in writer, unit_from=writer, **more)
 
@@ -237,13 +236,13 @@ def is_stray(folder: Path) -> bool:
     return (folder / "camera_matrix.csv").is_file() and (folder / "depth").is_dir()
 
 
-def open_stray(folder: Path, asked: Asked) -> Recording:
+def open_stray(folder: Path, given: Given) -> Recording:
     """Open Stray Scanner's folder. Raises UserError where a file is broken or the lens' resolution cannot be told."""
     depths = depth_files(folder / "depth")
     height, width = read_depth_png(depths[0]).shape
     beside = [folder / "confidence" / path.name for path in depths]
     confidences = tuple(path if path.is_file() else None for path in beside)
-    scale_m = asked.scale_m or UNITS_M["mm"]
+    scale_m = given.scale_m or UNITS_M["mm"]
     matrix, odometry = folder / "camera_matrix.csv", folder / "odometry.csv"
 
     def scaled_lens() -> Lens:
@@ -266,7 +265,7 @@ def open_stray(folder: Path, asked: Asked) -> Recording:
             yield _frame(f"{depth.parent.name}/{depth.name}", read_depth_png(depth), sure, scale_m)
 
     motion, writer = (poses[:, :3], poses[:, 3:], odometry.name), "Stray Scanner, which writes millimetres"
-    return _recording(folder, asked, read, (width, height), scaled_lens, tuple(files), motion, scale_m, writer)
+    return _recording(folder, given, read, (width, height), scaled_lens, tuple(files), motion, scale_m, writer)
 
 
 def _table(path: Path) -> np.ndarray:
@@ -280,7 +279,7 @@ def _table(path: Path) -> np.ndarray:
     return table
 
 
-def open_r3d(path: Path, asked: Asked) -> Recording:
+def open_r3d(path: Path, given: Given) -> Recording:
     """Open Record3D's .r3d. Raises UserError where it is broken or pyliblzfse, which unpacks its depth, is missing."""
     with _archive(path) as archive:
         if "metadata" not in archive.namelist() or not _depth_names(archive):
@@ -288,13 +287,13 @@ def open_r3d(path: Path, asked: Asked) -> Recording:
             raise UserError(f"{path}: contains no Record3D capture ({held[:200]})", legal=LEGAL_R3D)
         content = _content(path, archive, "metadata")
     with damage_told(f"{path}: its metadata cannot be read", LEGAL_R3D):
-        told = strict_json(content)
-        k = np.array([float(x) for x in told["K"]]).reshape(3, 3).T
-        width, height = int(told.get("dw", 192)), int(told.get("dh", 256))
-        colour = int(told["w"]), int(told["h"])
-        poses = np.array(told.get("poses") or np.zeros((0, 7)), float).reshape(-1, 7)
+        info = strict_json(content)
+        k = np.array([float(x) for x in info["K"]]).reshape(3, 3).T
+        width, height = int(info.get("dw", 192)), int(info.get("dh", 256))
+        colour = int(info["w"]), int(info["h"])
+        poses = np.array(info.get("poses") or np.zeros((0, 7)), float).reshape(-1, 7)
     refuse_pixels(str(path), width, height)
-    scale_m = asked.scale_m or UNITS_M["m"]
+    scale_m = given.scale_m or UNITS_M["m"]
     scaled_lens = partial(_scaled, f"{path}: metadata", k, colour, (width, height))
 
     def read() -> Iterator[Frame]:
@@ -306,7 +305,7 @@ def open_r3d(path: Path, asked: Asked) -> Recording:
                 yield _frame(f"{path.name} {name}", stored, sure, scale_m)
 
     motion, writer = (poses[:, 4:], poses[:, :4], "its metadata"), "Record3D, which writes metres"
-    return _recording(path, asked, read, (width, height), scaled_lens, (path,), motion, scale_m, writer)
+    return _recording(path, given, read, (width, height), scaled_lens, (path,), motion, scale_m, writer)
 
 
 def _archive(path: Path) -> zipfile.ZipFile:

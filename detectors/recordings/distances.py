@@ -186,8 +186,7 @@ def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int,
     Each of `READINGS` is weighed by how common it is and by how far it puts the nearest tenth of the points, which is
     where targets are (`NEAR_M`). A common divisor of all numbers speaks for the unit in which they are whole
     millimetres; sizes that only cameras with 1 mm have speak for it (`MILLIMETRE_SIZES`), and against distances beyond
-    their reach. Raises UserError where no reading is clearly the likeliest, with the distance that each gives.
-    """
+    their reach. Raises UserError where no reading is clearly the likeliest, with the distance that each gives."""
     near, median = (float(q) for q in np.quantile(stored[:: max(1, stored.size // 50_000)], (0.1, 0.5)))
     integers = usual_m == UNITS_M["mm"]
     divisor = int(np.gcd.reduce(stored.astype(np.int64))) if integers else 1

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from detectors.recordings.recording import Asked, damage_told
+from detectors.recordings.recording import Given, damage_told
 from harness.vocabulary.declaration.yaml_source import MAX_BYTES, DeclarationError, parse_yaml
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, refuse_bytes, strict_json
@@ -136,7 +136,7 @@ KNOWN_MODELS = ("", "none", "pinhole", "plumb_bob", "brown_conrady", "rational_p
 
 def lens_for(
     name: str,
-    asked: Asked,
+    given: Given,
     width: int,
     height: int,
     own: Callable[[], Lens | None] = lambda: None,
@@ -146,7 +146,7 @@ def lens_for(
     """Return the lens of depth images and the files that state it: --intrinsics, the named camera's, the capture's
     ``own``, or the first file named like a lens in the folders ``beside``. Raises UserError where nobody states a lens
     (``hint`` ends its advice), or that of other images."""
-    lens, file = asked.lens, asked.intrinsics
+    lens, file = given.lens, given.intrinsics
     if lens is None and file is None:
         lens = own()
         suffixes = (".json", ".yaml", ".yml")

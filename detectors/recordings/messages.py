@@ -1,7 +1,6 @@
 """ROS' messages: depth images and point clouds as frames (common_interfaces, REP 103 and 118).
 
-``compressedDepth``: twelve bytes (a form, two numbers of the quantisation), then a PNG or RVL (Wilson 2017).
-"""
+``compressedDepth``: twelve bytes (a form, two numbers of the quantisation), then a PNG or RVL (Wilson 2017)."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from detectors.recordings.depth_images import depth_named, open_depth_folder, op
 from detectors.recordings.devices import is_stray, open_mkv, open_r3d, open_stray
 from detectors.recordings.distances import UNITS_M, Unit, decided_unit, metres_per_unit, ray_lengths_doubt, scale_in
 from detectors.recordings.intrinsics import mappings, parsed_lens
-from detectors.recordings.recording import Asked, Recording, damage_told
+from detectors.recordings.recording import Given, Recording, damage_told
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import OtherLens
 
@@ -29,7 +29,7 @@ LEGAL_FORMATS = (
 FILES = {".mkv": open_mkv, ".r3d": open_r3d, **dict.fromkeys(LOADERS, open_arrays)}
 FILES |= dict.fromkeys((*BAG_SUFFIXES, ROS1_SUFFIX), open_bag)
 """Suffixes of files of which each is a capture, and what opens it."""
-ListOpener = Callable[[Sequence[Path], Asked, str], Recording]
+ListOpener = Callable[[Sequence[Path], Given, str], Recording]
 LISTS: dict[str, ListOpener] = {".png": open_depth_list, **dict.fromkeys((*CLOUDS, *POINT_LISTS), open_clouds)}
 """Suffixes of files of which several, all of one suffix, are one capture."""
 SAVE = "python -c \"import numpy, {}; numpy.save('depth.npy', {})\", then name depth.npy"
@@ -45,7 +45,7 @@ HELD = 6  # names of a folder's contents that a message lists
 def open_capture(paths: Sequence[Path], *, unit: str | None = None, **statements: Any) -> Recording:
     """Open a real capture as a source of frames; its first frame is read and checked. ``unit`` of the stored distances
     (mm, m, cm, um, tum, N/m) where the format's usual one is wrong; the other ``statements`` are the fields of
-    `recording.Asked`. Raises UserError for every fault of the files."""
+    `recording.Given`. Raises UserError for every fault of the files."""
     paths = [Path(path) for path in paths]
     if not paths:
         raise UserError("no capture is named", legal=LEGAL_FORMATS)
@@ -53,25 +53,25 @@ def open_capture(paths: Sequence[Path], *, unit: str | None = None, **statements
         if not path.is_file() and not path.is_dir():
             odd = path.exists() and "is neither a file nor a folder, but a device or a pipe"
             raise UserError(f"{path}: {odd or 'no such file or folder'}", legal=LEGAL_FORMATS)
-    asked = Asked(metres_per_unit(unit) if unit else None, **statements)
-    recording = replace(_opened(paths, asked), selection=asked.frames)
-    said = Unit(recording.scale_m, f"--unit {unit}" if unit else recording.unit_from)
-    if not said.origin:
-        said = _unit_not_stated(recording)
-        if said.scale_m != recording.scale_m:
-            recording = replace(_opened(paths, replace(asked, scale_m=said.scale_m)), selection=asked.frames)
+    given = Given(metres_per_unit(unit) if unit else None, **statements)
+    recording = replace(_opened(paths, given), selection=given.frames)
+    stated = Unit(recording.scale_m, f"--unit {unit}" if unit else recording.unit_from)
+    if not stated.origin:
+        stated = _unit_not_stated(recording)
+        if stated.scale_m != recording.scale_m:
+            recording = replace(_opened(paths, replace(given, scale_m=stated.scale_m)), selection=given.frames)
     first, *second = islice(recording.frames(), 2)
-    given, doubts = recording.lens, [said.warning]
+    lens, doubts = recording.lens, [stated.warning]
     if second and np.array_equal(first.z_m, second[0].z_m, equal_nan=True):
         doubts += ["the first two frames are equal: repeated frames do not lower noise, but are counted as if they did"]
     if recording.slopes is not None and first.xy_m is None:
         doubts += [ray_lengths_doubt(first.z_m, recording.slopes)]
     notes, warnings = [*recording.notes, *first.notes], [*recording.warnings, *doubts]
-    if isinstance(given, OtherLens):
-        notes, warnings = [*notes, given.note], [*warnings, given.warning]
-        recording = replace(recording, lens=given.plain)
+    if isinstance(lens, OtherLens):
+        notes, warnings = [*notes, lens.note], [*warnings, lens.warning]
+        recording = replace(recording, lens=lens.plain)
     notes, warnings = list(filter(None, notes)), list(filter(None, warnings))
-    return replace(recording, unit_from=said.origin, notes=tuple(notes), warnings=tuple(warnings))
+    return replace(recording, unit_from=stated.origin, notes=tuple(notes), warnings=tuple(warnings))
 
 
 def _unit_not_stated(recording: Recording) -> Unit:
@@ -104,27 +104,27 @@ def _statements_beside(files: Sequence[Path]) -> Iterator[tuple[Path, dict[str, 
                 continue
 
 
-def _opened(paths: list[Path], asked: Asked) -> Recording:
+def _opened(paths: list[Path], given: Given) -> Recording:
     """Open a capture by the first format that its paths fit."""
     path, is_single = paths[0], len(paths) == 1
     suffix, *others = {each.suffix.lower() for each in paths}
-    opener: Callable[[Path, Asked], Recording] | None = FILES.get(suffix) if is_single else None
+    opener: Callable[[Path, Given], Recording] | None = FILES.get(suffix) if is_single else None
     if is_single and path.is_dir():
-        opener = open_bag if is_bag(path) and asked.raw is None else _open_folder
-    elif is_single and asked.raw is not None:
+        opener = open_bag if is_bag(path) and given.raw is None else _open_folder
+    elif is_single and given.raw is not None:
         opener = open_arrays
-    if asked.topic is not None and opener is not open_bag:
-        raise UserError(f"{path}: is not a ROS bag, so it has no topic {asked.topic}", fix="leave out --topic")
-    unused = next((name for name in ("array", "pitch", "raw") if getattr(asked, name) is not None), None)
+    if given.topic is not None and opener is not open_bag:
+        raise UserError(f"{path}: is not a ROS bag, so it has no topic {given.topic}", fix="leave out --topic")
+    unused = next((name for name in ("array", "pitch", "raw") if getattr(given, name) is not None), None)
     if unused and opener is not open_arrays:
         legal = f"{', '.join(LOADERS)}, or bare numbers with --raw"
         raise UserError(f"{path}: --{unused} is for files of arrays", legal=legal, fix=f"leave out --{unused}")
     if opener is not None:
-        return opener(path, asked)
+        return opener(path, given)
     if any(each.is_dir() for each in paths):
         raise UserError(f"{len(paths)} paths that include folders", legal=LEGAL_FORMATS, fix="name one folder alone")
     if suffix in LISTS and not others:
-        return LISTS[suffix](paths, asked, path.name if is_single else f"{path.name} .. {paths[-1].name}")
+        return LISTS[suffix](paths, given, path.name if is_single else f"{path.name} .. {paths[-1].name}")
     if not is_single:
         raise UserError(f"{len(paths)} files of the kinds {', '.join(sorted((suffix, *others)))}", legal=LEGAL_FORMATS)
     if suffix in (".bin", ".raw", ".dat"):
@@ -133,15 +133,15 @@ def _opened(paths: list[Path], asked: Asked) -> Recording:
     raise UserError(f"{path}: files of the type '{suffix}' are not read", legal=LEGAL_FORMATS, fix=fix)
 
 
-def _open_folder(folder: Path, asked: Asked) -> Recording:
+def _open_folder(folder: Path, given: Given) -> Recording:
     with damage_told(f"{folder}: cannot be read", LEGAL_FORMATS, "check its permissions"):
         inside = shown(folder)
     if is_stray(folder):
-        return open_stray(folder, asked)
+        return open_stray(folder, given)
     for suffix in (*CLOUDS, *POINT_LISTS[:3]):
         clouds = [path for path in inside if path.suffix.lower() == suffix]
         if clouds:
-            recording = open_clouds(clouds, asked, folder.name)
+            recording = open_clouds(clouds, given, folder.name)
             beside = sum(path.suffix.lower() in (".png", *LOADERS) for path in inside)
             note = f"{beside} pictures or arrays beside the {suffix} files are ignored" if beside else ""
             return replace(recording, notes=(*recording.notes, note))
@@ -150,12 +150,12 @@ def _open_folder(folder: Path, asked: Asked) -> Recording:
     is_depth = bool(pictures) and (not arrays or any(png_kind(path)[2:] == (16, 0) for path in pictures))
     inner = folder / "depth"
     if inner.is_dir() and not is_depth and not any(path.suffix.lower() == ".png" for path in inner.iterdir()):
-        return _open_folder(inner, asked)
+        return _open_folder(inner, given)
     if is_depth or inner.is_dir():
-        return open_depth_folder(folder, asked)
+        return open_depth_folder(folder, given)
     frames = depth_named(arrays, arrays)
     if len(frames) > 1 and len({path.suffix.lower() for path in frames}) == 1:
-        return open_array_list(frames, asked, folder.name)
+        return open_array_list(frames, given, folder.name)
     held = ", ".join(path.name for path in inside[:HELD]) + (", .." if len(inside) > HELD else "")
     known = (p.suffix.lower() in FILES if p.is_file() else is_bag(p) or (p / "depth").is_dir() for p in inside)
     captures = [path for path, is_known in zip(inside, known, strict=True) if is_known]

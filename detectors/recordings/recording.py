@@ -36,7 +36,7 @@ def damage_told(what: str, legal: str, fix: str = "copy or export it again") -> 
 
 
 @dataclass(frozen=True)
-class Asked:
+class Given:
     """The user's statements about a capture. ``scale_m``: metres in one stored unit, None for the format's usual one.
     ``intrinsics``: a file with the depth pixels' lens, which counts before one that comes with the frames; ``lens``:
     the same as a value. ``frames`` selects frames by number. ``topic`` of a ROS bag. ``array``: NAME or NAME:NUMBER in
@@ -59,8 +59,7 @@ class Recording:
     ``read`` yields the frames in order; each call starts again. ``shape``: (height, width). ``files``: all whose
     content can change a number. ``scale_m``: metres in one stored unit, and ``unit_from`` who says so: "" where the
     data shall decide. ``notes``: how the files were understood. ``warnings``: full sentences on what makes the
-    distances doubtful; every program shows them first. ``selection`` picks frames.
-    """
+    distances doubtful; every program shows them first. ``selection`` picks frames."""
 
     name: str
     read: Callable[[], Iterator[Frame]]

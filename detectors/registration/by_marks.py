@@ -12,8 +12,7 @@ mark c of each view that is one of the reference's, in the surface's frame. Nois
 one independent value in 25 pixels; Tukey's weights keep holes out. b_v is what all pixels of a view share smoothly
 (wiggling, multipath): a cubic, whose level and tilts cannot be told from the pose's; the scatter of the seven other
 terms between views gives their common deviation (by expectation maximisation), so that the covariance holds the three.
-Not modelled: errors of a view within the plane; a surface that no cubic follows; gross errors of marks.
-"""
+Not modelled: errors of a view within the plane; a surface that no cubic follows; gross errors of marks."""
 
 from __future__ import annotations
 

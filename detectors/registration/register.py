@@ -2,8 +2,7 @@
 
 Errors that a whole view shares (an offset, wiggling, the lens) show as a distance between registered views that noise
 does not explain. They widen the covariance and are noted; a view is refused only where they would blur the merged map
-by more than `BLUR_M`, or by more than a pixel where pixels are coarser.
-"""
+by more than `BLUR_M`, or by more than a pixel where pixels are coarser."""
 
 from __future__ import annotations
 
@@ -147,14 +146,14 @@ def _apart(agreement: Agreement) -> str:
     limit = blur * (1 + agreement.scatter)
     marks_limit = float(np.hypot(blur, agreement.grids_m)) * (1 + agreement.marks_scatter)
     if agreement.apart_m > limit:
-        said = f"the surfaces lie {agreement.apart_m / MM:.1f} mm apart where the views overlap"
+        text = f"the surfaces lie {agreement.apart_m / MM:.1f} mm apart where the views overlap"
     elif agreement.marks_m > marks_limit:
-        said = f"the marks of the views do not coincide: their points lie {agreement.marks_m / MM:.1f} mm apart"
+        text = f"the marks of the views do not coincide: their points lie {agreement.marks_m / MM:.1f} mm apart"
         limit = marks_limit
     else:
         return ""
     blurred = f"which would blur the map (up to {limit / MM:.1f} mm are merged)"
-    return f"{said}, {blurred}: a wrong registration, or different targets"
+    return f"{text}, {blurred}: a wrong registration, or different targets"
 
 
 def _widened(

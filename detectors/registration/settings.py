@@ -10,14 +10,14 @@ from harness.vocabulary.config import Config
 
 
 class IcpRegistration(Config):
-    """Iterative closest point, point to point, from the guess."""
+    """Iterative closest point, point to point, which starts from the nominal pose."""
 
     method: Literal["icp"] = "icp"
     points: Literal["marks", "target"] = "marks"
 
 
 class CpdRegistration(Config):
-    """Coherent point drift, rigid, without scale; the defaults are MATLAB's."""
+    """Coherent point drift, rigid and without scale. The defaults are MATLAB's."""
 
     method: Literal["cpd"] = "cpd"
     points: Literal["marks", "target"] = "marks"
@@ -27,9 +27,9 @@ class CpdRegistration(Config):
 
 
 class PlainRegistration(Config):
-    """Methods without settings. ``nominal``: the guesses as they are. ``marks``: centroids of marks, matched by their
-    mutual distances. ``joint``: marks and the common surface of all views together. ``odometry``: RGB-D odometry from
-    view to view (Open3D), no marks: a SLAM system without loop closure."""
+    """Methods without settings. ``nominal`` uses the nominal poses unchanged. ``marks`` matches centroids of marks by
+    their mutual distances. ``joint`` fits marks and the common surface of all views together. ``odometry`` is RGB-D
+    odometry from view to view (Open3D) without marks: a SLAM system without loop closure."""
 
     method: Literal["nominal", "marks", "joint", "odometry"]
 

@@ -1,7 +1,7 @@
-"""Boards of a data set: their plan, the files of each, and reading them again.
+"""Boards of a data set: plans them, writes the files of each, and reads the files.
 
-Every board is one average of frames of one unit of a camera. Splits have boards of their own, ``validation`` and
-``test`` those of a study of the same experiment. Not included: several views, real captures."""
+Every board is one average of frames of one unit of a camera. No two splits share boards; ``validation`` and ``test``
+have those of a study of the same experiment. Several views and real captures are not included."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from scenes.sensor.source import SimulatedUnit
 from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.truth import truth_of
 
-DATASET_VERSION = 1  # Stands in ``dataset.json``; raised when a file's meaning changes
+DATASET_VERSION = 1  # written into ``dataset.json``; increased when the meaning of a file changes
 INDEX, TRUTH, CLOUD = "dataset.json", "truth.json", "cloud.npz"
 SPLITS: tuple[tuple[str, Role, float], ...] = (
     ("train", "learning", 0.3),
@@ -41,16 +41,16 @@ SPLITS: tuple[tuple[str, Role, float], ...] = (
     ("test", "hole_free", 0.1),
     ("test", "damaged", 0.4),
 )
-"""Split, purpose of its boards, and share of all boards of a category."""
-FEWEST = 10  # Boards of a category, with which every split has one
-INSET_PX = 4  # Rim of the board that is not inspected: as far as the cameras' windows and edges reach, and a pixel more
-BRIGHTEST = 0.995  # Quantile of a picture's intensity that pictures show as white
+"""Split, purpose of its boards, and their share of all boards of a category."""
+FEWEST = 10  # fewest boards of a category, so that every split has one
+INSET_PX = 4  # rim of the board that is not inspected: the reach of the cameras' windows and edges, plus a pixel
+BRIGHTEST = 0.995  # quantile of a picture's intensity that is shown as white
 AGAIN = "run the command that wrote the data set again"
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One board: the render that it needs, and the trial whose average it is. ``label``: good, kind, combined."""
+    """One board: the render that it needs, and the trial whose average it is. ``label``: good, a kind, or combined."""
 
     category: str
     split: str
@@ -66,7 +66,7 @@ class Sample:
 
 
 def categories_of(experiment: Experiment) -> dict[str, Point]:
-    """Return the points whose clouds differ, by names that the axes of source and capture give."""
+    """Return the points whose clouds differ, by names formed from the axes of source and capture."""
     points: dict[str, Point] = {}
     for each in experiment.points:
         if not each.is_variation:
@@ -76,17 +76,17 @@ def categories_of(experiment: Experiment) -> dict[str, Point]:
     axes = [path for path in axes if any(value != values[path][0] for value in values[path])]
     names, found = names_of(axes), dict[str, Point]()
     for point in points.values():
-        said = []
+        words = []
         for path, own in ((path, point.values[path]) for path in axes):
             text = value_text(path, differing(own, (value for value in values[path] if value != own)))
-            said.append(f"{names[path]} {text}" if text[:1].isdigit() else text)
-        name = re.sub(r"[^A-Za-z0-9.]+", "_", " ".join(said)).strip("_.") or experiment.config.name
+            words.append(f"{names[path]} {text}" if text[:1].isdigit() else text)
+        name = re.sub(r"[^A-Za-z0-9.]+", "_", " ".join(words)).strip("_.") or experiment.config.name
         found[name if name not in found else f"{name}_{len(found)}"] = point
     return found
 
 
 def samples_of(experiment: Experiment, boards: int, cache: Path) -> list[Sample]:
-    """Plan the boards of every category. Raises UserError where the experiment has no random boards."""
+    """Plan the boards of every category. Raises UserError if the experiment has no random boards."""
     samples = []
     for category, point in categories_of(experiment).items():
         source, seed, study = point.config.simulated, point.config.seed, point.config.study
@@ -109,21 +109,21 @@ def samples_of(experiment: Experiment, boards: int, cache: Path) -> list[Sample]
 
 
 def seen_region(render: RenderJob) -> Region:
-    """Render a view unless the cache holds it; returns the region of the sensor that its frames cover."""
+    """Render a view unless it is cached; return the region of the sensor that its frames cover."""
     camera = camera_of(render.camera)
     view, _ = cached_view(render.target, camera.optics, render.config, render.folder)
     return SimulatedUnit(camera, render.camera, view).region
 
 
 def joined(regions: list[Region]) -> Region:
-    """Return the smallest region that holds all."""
+    """Return the smallest region that contains all regions."""
     sides = np.array([(each.row0, each.row1, each.col0, each.col1) for each in regions])
     (row0, _, col0, _), (_, row1, _, col1) = sides.min(axis=0).tolist(), sides.max(axis=0).tolist()
     return Region(row0, row1, col0, col1)
 
 
 def write_board(out: Path, sample: Sample, window: Region) -> None:
-    """Write all files of a board on the ``window`` that its category shares; the truth last, for resuming."""
+    """Write all files of a board on the ``window`` that its category shares; the truth last, to allow resuming."""
     set_up, (point,) = load_set_up(sample.task.set_ups[0]), sample.task.points
     known = known_view(set_up, cloud_of(sample.task, point), hole_free=sample.task.hole_free)
     cloud, truth = known.cloud, () if sample.task.hole_free else known.truth
@@ -174,7 +174,7 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
         box = [int(n) for n in (columns.min(), rows.min(), np.ptp(columns) + 1, np.ptp(rows) + 1)]
         facts = {"pixels": len(rows), "bbox": box, "run_lengths": run_lengths(own), "line_m": one.line_m.tolist()}
         damages.append({**one.to_row(), "seen_depth_mm": known.seen_depth_m[one.id] / MM, **facts})
-    told = {
+    facts_of_board = {
         "file_name": f"{sample.category}/{sample.split}/{sample.label}/rgb/{file}.png",
         "height": window.shape[0],
         "width": window.shape[1],
@@ -188,11 +188,11 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
         "intensity_at_65535": white,
         "damages": damages,
     }
-    write_text(place / file / TRUTH, json.dumps(told, allow_nan=False) + "\n", durable=False)
+    write_text(place / file / TRUTH, json.dumps(facts_of_board, allow_nan=False) + "\n", durable=False)
 
 
 def read_index(folder: Path) -> dict[str, Any]:
-    """Read a data set's ``dataset.json``; ``samples`` is None while it is not finished. Raises UserError."""
+    """Read a data set's ``dataset.json``; ``samples`` is None while the data set is unfinished. Raises UserError."""
     data = _read_json(folder / INDEX, RECORD_BYTES, "name a folder that harness.dataset wrote")
     check_version(data.get("dataset_version"), DATASET_VERSION, folder / INDEX, "a data set")
     return data

@@ -1,7 +1,7 @@
-"""Jobs on a cluster by dask.distributed: each dask worker is a node that runs the local engine inside.
+"""Runs jobs on a cluster with dask.distributed. Each dask worker is a node, which runs the local engine.
 
-The driver calls the nodes through the scheduler with bundles of jobs, two at a time for each; dask neither queues nor
-retries them. When a node dies, its jobs go to others; a job that ran on `TRIES` nodes as they died has crashed."""
+The driver sends each node bundles of jobs through the scheduler, two at a time; dask neither queues nor retries them.
+If a node dies, its jobs go to other nodes; a job that was running on `TRIES` nodes as they died has crashed."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import write_text
 from harness.vocabulary.provenance import source_digest
 
-BUNDLE_S = 0.25  # work in a bundle, for each process of a node; calling a node takes some 10 ms
-MOST_IN_BUNDLE = 32  # jobs in a bundle, for each process of a node
+BUNDLE_S = 0.25  # work in a bundle for each process of a node; a call of a node takes about 10 ms
+MOST_IN_BUNDLE = 32  # most jobs in a bundle for each process of a node
 WITH_NODE = 2  # bundles at a node: its processes work on one while the other waits
-LOOKS_S = 1.0  # interval at which the driver looks which nodes are there
-WAIT_FOR_NODES_S = 60.0  # wait for workers that are started by hand. A batch system's queue may take hours.
+LOOKS_S = 1.0  # interval at which the driver checks which nodes are connected
+WAIT_FOR_NODES_S = 60.0  # wait for workers that are started by hand; a batch system's queue may take hours
 TRIES = 5
-ANSWERS_S = 5  # a scheduler that is there answers a connection in milliseconds
-EXAMINED_S = 60.0  # time for a node to say what it is: it reads the sources, from a network's disk perhaps
+ANSWERS_S = 5  # time for a scheduler to answer a connection, which takes milliseconds
+EXAMINED_S = 60.0  # time for a node to describe itself: it reads the sources, possibly from a network's disk
 CLOSES_S = 1.0
 KINDS = {name.lower(): f"{name}Cluster" for name in ["SLURM", "PBS", "LSF", "SGE", "HTCondor", "OAR", "Moab", "Local"]}
-"""Classes of dask-jobqueue, each in a module of the kind's name; "local" starts its jobs on this machine."""
+"""Classes of dask-jobqueue, each in a module named after its kind; "local" starts jobs on this machine."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Bundle:
 
 @dataclass(frozen=True)
 class NodeFacts:
-    """A node's facts. ``digests``: of installed code by stage; ``sees``: content of the file it was asked for."""
+    """Facts about a node. ``digests``: of its installed code, by stage. ``sees``: content of the probe file there."""
 
     python: str
     digests: Mapping[Stage, str]
@@ -65,7 +65,7 @@ class NodeFacts:
 
 @dataclass
 class _Node:
-    """A node that takes jobs. ``bundles``: those under way, by number, ``renders`` of them renders."""
+    """A node that takes jobs. ``bundles``: those that it works on, by number; ``renders``: the number of renders."""
 
     address: str
     facts: NodeFacts
@@ -75,9 +75,9 @@ class _Node:
 
 
 class ClusterEngine:
-    """Jobs on the workers of ``scheduler``: tcp://host:8786, or jobqueue:slurm and the like, asked for
-    ``workers_wanted``. ``limits`` are a trial's; renders have its limit of time only. ``code``: as `LocalEngine`.
-    ``folder``: where jobs read and store renders; nodes that do not see it are left out."""
+    """Runs jobs on the workers of ``scheduler``: tcp://host:8786, or jobqueue:slurm and the like, which starts
+    ``workers_wanted``. ``limits``: of a trial; renders have its time limit only. ``code``: as in `LocalEngine`.
+    ``folder``: where jobs read and store renders; nodes that do not see it are not used."""
 
     def __init__(
         self, scheduler: str, limits: Limits, workers_wanted: int, code: Mapping[Stage, Code], folder: Path
@@ -87,20 +87,20 @@ class ClusterEngine:
         self._digests = {stage: source_digest(*which) for stage, which in self._code.items()}
         self._client: Any = None
         self._nodes: dict[str, _Node] = {}
-        self._refused: dict[str, UserError] = {}  # nodes of other numbers: left out while others are there
-        self._asked: set[str] = set()  # addresses of nodes that were asked what they are
+        self._refused: dict[str, UserError] = {}  # nodes with other code: not used while there are others
+        self._asked: set[str] = set()  # addresses of nodes that were asked to describe themselves
         self._waiting: dict[Stage, deque[Job]] = {"renders": deque(), "trials": deque()}
         self._done: list[tuple[Job, Ended]] = []
         self._out: Counter[Stage] = Counter()
         self._tries: Counter[str] = Counter()
-        # (address, number of the bundle, answer) of a node; without a number the answer is what the node is
+        # (node's address, bundle's number, answer); without a number, the answer describes the node
         self._events: queue.SimpleQueue[tuple[str, int | None, Any]] = queue.SimpleQueue()
         self._number = 0
-        self._mean_s = BUNDLE_S  # mean duration of a trial; at first as if each were worth a bundle of its own
+        self._mean_s = BUNDLE_S  # mean duration of a trial; at first, each trial counts as a whole bundle
         self._looked = float("-inf")
-        self._lacking, self._lacking_since = "", time.monotonic()  # nodes that could do what waits, lacking since then
-        self._nonce = secrets.token_hex(16)  # names this driver to the nodes
-        # a file that tells whether a node sees the folder; to the cache of renders it is a leftover
+        self._lacking, self._lacking_since = "", time.monotonic()  # lacking for the waiting jobs, and since when
+        self._nonce = secrets.token_hex(16)  # identifies this driver to the nodes
+        # a file that shows whether a node sees the folder; the cache of renders treats it as a leftover
         self._probe = folder.absolute() / f".{self._nonce[:16]}.seen.part.npz"
         self._told: set[str] = set()
         self._stack = contextlib.ExitStack()
@@ -122,12 +122,12 @@ class ClusterEngine:
             async def dropped() -> None:
                 await self._client.run(drop, self._nonce, workers=busy, on_error="ignore", asynchronous=True)
 
-            with contextlib.suppress(Exception):  # a node that cannot be told ends its bundles at its own time
+            with contextlib.suppress(Exception):  # a node that cannot be reached finishes its bundles in its own time
                 asyncio.run_coroutine_threadsafe(dropped(), self._client.loop.asyncio_loop).result(CLOSES_S)
         self._stack.close()
 
     def room(self, stage: Stage) -> int:
-        """Room for as much as keeps all nodes busy, and the next bundles ready."""
+        """Return the room for enough jobs to keep all nodes busy, with the next bundles ready."""
         each = 1 if stage == "renders" else WITH_NODE * self._bundle_size() + 1
         return max(1, each * sum(one.facts.processes for one in self._nodes.values())) + 1 - self._out[stage]
 
@@ -137,7 +137,7 @@ class ClusterEngine:
         self._waiting[job.stage].append(job)
 
     def ended(self) -> list[tuple[Job, Ended]]:
-        """Wait for jobs to end. Raises UserError where the scheduler, or every node that could do them, is gone."""
+        """Wait for jobs to end. Raises UserError if the scheduler, or every node that could run them, is gone."""
         while not self._done:
             self._hand_out()
             if not self._done:
@@ -150,13 +150,13 @@ class ClusterEngine:
         return max(1, min(MOST_IN_BUNDLE, round(BUNDLE_S / max(self._mean_s, 1e-4))))
 
     def _hand_out(self) -> None:
-        """Send every node a bundle of trials, then a second one, and renders where it may render."""
+        """Send each node a bundle of trials, then a second one, and renders where it may render."""
         renders, trials = self._waiting["renders"], self._waiting["trials"]
         some_offer = any(one.facts.offers_render and one.can_render for one in self._nodes.values())
         for most, to in product(range(WITH_NODE), list(self._nodes.values())):
             processes, offers = to.facts.processes, to.facts.offers_render
-            # a node of one process does one thing at a time: trials first, as renders make more of them, but where
-            # nodes are set aside for renders, these first there
+            # A node with one process does one thing at a time: trials first, because renders only make more of them;
+            # but nodes that are set aside for renders do these first.
             may_render = to.can_render and (offers or not some_offer)
             may_render &= processes > 1 or not (to.bundles or (trials and not offers))
             if renders and may_render and to.renders < min(MOST_RENDERERS, processes):
@@ -173,28 +173,28 @@ class ClusterEngine:
         self._call(to.address, self._number, carry_out, bundle, self._code, self._nonce)
 
     def _call(self, address: str, number: int | None, function: Any, *arguments: Any) -> None:
-        """Have a node run a function; what it returns or raises becomes an event."""
+        """Call a function on a node; what it returns or raises becomes an event."""
 
         async def call() -> None:
-            said: Any = None
-            # the scheduler tells of a worker shortly before it knows the way to it
+            answer: Any = None
+            # the scheduler reports a worker shortly before it can reach it
             for pause_s in (0.0,) if number is not None else (0.0, 0.2, 1.0, 3.0):
                 await asyncio.sleep(pause_s)
                 try:
                     given = {"workers": [address], "on_error": "return", "asynchronous": True}
                     calling = self._client.run(function, *arguments, **given)
                     answers = await (calling if number is not None else asyncio.wait_for(calling, EXAMINED_S))
-                    said = answers.get(address, OSError("no answer"))
+                    answer = answers.get(address, OSError("no answer"))
                 except Exception as error:
-                    said = error
-                if not isinstance(said, OSError | KeyError):
+                    answer = error
+                if not isinstance(answer, OSError | KeyError):
                     break
-            self._events.put((address, number, said))
+            self._events.put((address, number, answer))
 
         asyncio.run_coroutine_threadsafe(call(), self._client.loop.asyncio_loop)
 
     def _step(self, waits_s: float = LOOKS_S) -> None:
-        """Take what has happened, waiting for it at most so long."""
+        """Process the events that have happened; wait for the first of them at most so long."""
         if time.monotonic() - self._looked >= LOOKS_S:
             self._look_for_nodes()
             self._looked = time.monotonic()
@@ -204,7 +204,8 @@ class ClusterEngine:
                 self._heed(*self._events.get_nowait())
 
     def _look_for_nodes(self) -> None:
-        """Ask new nodes what they are, and give up those that are gone. Raises UserError without a scheduler."""
+        """Ask new nodes to describe themselves, and give up those that are gone. Raises UserError without a
+        scheduler."""
         there = None
         if self._client.status == "running":
             with contextlib.suppress(OSError):
@@ -221,65 +222,65 @@ class ClusterEngine:
             self._gone(address)
         self._look_for_lack()
 
-    def _heed(self, address: str, number: int | None, said: Any) -> None:
+    def _heed(self, address: str, number: int | None, answer: Any) -> None:
         if number is None:
-            self._examined(address, said)
+            self._examined(address, answer)
             return
         one = self._nodes.get(address)
         bundle = None if one is None else one.bundles.pop(number, None)
         if one is None or bundle is None:
-            return  # the node was given up meanwhile
+            return  # the node was given up in the meantime
         one.renders -= bundle.jobs[0].stage == "renders"
-        if isinstance(said, tuple):
-            for job, ended in zip(bundle.jobs, said, strict=True):
+        if isinstance(answer, tuple):
+            for job, ended in zip(bundle.jobs, answer, strict=True):
                 if job.stage == "trials":
                     self._mean_s += 0.1 * (ended.seconds - self._mean_s)
                 self._over(job, ended)
-        elif isinstance(said, UserError):  # its processes run other code, or cannot start
-            self._refuse(address, UserError(f"the worker at {_bare(address)}: {said.message}", fix=said.fix))
+        elif isinstance(answer, UserError):  # its processes run other code, or cannot start
+            self._refuse(address, UserError(f"the worker at {_bare(address)}: {answer.message}", fix=answer.fix))
             self._waiting[bundle.jobs[0].stage].extendleft(reversed(bundle.jobs))
             self._gone(address)
         else:
             self._look_for_nodes()
-            self._lost(bundle.jobs, f"its worker did not answer ({type(said).__name__}: {said})", address)
+            self._lost(bundle.jobs, f"its worker did not answer ({type(answer).__name__}: {answer})", address)
 
-    def _examined(self, address: str, said: NodeFacts | BaseException) -> None:
-        """Use a node, or leave it out with a line that says why."""
+    def _examined(self, address: str, answer: NodeFacts | BaseException) -> None:
+        """Use a node, or print why it is not used."""
         if address not in self._asked:
             return
         where = f"the worker at {_bare(address)}"
-        if isinstance(said, ImportError | AttributeError):
+        if isinstance(answer, ImportError | AttributeError):
             fix = "install the same version of tofpod there and start its workers again"
-            self._refuse(address, UserError(f"{where} cannot run tofpod: {type(said).__name__}: {said}", fix=fix))
-        elif isinstance(said, BaseException):
-            # it died meanwhile, or the network failed: no sign of another installation
-            self._tell_once(f"{where} did not state its version ({type(said).__name__}: {said}); it is not used")
-        elif said.python.split(".")[:2] != list(platform.python_version_tuple()[:2]):
-            message = f"{where} runs Python {said.python}, this machine {platform.python_version()}"
+            self._refuse(address, UserError(f"{where} cannot run tofpod: {type(answer).__name__}: {answer}", fix=fix))
+        elif isinstance(answer, BaseException):
+            # it died in the meantime, or the network failed; this says nothing about its installation
+            self._tell_once(f"{where} did not state its version ({type(answer).__name__}: {answer}); it is not used")
+        elif answer.python.split(".")[:2] != list(platform.python_version_tuple()[:2]):
+            message = f"{where} runs Python {answer.python}, this machine {platform.python_version()}"
             self._refuse(address, UserError(message, fix="use the same Python on all"))
-        elif said.digests.get("trials") != self._digests.get("trials"):
+        elif answer.digests.get("trials") != self._digests.get("trials"):
             message = f"{where} runs another version of tofpod, of a plug-in, or of numpy, scipy, numba or OpenCV"
             fix = "install the same there, and start its workers again: they keep the code that they loaded"
             self._refuse(address, UserError(f"{message} than this machine", fix=fix))
-        elif said.sees != self._nonce:
+        elif answer.sees != self._nonce:
             message = f"{where} does not see {self._probe.parent}, where this machine keeps renders"
             self._refuse(address, UserError(message, fix="name a folder with --out that all machines share"))
         else:
-            self._nodes[address] = _Node(address, said, said.digests.get("renders") == self._digests.get("renders"))
+            self._nodes[address] = _Node(address, answer, answer.digests.get("renders") == self._digests.get("renders"))
 
     def _refuse(self, address: str, why: UserError) -> None:
         self._refused[address] = why
         self._tell_once(f"{why.message}; it is not used")
 
     def _gone(self, address: str) -> None:
-        """Give a node up; what it had goes to others."""
+        """Give up a node and pass its jobs to others."""
         one = self._nodes.pop(address, None)
         for bundle in one.bundles.values() if one is not None else ():
             why = "its worker died: by hand, by the batch system, or by the system as memory ran out"
             self._lost(bundle.jobs, why, address)
 
     def _lost(self, jobs: tuple[Job, ...], why: str, address: str) -> None:
-        """Jobs that were at a node as it died run again; after `TRIES` such deaths they are taken for the cause."""
+        """Queue the jobs of a node that died again; a job that was at `TRIES` such nodes counts as the cause."""
         self._tries.update(job.name for job in jobs)
         hopeless = [job for job in jobs if self._tries[job.name] >= TRIES]
         self._waiting[jobs[0].stage].extendleft(job for job in reversed(jobs) if job not in hopeless)
@@ -292,7 +293,7 @@ class ClusterEngine:
         self._done.append((job, ended))
 
     def _look_for_lack(self) -> None:
-        """Raise UserError where for long no node could do what waits; a batch system's queue may take any time."""
+        """Raise UserError if no node can run the waiting jobs for long; a batch system's queue may take any time."""
         lacking, fix = "", ""
         if not self._nodes and self._refused and self._asked <= self._refused.keys():
             raise next(iter(self._refused.values()))
@@ -331,14 +332,14 @@ def _connected(scheduler: str, workers_wanted: int) -> Iterator[Any]:
         raise UserError("--scheduler needs dask.distributed", fix='pip install "tofpod[cluster]"') from error
     with contextlib.ExitStack() as stack:
         stack.enter_context(dask.config.set({"distributed.comm.timeouts.connect": f"{ANSWERS_S}s"}))
-        # how jobs end tells of workers that come and go, and versions are checked here
+        # the ends of jobs show which workers come and go, and this module checks versions
         stack.enter_context(warnings.catch_warnings())
         warnings.simplefilter("ignore")
         for name in list(logging.root.manager.loggerDict):
             if name.split(".")[0] in ("distributed", "tornado"):
                 logging.getLogger(name).setLevel(logging.CRITICAL + 1)
         cluster = None
-        if not is_address:  # as the user's own configuration of dask says
+        if not is_address:  # according to the user's own dask configuration
             try:
                 cluster = getattr(importlib.import_module(f"dask_jobqueue.{kind}"), KINDS[kind])()
                 stack.callback(_close, cluster)
@@ -370,12 +371,12 @@ def _bare(address: str) -> str:
 
 # ---------------------------------------------------------------- in a dask worker, which never computes itself
 
-_engines: dict[str, LocalEngine] = {}  # engines by the code that they run: one, but for drivers of unlike experiments
-_awaited: dict[str, set[Answers]] = {}  # answers that each driver waits for
+_engines: dict[str, LocalEngine] = {}  # by the code that they run: normally one
+_awaited: dict[str, set[Answers]] = {}  # the queues that each driver waits for
 
 
 def examine(code: Mapping[Stage, Code], probe: str, dask_worker: Any) -> NodeFacts:
-    """Describe this node. Digests are taken once a process: files that change later are not what it runs."""
+    """Describe this node. Each process computes digests once: files that change later are not what it runs."""
     digests: dict[Stage, str] = {}
     for stage, which in code.items():
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
@@ -396,7 +397,7 @@ def drop(driver: str) -> None:
 
 
 async def carry_out(bundle: Bundle, code: Mapping[Stage, Code], driver: str, dask_worker: Any) -> tuple[Ended, ...]:
-    """Do the jobs of a bundle; returns their ends. Raises UserError for other code or processes that cannot start."""
+    """Run the jobs of a bundle; return their ends. Raises UserError for other code, or if processes cannot start."""
     key = repr(sorted(code.items()))
     if key not in _engines:
         _engines[key] = LocalEngine(dask_worker.state.nthreads, Limits(), code)
@@ -415,9 +416,9 @@ def _ends_of(bundle: Bundle, engine: LocalEngine, answers: Answers, worker: str)
         engine.put(job, bundle.limits, answers)
     ended: dict[str, Ended] = {}
     while len(ended) < len(bundle.jobs) and not answers.is_dropped:
-        said = answers.ended.get()
-        if isinstance(said, UserError):
+        answer = answers.ended.get()
+        if isinstance(answer, UserError):
             engine.drop(answers)
-            raise said
-        ended[said[0].name] = replace(said[1], worker=worker)
+            raise answer
+        ended[answer[0].name] = replace(answer[1], worker=worker)
     return tuple(ended[job.name] for job in bundle.jobs if job.name in ended)

@@ -1,4 +1,4 @@
-"""The progress of a sweep, and its amount of work before it runs."""
+"""Shows the progress of a sweep, and its amount of work in advance."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from harness.engine.work import EngineOptions, Outcome
 from harness.experiment.schema import CaptureSource, Experiment
 from harness.tables.text import many
 
-PLAIN_EVERY_S = 10.0  # seconds between lines where there is no terminal: some life in a log, and not too much
-WINDOW_S = 60.0  # rates are those of the last minute: work of unlike set-ups goes at unlike rates
+PLAIN_EVERY_S = 10.0  # seconds between lines if there is no terminal: a sign of life in a log
+WINDOW_S = 60.0  # rates are those of the last minute, because set-ups differ in speed
 
 
 @contextmanager
 def progress_display(
     stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic
 ) -> Iterator[Callable[[Outcome], None]]:
-    """Yield a function that shows on ``stream`` (None: stderr) how far a run is; work found done is not in the rate."""
+    """Yield a function that shows the progress of a run on ``stream`` (None: stderr). Rates exclude work found done."""
     stream = sys.stderr if stream is None else stream
     names = ("counts", "rate", "failed", "left")
     columns = [TextColumn(f"{'[bold red]' * (name == 'failed')}{{task.fields[{name}]}}") for name in names]
@@ -43,10 +43,10 @@ def progress_display(
         disable=not stream.isatty(),
     )
     stages = {name: bars.add_task(name, counts="", rate="", failed="", left="") for name in ("renders", "trials")}
-    said, said_at = "", float("-inf")
+    last, said_at = "", float("-inf")
 
     def show(outcome: Outcome | None) -> None:
-        nonlocal said, said_at
+        nonlocal last, said_at
         if outcome is not None:
             for name, task in stages.items():
                 counts, state = getattr(outcome, name), bars.tasks[task]
@@ -64,8 +64,8 @@ def progress_display(
         if bars.disable and bars.tasks[0].fields["counts"] and (outcome is None or clock() >= said_at + PLAIN_EVERY_S):
             lines = (" ".join(filter(None, [task.description, *map(task.fields.get, names)])) for task in bars.tasks)
             text = ", ".join(lines)
-            if text != said:
-                said, said_at = text, clock()
+            if text != last:
+                last, said_at = text, clock()
                 print(text, file=stream, flush=True)
 
     with bars:
@@ -76,7 +76,7 @@ def progress_display(
 
 
 def dry_run(experiment: Experiment, out: Path, options: EngineOptions) -> int:
-    """Print the work of a sweep, or of a shard of it; nothing is written."""
+    """Print the amount of work of a sweep or of one shard, without writing anything."""
     name, folder, points = experiment.config.name, experiment.folder(out), many(len(experiment.points), "point")
     if isinstance(experiment.config.source, CaptureSource):
         print(f"{name}: valid; {points} of a real capture; results: {folder}")

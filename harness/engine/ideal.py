@@ -1,7 +1,7 @@
-"""Noise of random units, and each damage's signature: the input of the ideal observer on a study's set-ups.
+"""Noise of random units and the signature of each damage: the input of the ideal observer for a study's set-ups.
 
-Noise is what a unit's average shows, away from damage and rim, beyond what a camera without noise, unit errors and
-rounding shows, less a cubic; the signature, what that camera shows near damage beyond a cubic through the rest."""
+Noise is the difference between a unit's average and a camera without noise, unit errors and rounding, away from damage
+and rim, minus a cubic. The signature is what that camera shows near damage, minus a cubic through the rest."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from harness.vocabulary.seeds import random_stream
 from scenes.sensor.camera import CameraConfig, EffectsConfig, camera_of
 from scenes.sensor.source import SimulatedUnit
 
-UNITS_A_BOARD = 10  # Units, drawn anew for every board, whose noise is taken there
-SMOOTHED_PX = 61  # Side of the square over which a pixel's variance is averaged
-DEGREE = 3  # Degree of the undamaged surface, as the thesis fits it
-FEWEST_PIXELS = 1000  # Undamaged pixels without which a board tells too little of the noise
-FINE_MM = 1e-4  # Rounding step of the noise-free camera
-REACH_PX = 8  # Pixels beyond a damage's outline to which camera window and rims smear its signature
+UNITS_A_BOARD = 10  # units, drawn anew for every board, whose noise is measured there
+SMOOTHED_PX = 61  # side of the square over which a pixel's variance is averaged
+DEGREE = 3  # degree of the undamaged surface, as in the thesis
+FEWEST_PIXELS = 1000  # fewest undamaged pixels of a board to estimate its noise
+FINE_MM = 1e-4  # rounding step of the noise-free camera
+REACH_PX = 8  # distance beyond a damage's outline to which the camera's window and rims spread its signature
 
 
 def ideal_of_set_ups(plan: SweepPlan, engine: JobEngine, calls_per_m2: float) -> dict[tuple[str, int], IdealDamages]:
-    """Return the ideal observer on every set-up of a study, by its variant and frames, at a rate of false calls. Views
-    that are not in the store are rendered. Raises UserError where a view or a board's noise cannot be had."""
+    """Return the ideal observer for every set-up of a study, by variant and frames, at a rate of false calls. Views
+    that are not stored are rendered. Raises UserError if a view or a board's noise is not available."""
     found = {}
     for group in plan.groups:
         batches = [batch for batch in group.then if batch.role == "damaged"]
@@ -53,7 +53,7 @@ def ideal_of_set_ups(plan: SweepPlan, engine: JobEngine, calls_per_m2: float) ->
 
 
 def board_views(batch: Batch, points: tuple[Point, ...]) -> dict[int, BoardView]:
-    """Return a damaged board as the ideal observer sees it, by the numbers of frames that the points ask for."""
+    """Return a damaged board as the ideal observer sees it, by the numbers of frames of the points."""
     set_up = load_set_up(batch.set_ups[0])
     clear_z_m = noise_free_z_m(set_up)
     intact = set_up.intact & np.isfinite(clear_z_m)
@@ -81,7 +81,7 @@ def board_views(batch: Batch, points: tuple[Point, ...]) -> dict[int, BoardView]
 
 
 def noise_free_z_m(set_up: SetUp) -> np.ndarray:
-    """Return (h, w) what the camera shows without noise, unit errors and rounding; NaN where it shows nothing."""
+    """Return z (h, w) of the camera without noise, unit errors and rounding; NaN where it shows nothing."""
     config = set_up.unit.config
     kept = {name: getattr(config.effects, name) for name in ("multipath", "wiggling", "ambient", "saturation")}
     clear = dict.fromkeys(EffectsConfig.model_fields, False) | kept
@@ -91,7 +91,7 @@ def noise_free_z_m(set_up: SetUp) -> np.ndarray:
 
 
 def _unit(set_up: SetUp, **changes: object) -> SimulatedUnit:
-    """The unit of a set-up with another declaration, before the same view."""
+    """Return the unit of a set-up with a changed declaration, in front of the same view."""
     config = CameraConfig.model_validate(set_up.unit.config.model_dump() | changes)
     return SimulatedUnit(camera_of(config), config, set_up.unit.view)
 
@@ -99,7 +99,7 @@ def _unit(set_up: SetUp, **changes: object) -> SimulatedUnit:
 def _noise_m(
     set_up: SetUp, clear_z_m: np.ndarray, board: int, point: Point, surface: np.ndarray, intact: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Noise fields (k, h, w) of `UNITS_A_BOARD` units, and where they are known; a cubic of each is taken out."""
+    """Return the noise (k, h, w) of `UNITS_A_BOARD` units, each minus its cubic fit, and where it is known."""
     capture, fields = point.config.capture, []
     for number in range(UNITS_A_BOARD):
         labels = ("units of the ideal observer", board, number)
@@ -116,7 +116,7 @@ def _noise_m(
 
 
 def _deviation_m(noise_m: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """(h, w): root mean square of the noise over units and a square about each pixel, else the nearest one's."""
+    """Return the root mean square (h, w) of the noise over units and a square around each pixel, or the nearest one."""
     square, count = (ndimage.uniform_filter(image.sum(axis=0), SMOOTHED_PX) for image in (noise_m**2, known * 1.0))
     there = count > 0.5 * len(noise_m) / SMOOTHED_PX
     nearest = ndimage.distance_transform_edt(~there, return_distances=False, return_indices=True)
@@ -124,7 +124,7 @@ def _deviation_m(noise_m: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def _signatures_m(set_up: SetUp, clear_z_m: np.ndarray, surface: np.ndarray, intact: np.ndarray) -> np.ndarray:
-    """(n, h, w): each damage's residual to the surface, 0 away from it."""
+    """Return the residual (n, h, w) of each damage from the surface, 0 away from it."""
     fitted = np.tensordot(np.linalg.lstsq(surface[:, intact].T, clear_z_m[intact], rcond=None)[0], surface, 1)
     residual_m, pitch_m = clear_z_m - fitted, max(set_up.pitch_mm) * MM
     signals = []

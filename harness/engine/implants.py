@@ -1,7 +1,7 @@
-"""A study on recorded frames: virtual damage at random places of scans of an undamaged part, judged as boards are.
+"""A study on recorded frames: virtual damage at random places of scans of an undamaged part, judged like boards.
 
-A placement takes the part of a simulated board: some damages at once, in one group of recorded frames. Placements
-of one recording share its surface and fixed pattern, and where there are few frames its noise."""
+A placement corresponds to a simulated board: some damages at once, in one group of recorded frames. The placements in
+one recording share its surface and fixed pattern and, if it has few frames, its noise."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig, Purpose
 from scenes.target.truth import truth_of
 
-MOST_HOLE_FREE, MOST_SETTING = 20, 5  # Undamaged averages, at most, that count false calls; that set a threshold
-MOST_EMPTY = 200  # Placements in a row without a place for any damage, after which there is none
-NORMAL_PX = 4  # Half the side of the square of the surface whose plane is taken as the tangent plane
-TELLING_DEG = 5.0  # Steeper by so much than where damage is placed, the rim of what is judged has a limit of its own
+MOST_HOLE_FREE, MOST_SETTING = 20, 5  # most undamaged averages that count false calls, and that set a threshold
+MOST_EMPTY = 200  # give up after so many placements in a row without a place for any damage
+NORMAL_PX = 4  # half the side of the square of surface that determines the tangent plane
+TELLING_DEG = 5.0  # a warning follows if the judged rim is so much steeper than the places of damage
 VARIANT = "main"
 
 
 @dataclass(frozen=True)
 class Judging:
-    """The judgement of clouds. ``threshold`` None: ``threshold_of`` an undamaged cloud returns it, with warnings."""
+    """The rule by which clouds are judged. ``threshold`` None: ``threshold_of`` returns it, with warnings."""
 
     detector: str
     settings_json: str
@@ -54,7 +54,7 @@ class Judging:
 
 
 class Scan:
-    """A recording of an undamaged part, its surface and judged area. Raises UserError where either is missing."""
+    """A recording of an undamaged part, with its surface and judged area. Raises UserError if either is missing."""
 
     def __init__(self, recording: Recording, judging: Judging) -> None:
         if recording.lens is None or recording.slopes is None or recording.projection != "central":
@@ -68,7 +68,7 @@ class Scan:
         self.judged = np.isfinite(evidence.score) & np.isfinite(evidence.surface_z_m)
         self.surface_z_m = np.where(self.judged, evidence.surface_z_m, np.nan)
         points_m = self.rays[self.judged] * self.surface_z_m[self.judged][:, None]
-        # the board's frame: the plane through the surface, its z to the camera, its x along the picture's rows
+        # the board's frame: the plane through the surface, z towards the camera, x along the picture's rows
         centre = points_m.mean(axis=0)
         _, axes = np.linalg.eigh(np.cov((points_m - centre).T))
         normal = axes[:, 0] * -np.sign(axes[2, 0])
@@ -80,7 +80,7 @@ class Scan:
         middle = places.min(axis=0) / 2 + places.max(axis=0) / 2
         self.T_camera_board[:3, 3] = transform_points(self.T_camera_board, np.array([*middle, 0.0]))
         self.size_m: np.ndarray = np.ptp(places, axis=0)
-        # what is found in the undamaged recording is no place for damage, which it would pass for
+        # no damage is placed where the undamaged recording has findings, which would count as hits
         detector, threshold = detector_of(judging.detector, judging.settings_json), judging.threshold
         found = detector.find(self.whole, evidence, threshold or judging.threshold_of(self.whole)[0])
         rays = np.array([each.centre_m for each in found]).reshape(-1, 3)
@@ -90,19 +90,19 @@ class Scan:
 
     @cached_property
     def rays(self) -> np.ndarray:
-        """(h, w, 3) rays with z = 1."""
+        """Rays (h, w, 3) with z = 1."""
         return np.concatenate([self.slopes, np.ones((*self.slopes.shape[:2], 1))], axis=-1)
 
     @cached_property
     def places_m(self) -> np.ndarray:
-        """(h, w, 2) where each pixel's ray meets the plane, NaN where nothing is judged."""
+        """Points (h, w, 2) where each pixel's ray meets the plane; NaN where nothing is judged."""
         normal, centre = self.T_camera_board[:3, 2], self.T_camera_board[:3, 3]
         met = self.rays * ((centre @ normal) / (self.rays @ normal))[..., None]
         return np.where(self.judged[..., None], transform_points(invert(self.T_camera_board), met)[..., :2], np.nan)
 
     @cached_property
     def depth_px(self) -> np.ndarray:
-        """(h, w) distance of each pixel to the nearest that is not judged or not in the picture."""
+        """Distance (h, w) of each pixel to the nearest one that is not judged or is outside the picture."""
         return np.asarray(ndimage.distance_transform_edt(np.pad(self.judged, 1))[1:-1, 1:-1])
 
     @cached_property
@@ -112,23 +112,23 @@ class Scan:
 
     @property
     def pitch_m(self) -> float:
-        """Side in plan of a square as large as what a judged pixel sees."""
+        """Side of a square in plan with the mean area of a judged pixel."""
         return math.sqrt(self.area_m2 / max(self.judged.sum(), 1))
 
     @cached_property
     def angle_deg(self) -> np.ndarray:
-        """(h, w) angle between each judged pixel's ray and the fitted surface's normal, NaN elsewhere."""
+        """Angle (h, w) between each judged pixel's ray and the fitted surface's normal; NaN elsewhere."""
         down, across = np.gradient(self.rays * self.surface_z_m[..., None], axis=(0, 1))
         normal = np.cross(down, across)
         along = (normal * self.rays).sum(-1) / (np.linalg.norm(normal, axis=-1) * np.linalg.norm(self.rays, axis=-1))
         return np.asarray(np.degrees(np.arccos(np.clip(np.abs(along), 0, 1))))
 
     def rim_px(self, family: DrawnTargetConfig) -> float:
-        """Return how far inside the judged area a damage's centre lies at least, whatever the damage's size."""
+        """Return the least distance of a damage's centre from the edge of the judged area, for any size of damage."""
         return family.damage.widest_mm * MM / 2 / self.pitch_m + BEYOND_PX + self.reach_px
 
     def left_out(self, family: DrawnTargetConfig) -> str:
-        """Return a sentence on the rim that no damage is placed on; empty where it is as steep as the rest."""
+        """Return a sentence on the rim where no damage is placed; empty if it is not steeper than the rest."""
         inner, known = self.depth_px >= self.rim_px(family), np.isfinite(self.angle_deg)
         if not (inner & known).any():
             return ""
@@ -140,13 +140,13 @@ class Scan:
         return f"{self.recording.name}: damage is placed on {inside}, seen at up to {steep[0]:.0f} degrees; {rim}"
 
     def averaged(self, frames: Sequence[Frame]) -> Cloud:
-        """Return the average of some frames, as `harness.detect` takes it."""
+        """Return the average of some frames, computed as in `harness.detect`."""
         cloud = average(replace(self.recording, read=lambda: iter(frames), selection=None), RECORDED)
         return replace(cloud, projection="central", noise_reach_px=getattr(self, "reach_px", 0.0))
 
     def place(self, x_m: float, y_m: float, rim_px: float) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the point (3,) of the surface above a place of the plane, and the normal (3,) to the camera, in its
-        frame; None with less than ``rim_px`` of judged surface around it, or a finding within the hit radius."""
+        """Return the surface's point (3,) above a place of the plane and the normal (3,) towards the camera, in its
+        frame; None with less than ``rim_px`` of judged surface around it, or with a finding within the hit radius."""
         if (np.linalg.norm(self.taken_m - [x_m, y_m], axis=1) < self.free_m).any():
             return None
         point = transform_points(self.T_camera_board, np.array([x_m, y_m, 0.0]))
@@ -166,7 +166,7 @@ class Scan:
         return ray * (middle @ normal) / (ray @ normal), normal
 
     def known(self, cloud: Cloud, target: TargetConfig) -> KnownCloud:
-        """Return a cloud of this scan with the truth of the damages that were put into it."""
+        """Return a cloud of this scan with the truth of the damages put into it."""
         truth = truth_of(target, self.T_camera_board)
         intact = self.judged & far_from(truth, self.places_m, INTACT_MARGIN_PX * self.pitch_m)
         of_truth = (target, truth, outlined(truth, self.places_m), self.places_m)
@@ -176,7 +176,7 @@ class Scan:
 
 @dataclass(frozen=True, eq=False)
 class Implanted:
-    """Damages of ``target`` in one scan, at places where they fit, with what each changes."""
+    """Damages of ``target`` at suitable places in one scan, with the change that each makes."""
 
     number: int
     scan: Scan
@@ -184,7 +184,7 @@ class Implanted:
     implants: tuple[Implant, ...]
 
     def cloud(self, group: slice) -> Cloud:
-        """Return the average of a group of the scan's frames with the damage in them."""
+        """Return the average of a group of the scan's frames after the damage is put into them."""
         changed = []
         for number, frame in list(enumerate(self.scan.frames))[group]:
             z_m, reason = frame.z_m.copy(), frame.reason.copy()
@@ -197,7 +197,7 @@ class Implanted:
 def placements(
     scans: Sequence[Scan], family: DrawnTargetConfig, camera: str, targets: int, seed: int, cache: Path
 ) -> Iterator[Implanted]:
-    """Yield placements with ``targets`` damages or a few more, scan by scan. Raises UserError where none fits."""
+    """Yield placements with ``targets`` damages or a few more, scan by scan. Raises UserError if none fits."""
     units = [unit_config(camera, scan.lens) for scan in scans]
     found = number = empty = 0
     while found < targets:
@@ -210,7 +210,7 @@ def placements(
         implants = []
         for damage in placed.damages:
             spot = scan.place(*damage.centre_m, 0.0)
-            assert spot is not None  # `damages_placed` has looked
+            assert spot is not None  # `damages_placed` has checked it
             board = local_board(placed, damage, *spot, side_mm(damage, float(spot[0][2]), config))
             draw = int(random_stream(seed, "implant", number, damage.id).integers(2**31))
             implants.append(implant_of(config, same, scan.lens, board, len(scan.frames), draw, cache))
@@ -221,7 +221,7 @@ def placements(
 
 
 def damages_placed(scan: Scan, family: DrawnTargetConfig, camera: str, purpose: Purpose, number: int) -> TargetConfig:
-    """Return a board of the family with those of its damages that have enough judged surface around them."""
+    """Return a board of the family with only those damages that have enough judged surface around them."""
     drawn, rim_px = family.drawn(purpose, number), scan.rim_px(family)
     kept = {each.id for each in drawn.damages if scan.place(*each.centre_m, rim_px) is not None}
     left = {name: tuple(each for each in getattr(drawn, name) if each.id in kept) for name in KINDS}
@@ -232,11 +232,11 @@ def judge_scans(
     scans: Sequence[Scan], made: Sequence[Implanted], family: DrawnTargetConfig, camera: str, judging: Judging,
     frames: Sequence[int],
 ) -> tuple[ResultTables, tuple[SetUpRecord, ...], tuple[str, ...]]:  # fmt: skip
-    """Set a threshold for each number of frames, count false calls on the undamaged frames, and judge all placements;
-    return tables, a set-up for each number of frames, and warnings. Where a recording has two groups of so many frames
-    or more, every second sets the threshold; else the same frames do both, and a warning says so."""
+    """Set a threshold for each number of frames, count false calls on undamaged frames, and judge all placements.
+    Return tables, a set-up for each number of frames, and warnings. If a recording has two groups of that many frames
+    or more, every second group sets the threshold; otherwise the same frames do both, and a warning says so."""
     rows: Rows = {name: [] for name in ("runs", "holes", *STUDY_TABLES)}
-    warnings, calibrated = [said for scan in scans if (said := scan.left_out(family))], {}
+    warnings, calibrated = [text for scan in scans if (text := scan.left_out(family))], {}
     for count in frames:
         groups = [(scan, slice(k, k + count)) for scan in scans for k in range(0, len(scan.frames) - count + 1, count)]
         if not groups:
@@ -247,7 +247,7 @@ def judge_scans(
             warnings.append(f"{count} frames: one average sets the threshold, shows the false calls and is damaged too")
         setting, quiet = setting[:MOST_SETTING] if judging.threshold is None else [], judged[:MOST_HOLE_FREE]
         own = [judging.threshold_of(scan.averaged(scan.frames[group])) for scan, group in setting]
-        warnings += dict.fromkeys(f"{count} frames: {said}" for _, doubts in own for said in doubts)
+        warnings += dict.fromkeys(f"{count} frames: {text}" for _, doubts in own for text in doubts)
         calibrated[count] = len(own)
         threshold = judging.threshold or float(np.median([value for value, _ in own]))
 
@@ -288,7 +288,7 @@ def judge_scans(
 
 
 def _add(rows: Rows, judging: Judging, known: KnownCloud, threshold: float, named: dict[str, str | int]) -> None:
-    """Judge one cloud, and add its rows, ``named`` by frames, board and role."""
+    """Judge one cloud and add its rows. ``named``: its frames, board and role."""
     began, hole_free, radius_m = time.perf_counter(), named["role"] == "hole_free", judging.radius_m
     judged = judge(known, judging.detector, judging.settings_json, threshold, radius_m, hole_free=hole_free)
     found = study_rows(known, judged, radius_m, hole_free=hole_free)

@@ -1,7 +1,7 @@
-"""The journal of a sweep: how each trial ended, appended to segment files, so that the same command resumes.
+"""The journal of a sweep: how each trial ended, appended to segment files, from which the same command resumes.
 
-Each process that writes has a segment of its own: shards may share a folder, and journals merge by appending. A segment
-begins with its version; every further line is an entry with a checksum. A torn or altered line is ignored."""
+Each process that writes has its own segment, so that shards may share a folder and journals merge by appending. A
+segment begins with its version; further lines are entries with a checksum. Torn or altered lines are ignored."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from harness.vocabulary.provenance import check_version, stamp_of, stamped
 from harness.vocabulary.seeds import canonical_json
 
 JOURNAL_VERSION = 6
-"""Raised by every change to records or to what a trial computes: trials in segments of older versions run again."""
+"""Increased with every change to records or to what a trial computes: trials of older versions then run again."""
 SEGMENT_NAME = re.compile(r"[0-9]{6}-[0-9a-f]{8}\.jsonl")
-THRESHOLDS = "thresholds-"  # begins keys of entries that hold the thresholds at which trials were judged
-NOTHING = "null"  # stands in the place of the record of a trial that is not done
+THRESHOLDS = "thresholds-"  # prefix of the keys of entries that hold thresholds
+NOTHING = "null"  # replaces the record of a trial that is not done
 KEPT = ("state", "why", "is_bug", "seconds", "peak_mb", "worker")
 
 
 class _Location(NamedTuple):
-    """The place of an entry: segment, first byte and length of its line; and its state."""
+    """The location of an entry: segment, offset and length of its line in bytes; and the entry's state."""
 
     segment: str
     start: int
@@ -39,8 +39,8 @@ class _Location(NamedTuple):
 
 
 class Journal:
-    """Entries in a folder, by key: the end of a trial, its record's text as value. Raises UserError for links, what
-    cannot be written, and a newer tofpod's. ``damaged``: torn or altered lines and segments of other versions."""
+    """Entries in a folder, by key: how a trial ended, and its record as text. Raises UserError for links, for a segment
+    that cannot be written or is of a newer tofpod. ``damaged``: torn or altered lines, segments of other versions."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -54,7 +54,7 @@ class Journal:
         return sum(not key.startswith(THRESHOLDS) for key in self._known())
 
     def thresholds(self) -> list[str]:
-        """Return the keys of stored thresholds, sorted."""
+        """Return the keys of the stored thresholds, sorted."""
         return sorted(key for key in self._known() if key.startswith(THRESHOLDS))
 
     def state(self, key: str) -> State | None:
@@ -76,19 +76,19 @@ class Journal:
         return found[1] if found is not None and found[0] == key else None
 
     def entries(self) -> Iterator[tuple[str, Ended]]:
-        """Yield (key, entry) of all trials and thresholds, in the order in which they stand in the segments."""
+        """Yield (key, entry) of all trials and thresholds, in the order of the segments."""
         for key, _ in sorted(self._known().items(), key=lambda item: item[1][:2]):
             if (entry := self.read(key)) is not None:
                 yield key, entry
 
     def write(self, key: str, entry: Ended) -> None:
-        """Append how a trial ended. Raises UserError where the folder cannot be written or the disk is full."""
+        """Append how a trial ended. Raises UserError if the folder cannot be written or the disk is full."""
         self._known()
-        said = {name: getattr(entry, name) for name in KEPT} | {"key": key, "seconds": round(entry.seconds, 4)}
-        text = f"{canonical_json(said)}\t{NOTHING if entry.value is None else entry.value}".encode()
+        fields = {name: getattr(entry, name) for name in KEPT} | {"key": key, "seconds": round(entry.seconds, 4)}
+        text = f"{canonical_json(fields)}\t{NOTHING if entry.value is None else entry.value}".encode()
         line = _digest(text) + b" " + text + b"\n"
         try:
-            if self._own is None:  # names count up, so that they sort by the time at which the segments were begun
+            if self._own is None:  # ascending numbers sort segments by the time at which they were begun
                 self.folder.mkdir(parents=True, exist_ok=True)
                 numbers = [int(name[:6]) for name in os.listdir(self.folder) if SEGMENT_NAME.fullmatch(name)]
                 own = self.folder / f"{max(numbers, default=0) + 1:06d}-{secrets.token_hex(4)}.jsonl"
@@ -132,7 +132,7 @@ class Journal:
                 if os.fstat(file.fileno()).st_size <= start:
                     return
                 if not start and not self._is_ours(path, file.readline(200)):
-                    self._read_to[path.name] = 1 << 62  # never looked into again
+                    self._read_to[path.name] = 1 << 62  # never read again
                     return
                 file.seek(start := max(start, file.tell()))
                 while (line := file.readline(RECORD_BYTES)).endswith(b"\n"):
@@ -158,21 +158,21 @@ class Journal:
         return version == JOURNAL_VERSION
 
     def _remember(self, key: str, place: _Location) -> None:
-        """A later entry takes the place of an earlier one, unless only the earlier trial is done."""
+        """Store an entry's location. A later entry replaces an earlier one, unless only the earlier one is done."""
         before = self._places.get(key)
         if before is None or before.state != "done" or place.state == "done":
             self._places[key] = place
 
 
 def _parsed(line: bytes) -> tuple[str, Ended] | None:
-    """The key and the entry of a line; None where it is damaged."""
+    """Return the key and the entry of a line; None if it is damaged."""
     digest, _, text = line.rstrip(b"\n").partition(b" ")
     if digest != _digest(text):
         return None
     try:
         head, _, record = text.decode().partition("\t")
-        said = strict_json(head)
-        key, entry = said.pop("key"), Ended(value=None if record == NOTHING else record, **said)
+        fields = strict_json(head)
+        key, entry = fields.pop("key"), Ended(value=None if record == NOTHING else record, **fields)
     except (ValueError, TypeError, KeyError, AttributeError):
         return None
     is_whole = entry.state in STATES and (entry.value is not None) == (entry.state == "done")

@@ -1,6 +1,6 @@
-"""Hole-free boards on which a detector (`detectors.interface.Calibratable`) learns before its threshold is set.
+"""Lets a detector (`detectors.interface.Calibratable`) learn from hole-free boards before its threshold is set.
 
-The learned state is stored in the journal, for resuming and shards, and in a file of that name, which trials read."""
+The journal stores the learned state, for resuming and shards; a file named after its key holds it for trials."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from harness.engine.judge import Rows, detector_of
 from harness.engine.trial import TrialTask, cloud_of
 from harness.vocabulary.seeds import canonical_json
 
-LEARNING_BOARDS = 8  # Boards to learn on: 200,000 pixels each at 0.7 m give a spectrum to a few per cent
+LEARNING_BOARDS = 8  # boards to learn from: at 0.7 m, 200,000 pixels each give a spectrum to a few per cent
 
 
 def learns(detector: str, settings: dict[str, object]) -> bool:
@@ -25,7 +25,7 @@ def learns(detector: str, settings: dict[str, object]) -> bool:
 
 
 def learn(task: TrialTask) -> Rows:
-    """Return the record of what a task's detector learns on its `LEARNING_BOARDS` boards: an ``.npz`` in base 64."""
+    """Return the record of what a task's detector learns from its `LEARNING_BOARDS` boards: an ``.npz`` in base 64."""
     (point,), views = task.points, len(task.set_ups) // LEARNING_BOARDS
     boards = (
         replace(task, set_ups=task.set_ups[number * views : (number + 1) * views], repeat=number)

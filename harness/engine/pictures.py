@@ -1,4 +1,4 @@
-"""A report's pictures, drawn again from their seeds: the first damaged repeat; of a study, damages near the limit."""
+"""Draws a report's pictures again from their seeds: the first damaged repeat or, in a study, damages near the limit."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from harness.vocabulary.geometry import MM, transform_points
 from harness.vocabulary.seeds import canonical_json
 from scenes.target.truth import Damage, face_of
 
-MOST_POINTS = 60_000  # points of a merged cloud in a picture
-SHARES: dict[Where, float] = {"below": 0.75, "at": 1.0, "above": 1.25}  # pictured damage over the limit
+MOST_POINTS = 60_000  # most points of a merged cloud in a picture
+SHARES: dict[Where, float] = {"below": 0.75, "at": 1.0, "above": 1.25}  # size of the damage over the limit
 MOST_SET_UPS = 6
-ROOM_MM = 12.0  # room around the largest of a set-up's damages in their pictures, which all have one size
+ROOM_MM = 12.0  # margin around the largest damage of a set-up, whose pictures all have one size
 GREY = 160
 
 
@@ -35,7 +35,7 @@ def pictures_of(group: Group, thresholds: Mapping[str, float]) -> list[Any]:
 
 
 def _judged(task: TrialTask, point: PointTask, most: int) -> JudgedCloud:
-    """Judge one view's cloud as a trial did that drew so many frames at ``most``."""
+    """Judge the cloud of one view like a trial that drew ``most`` frames."""
     set_up = load_set_up(task.set_ups[0])
     capture = capture_of(set_up, 0, task, most)
     clouds = averages_of(capture, [point.frames], point.average, point.exact, point.flat_field)
@@ -45,7 +45,7 @@ def _judged(task: TrialTask, point: PointTask, most: int) -> JudgedCloud:
 
 
 def _detected(judged: JudgedCloud) -> np.ndarray:
-    """(h, w) bool: pixels that belong to a detection."""
+    """Return (h, w) bool: pixels that belong to a detection."""
     detected = np.zeros(judged.evidence.score.shape, bool)
     for detection in judged.detections:
         detected.ravel()[detection.pixels] = True
@@ -53,7 +53,7 @@ def _detected(judged: JudgedCloud) -> np.ndarray:
 
 
 def _cloud_examples(group: Group, thresholds: Mapping[str, float]) -> list[ExampleCloud]:
-    """The clouds of repeat 0 at the least and the greatest number of frames of each variant of a group."""
+    """Return the clouds of repeat 0 of each variant of a group, at its smallest and largest number of frames."""
     batch, by_variant = group.damaged, dict[str, list[PointTask]]()
     _, task = next(group.trials(batch, thresholds))
     for point in sorted(task.points, key=lambda point: point.frames):
@@ -83,7 +83,7 @@ def _cloud_examples(group: Group, thresholds: Mapping[str, float]) -> list[Examp
 
 
 def _outline_px(set_up: SetUp, damage: Damage) -> np.ndarray:
-    """(n, 2) columns and rows of a damage's rim on the cloud's grid; of a hole or dent a circle."""
+    """Return columns and rows (n, 2) of a damage's rim on the cloud's grid; a circle for a hole or dent."""
     region, lens = set_up.unit.region, set_up.unit.camera.nominal_lens
     across = np.cross(damage.axis_camera, [0.0, 1.0, 0.0])
     across /= np.linalg.norm(across)
@@ -97,14 +97,15 @@ def _outline_px(set_up: SetUp, damage: Damage) -> np.ndarray:
 
 
 def _map_examples(group: Group, thresholds: Mapping[str, float]) -> list[MappedExample]:
-    """Maps of the fewest views and of all, one by each merge, with the most frames and the registration named last."""
+    """Return maps of the fewest views and of all, one for each merge, with the most frames and the last
+    registration."""
     batch = group.damaged
     points = [point for point in group.points if point.digest in thresholds and point.config.mapping is not None]
     several = [point for point in points if (_mapping(point).views or len(batch.renders)) > 1]
     most = max((point.config.capture.frames for point in several), default=0)
     last: dict[tuple[int, str], Point] = {}
     for point in several:
-        # a variation has a picture only where nothing else is in the group
+        # a variation has a picture only if the group holds nothing else
         if point.config.capture.frames == most and (not point.is_variation or points[0].is_variation):
             last[_mapping(point).views or len(batch.renders), _mapping(point).merge.kind] = point
     ends = {pick(count for count, _ in last) for pick in (min, max)} if last else set()
@@ -112,9 +113,9 @@ def _map_examples(group: Group, thresholds: Mapping[str, float]) -> list[MappedE
         return []
     set_ups = [load_set_up(ref) for ref in batch.set_ups]
     _, task = next(group.trials(batch, thresholds))
-    asked = next(iter(last.values())).config.capture
+    config = next(iter(last.values())).config.capture
     captures = [capture_of(set_up, number, task, most) for number, set_up in enumerate(set_ups)]
-    clouds = [averages_of(capture, [most], asked.average, asked.exact, asked.flat_field) for capture in captures]
+    clouds = [averages_of(capture, [most], config.average, config.exact, config.flat_field) for capture in captures]
     maps = MapMaker(set_ups, clouds, group.poses, ("damaged", 0))
     chosen = [point for (count, _), point in last.items() if count in ends]
     return [_map_example(maps, point, thresholds[point.digest], group.learned.get(point.digest)) for point in chosen]
@@ -171,7 +172,7 @@ def _map_example(maps: MapMaker, point: Point, threshold: float, learned: str | 
 
 
 class ShownDamage(NamedTuple):
-    """One damage to show: row ``row`` of the limit's inspections, on the board of ``batch``."""
+    """A damage to show: row ``row`` of the limit's inspections, on the board of ``batch``."""
 
     group: Group
     batch: Batch
@@ -183,7 +184,7 @@ class ShownDamage(NamedTuple):
 
 
 def shown_in(plan: SweepPlan, limits: Sequence[SetUpLimit]) -> Iterator[ShownDamage]:
-    """Yield the damages of the first few set-ups (single views) nearest to 0.75, 1 and 1.25 of the limit."""
+    """Yield, for the first set-ups with single views, the damages closest to 0.75, 1 and 1.25 of the limit."""
     places = [(group, point) for group in plan.groups for point in group.points]
     by_place = {(point.variant, point.config.capture.frames): (group, point) for group, point in places}
     for limit in limits[:MOST_SET_UPS]:
@@ -205,12 +206,12 @@ def shown_in(plan: SweepPlan, limits: Sequence[SetUpLimit]) -> Iterator[ShownDam
 
 
 def study_example(shown: ShownDamage, thresholds: Mapping[str, float]) -> StudyExample:
-    """Return the picture of a damage, whose board is rendered. The run is repeated exactly."""
+    """Return the picture of a damage whose board has been rendered. The trial is repeated exactly."""
     group, batch, point, limit, where, row, half_m = shown
     seen = limit.record.inspected
     (task,) = (task for _, task in group.trials(batch, thresholds) if task.repeat == int(seen.repeat[row]))
-    asked = next(found for found in task.points if found.digest == point.digest)
-    set_up, judged = load_set_up(task.set_ups[0]), _judged(task, asked, asked.frames)
+    of_point = next(found for found in task.points if found.digest == point.digest)
+    set_up, judged = load_set_up(task.set_ups[0]), _judged(task, of_point, of_point.frames)
     damage = next(found for found in set_up.truth if str(found.id) == str(seen.hole[row]))
     rim = _outline_px(set_up, damage)
     pitch_mm = float(np.mean(set_up.pitch_mm))
@@ -218,7 +219,7 @@ def study_example(shown: ShownDamage, thresholds: Mapping[str, float]) -> StudyE
     middle = np.round(rim.mean(axis=0)).astype(int)
 
     def window(image: np.ndarray, beyond: float | bool) -> np.ndarray:
-        """A square of 2 half + 1 pixels about the rim's centre; ``beyond`` the image's edge."""
+        """Return a square of 2 half + 1 pixels around the rim's centre; ``beyond``: value outside the image."""
         padded = np.pad(image, half, constant_values=beyond)
         return np.asarray(padded[middle[1] : middle[1] + 2 * half + 1, middle[0] : middle[0] + 2 * half + 1])
 

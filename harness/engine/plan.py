@@ -1,4 +1,4 @@
-"""The plan of a sweep: views to render, trials to run, points that share their frames, and a shard's parts of it."""
+"""The plan of a sweep: views to render, trials to run, points that share their frames, and the parts of a shard."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ CODE = "harness.engine.learning"
 PACKAGES = (
     "numpy", "scipy", "numba", "opencv-python-headless", "open3d-cpu" if sys.platform == "linux" else "open3d",
 )  # fmt: skip
-"""A trial counts as not done after a change of its task, of sources that it reaches, or of a version of these."""
-MOST_REPEATS = 256  # repeats of a part of a plan, which is looked up and queued as one
+"""A trial runs again after a change of its task, of sources that it reaches, or of a version of these packages."""
+MOST_REPEATS = 256  # repeats in one part of a plan; a part is looked up and queued as a whole
 
 
 def trial_code(detector: str) -> tuple[str, ...]:
-    """Return the modules whose sources decide a trial with a detector, a plug-in's included."""
+    """Return the modules whose sources determine a trial with a detector, including those of a plug-in."""
     return (CODE, DETECTORS.offer(detector).target.partition(":")[0])
 
 
 @dataclass(frozen=True)
 class RenderJob:
-    """One view to render, or to find in the cache."""
+    """A view to render, unless it is in the cache."""
 
     target: TargetConfig
     camera: CameraConfig
@@ -52,15 +52,15 @@ class RenderJob:
 
     @cached_property
     def path(self) -> Path:
-        """The file in the cache."""
+        """Its file in the cache."""
         return self.folder / f"{render_key(self.target, camera_of(self.camera).optics, self.config)}.npz"
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Trials of one role before one target, which share its renders. ``renders`` and ``set_ups``: one for each view,
-    of all targets in a row where the role is "learning". ``board``: its number among a study's boards of this role;
-    None for any other experiment. ``units``: cameras that take the repeats in turn; none: that of the set-ups."""
+    """Trials of one role with one target, which share its renders. ``renders`` and ``set_ups`` have an entry for each
+    view (in the role "learning": the views of all targets in sequence). ``board``: the board's number in a study; None
+    for other experiments. ``units``: cameras that take turns over the repeats; empty: the camera of the set-ups."""
 
     role: Role
     renders: tuple[RenderJob, ...]
@@ -83,11 +83,11 @@ class Batch:
 
 @dataclass(frozen=True)
 class Group:
-    """Points that share their frames: one set-up, one seed. On the batch ``learning`` detectors that can do so learn;
-    the batches ``first`` are hole-free and set the points' thresholds; ``then`` those judged by them. ``poses``: the
-    declaration of the views, where there are several. ``folder``: the place of files of what was learned.
-    Groups of a study that differ only in the damage have the same trials before thresholds: the first of them runs
-    these for the points ``also`` of the others, in the same order as its own, whose ``leader`` it is."""
+    """Points that share their frames: one set-up, one seed. Detectors learn on the batch ``learning``; the batches
+    ``first`` are hole-free and set thresholds; the batches ``then`` are judged at them. ``poses`` declares several
+    views. ``folder`` is for files of what detectors learn. Groups of a study that differ only in the damage have the
+    same trials before thresholds. The first such group is the ``leader`` of the others and also runs these trials for
+    their points, ``also``, in the same order as its own."""
 
     points: tuple[Point, ...]
     learning: tuple[Batch, ...]
@@ -101,18 +101,18 @@ class Group:
 
     @property
     def batches(self) -> tuple[Batch, ...]:
-        """All, in the order in which they run."""
+        """All batches, in the order in which they run."""
         return (*self.learning, *self.first, *self.then)
 
     @cached_property
     def learners(self) -> tuple[Point, ...]:
-        """Points whose detector learns."""
-        asked = ((point, point.config.detector) for point in self.points)
-        return tuple(point for point, detector in asked if learns(detector.name, detector.settings))
+        """The points whose detector learns."""
+        pairs = ((point, point.config.detector) for point in self.points)
+        return tuple(point for point, detector in pairs if learns(detector.name, detector.settings))
 
     @cached_property
     def learned(self) -> dict[str, str]:
-        """Files, by point digest, of what detectors learn: each has the name of its trial in the journal."""
+        """The files that hold what detectors learn, by point digest; each is named after its trial in the journal."""
         if self.leader is not None:
             return self.leader.learned
         trials = (trial for batch in self.learning for trial in self.trials(batch, None))
@@ -122,12 +122,12 @@ class Group:
 
     @property
     def damaged(self) -> Batch:
-        """The first batch before a damaged target."""
+        """The first batch with a damaged target."""
         return next(batch for batch in self.then if batch.role == "damaged")
 
     def repeats(self, batch: Batch, point: Point) -> int:
-        """Return the number of trials of a batch that a point wants: with a given threshold as many hole-free as
-        damaged ones, one of each calibration board, of damaged boards ``repeats`` for each unit."""
+        """Return a point's number of trials of a batch: 1 of a calibration board; ``repeats`` per unit of a damaged
+        board; of hole-free boards as many as calibrate or, with a given threshold, as of damaged boards."""
         calibrate = point.config.threshold.calibrate
         if batch.role == "calibration":
             return 0 if calibrate is None else 1
@@ -136,7 +136,7 @@ class Group:
         return point.config.repeats * max(len(batch.units), 1)
 
     def most_repeats(self, batch: Batch) -> int:
-        """Return the number of trials of a batch: of learning one for each learner."""
+        """Return the number of trials of a batch; when learning, one for each detector that learns."""
         if batch.role == "learning":
             return len(self.learners)
         return max(self.repeats(batch, point) for point in self.points)
@@ -148,8 +148,8 @@ class Group:
         repeats: Iterable[int] | None = None,
         without: Collection[str] = (),
     ) -> Iterator[tuple[str, TrialTask]]:
-        """Yield (journal key, task) of each trial of a batch, or of some ``repeats``. ``thresholds`` by point digest,
-        empty while calibrating; points without, or of ``without``, are not judged; None names trials all the same."""
+        """Yield (journal key, task) of the trials of a batch, or of some ``repeats``. ``thresholds``: by point digest,
+        empty in calibration; None: list all trials. Points without a threshold, or in ``without``, are not judged."""
         if batch.role == "learning":
             for number in range(len(self.learners)) if repeats is None else repeats:
                 learner = (point_task(self.learners[number], None, None),)
@@ -162,10 +162,10 @@ class Group:
         points = [point for point in every if unjudged or given[point.digest] is not None]
         points = [point for point in points if point.digest not in without]
         learned = self.learned
-        asked = {one.digest: point_task(one, given[one.digest], learned.get(one.digest)) for one in points}
+        tasks = {one.digest: point_task(one, given[one.digest], learned.get(one.digest)) for one in points}
         count = max((self.repeats(batch, point) for point in points), default=0)
         for repeat in range(count) if repeats is None else repeats:
-            wanted = tuple(asked[point.digest] for point in points if repeat < self.repeats(batch, point))
+            wanted = tuple(tasks[point.digest] for point in points if repeat < self.repeats(batch, point))
             if wanted:
                 task = TrialTask(batch.before(repeat), self.seed, batch.role, repeat, wanted, self.poses, batch.board)
                 yield self._key(batch, task), task
@@ -187,11 +187,11 @@ class Group:
 
 
 def point_task(point: Point, threshold: float | None, learned: str | None) -> PointTask:
-    """Return what a point asks of trials. ``threshold`` None: it is being calibrated; ``learned`` as of `PointTask`."""
+    """Return a point's part of a trial. ``threshold`` is None during calibration; ``learned`` as in `PointTask`."""
     capture, detector, matching = point.config.capture, point.config.detector, point.config.matching
-    asked = (detector.name, canonical_json(detector.settings), capture.average, matching.radius_mm * MM, threshold)
+    first = (detector.name, canonical_json(detector.settings), capture.average, matching.radius_mm * MM, threshold)
     further = (point.config.mapping, capture.exact, learned, capture.flat_field, matching.overlap)
-    return PointTask(point.digest, point.variant, capture.frames, *asked, *further)
+    return PointTask(point.digest, point.variant, capture.frames, *first, *further)
 
 
 @dataclass(frozen=True)
@@ -202,13 +202,13 @@ class SweepPlan:
 
     @property
     def renders(self) -> tuple[RenderJob, ...]:
-        """The distinct views, in the order in which trials need them."""
+        """The different views, in the order in which trials need them."""
         jobs = {job.path: job for group in self.groups for batch in group.batches for job in batch.renders}
         return tuple(jobs.values())
 
 
 def plan_of(experiment: Experiment, cache: Path, folder: Path | None = None) -> SweepPlan:
-    """Group the points of an experiment by the frames that they share. ``folder``: its results; None: the cache."""
+    """Group the points of an experiment that share their frames. ``folder``: its results; None: the cache."""
     by_frames: dict[str, list[Point]] = {}
     for point in experiment.points:
         by_frames.setdefault(point.frames_key, []).append(point)
@@ -224,13 +224,13 @@ def plan_of(experiment: Experiment, cache: Path, folder: Path | None = None) -> 
 
 
 def _before_thresholds(group: Group) -> str:
-    """Return a text that is equal for groups of a study with the same trials before thresholds."""
+    """Return a text that is the same for groups of a study whose trials before thresholds are the same."""
     batches = (*group.learning, *group.first)
     if not batches or batches[-1].board is None:
         return group.points[0].frames_key
-    asked = [replace(point_task(point, None, None), digest="", variant="") for point in group.points]
+    tasks = [replace(point_task(point, None, None), digest="", variant="") for point in group.points]
     seen = [(batch.paths, [ref.camera for ref in batch.before(0)]) for batch in batches]
-    return repr([group.seed, group.poses, asked, [point.config.threshold for point in group.points], seen])
+    return repr([group.seed, group.poses, tasks, [point.config.threshold for point in group.points], seen])
 
 
 def _group(points: tuple[Point, ...], cache: Path, folder: Path) -> Group:
@@ -241,7 +241,7 @@ def _group(points: tuple[Point, ...], cache: Path, folder: Path) -> Group:
         boards = 0 if calibrate is None else calibrate.boards or 0
 
         def batches(role: Role, count: int) -> tuple[Batch, ...]:
-            """Damaged boards stand before all units in turn, every other board before one of its own."""
+            """Return a role's batches: all units inspect each damaged board; every other board has its own unit."""
             made = []
             for board in range(count):
                 numbers = range(study.units or 0) if role == "damaged" else [board] if study.units else []
@@ -266,11 +266,11 @@ def _group(points: tuple[Point, ...], cache: Path, folder: Path) -> Group:
     return replace(group, learning=(Batch("learning", tuple(renders.values()), set_ups),))
 
 
-_drawn = lru_cache(maxsize=4096)(DrawnTargetConfig.drawn)  # Cameras, frames and detectors look at the same boards
+_drawn = lru_cache(maxsize=4096)(DrawnTargetConfig.drawn)  # cameras, frames and detectors share boards
 
 
 def unit_of(camera: CameraConfig, seed: int, role: Role, number: int) -> CameraConfig:
-    """Return the camera of a unit that is drawn for boards of a role."""
+    """Return the camera of a unit that is drawn for a role and number."""
     stream = random_stream(seed, "unit of the camera", camera.unit_seed, role, number)
     return camera.model_copy(update={"unit_seed": int(stream.integers(2**32))})
 
@@ -283,7 +283,7 @@ def batch_of(
     board: int | None = None,
     units: tuple[CameraConfig, ...] = (),
 ) -> Batch:
-    """Return the trials of a role before one declared target: with its damage where the role is "damaged"."""
+    """Return the trials of a role with one declared target, which shows its damage only in the role "damaged"."""
     target = declared.at_wavelength(camera_of(source.camera).optics.wavelength_nm)
     poses = (target.pose,) if source.views is None else poses_of(source.views, target.pose)
     renders, set_ups, damaged = [], [], role == "damaged"
@@ -295,7 +295,7 @@ def batch_of(
 
 
 class PlanPart(NamedTuple):
-    """Some repeats of one batch of the group with this number; ``sets_threshold``: whether they set its thresholds."""
+    """Some repeats of one batch of group number ``group``. ``sets_threshold``: whether they set its thresholds."""
 
     group: int
     batch: Batch
@@ -304,7 +304,7 @@ class PlanPart(NamedTuple):
 
 
 def parts_of(plan: SweepPlan, shard: Shard) -> tuple[list[list[PlanPart]], list[list[PlanPart]]]:
-    """Cut a plan, by group, into parts that set its thresholds, learning first, and the shard's judged parts."""
+    """Cut a plan, by group, into parts that set thresholds (learning first), and the judged parts of a shard."""
 
     def cut(number: int, batch: Batch, repeats: range, sets_threshold: bool) -> list[PlanPart]:
         starts = range(repeats.start, repeats.stop, MOST_REPEATS)

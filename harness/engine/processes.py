@@ -1,6 +1,6 @@
-"""Jobs in processes of this machine: a process that dies, hangs or needs too much memory fails its own job only.
+"""Runs jobs in processes of this machine. A process that dies, hangs or needs too much memory fails only its own job.
 
-The standard library's executors give up all jobs when a process dies; here a thread serves each through a pipe."""
+The standard library's executors fail all jobs if a process dies; here, a thread serves each process through a pipe."""
 
 from __future__ import annotations
 
@@ -29,42 +29,42 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.provenance import source_digest
 
 ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMBA")}
-"""One thread a process: sums then have one order on every machine, and processes do not compete for cores. Libraries
-read this part of the environment as they load."""
-MOST_RENDERERS = 2  # processes that render, of 2 GB each
-LOOKS_S = 1.0  # interval at which a driver looks at the clock
-START_S = 300.0  # time for a process to load what it needs: seconds, but from a network's disk more
-DUMP_S = 0.3  # time that a hanging process gets to write its traceback; its signal handler needs a millisecond
-STOPPED_S = 2.0  # a wait of `LOOKS_S` that takes so much longer was no waiting: Ctrl-Z, or a suspended machine
+"""Each process uses one thread, so that sums are taken in the same order on every machine and processes do not compete
+for cores. Libraries read these variables when they are loaded."""
+MOST_RENDERERS = 2  # processes that render; each needs 2 GB
+LOOKS_S = 1.0  # interval at which the driver checks the clock
+START_S = 300.0  # time for a process to load its modules: normally seconds, but longer from a network's disk
+DUMP_S = 0.3  # time for a hanging process to write its traceback; the signal handler needs a millisecond
+STOPPED_S = 2.0  # if a wait of `LOOKS_S` takes so much longer, the machine or process was suspended (Ctrl-Z)
 IDLE_S: dict[Stage, float] = {"trials": 300.0, "renders": 10.0}  # idle processes end then; renderers hold 2 GB
-FALSE_STARTS = 3  # processes in a row that died before they could take a job: then none will start
+FALSE_STARTS = 3  # give up after so many processes in a row died before they could take a job
 _STARTING = threading.Lock()
 CAN_FORK = "forkserver" in multiprocessing.get_all_start_methods()
 PROCESSES: Any = multiprocessing.get_context("forkserver" if CAN_FORK else "spawn")
-"""Processes fork from a small one of their own, which imports once what each would spend a second on."""
+"""Processes fork from a small server process that has imported what each of them would need a second to import."""
 if CAN_FORK:
     PROCESSES.set_forkserver_preload(["harness.engine.trial"])
 
 
 @dataclass(eq=False)
 class Answers:
-    """The queue for the ends of jobs, or for the error that ends all. ``is_dropped``: nobody reads it any more."""
+    """Queue for the ends of jobs, or for an error that ends all of them. ``is_dropped``: nobody reads it any more."""
 
     ended: queue.SimpleQueue[tuple[Job, Ended] | UserError] = field(default_factory=queue.SimpleQueue)
     is_dropped: bool = False
 
 
 class LocalEngine:
-    """``jobs`` processes for trials, and up to two for renders, which alone load Mitsuba. ``limits`` are a trial's;
-    renders have no memory limit, as Dr.Jit reserves more than it uses. ``code``: modules that decide the numbers of
-    a stage; a process that starts after one of their sources was edited is refused: it would compute other results."""
+    """Runs jobs in ``jobs`` processes for trials and up to two for renders, which load Mitsuba. ``limits`` hold for
+    trials; renders have no memory limit, because Dr.Jit reserves more than it uses. ``code``: modules that determine a
+    stage's results. A process that starts after an edit of their sources is refused: its results would differ."""
 
     def __init__(self, jobs: int, limits: Limits, code: Mapping[Stage, Code] | None = None) -> None:
         self.code = dict(code or {})
         self.digests = {stage: source_digest(*which) for stage, which in self.code.items()}
         self.false_starts = 0
         self.is_over = False
-        self.said: tempfile.TemporaryDirectory[str]
+        self.trace_files: tempfile.TemporaryDirectory[str]
         self._limits = limits
         self._most: dict[Stage, int] = {"trials": jobs, "renders": min(jobs, MOST_RENDERERS)}
         self._waiting: dict[Stage, deque[tuple[Job, Limits, Answers]]] = {"trials": deque(), "renders": deque()}
@@ -74,7 +74,7 @@ class LocalEngine:
         self._out: Counter[Stage] = Counter()
 
     def __enter__(self) -> LocalEngine:
-        self.said = tempfile.TemporaryDirectory(prefix="tofpod-", ignore_cleanup_errors=True)
+        self.trace_files = tempfile.TemporaryDirectory(prefix="tofpod-", ignore_cleanup_errors=True)
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -85,14 +85,14 @@ class LocalEngine:
             self._state.notify_all()
         for worker in self._workers:
             worker.join(timeout=1.0)
-        self.said.cleanup()
+        self.trace_files.cleanup()
 
     def room(self, stage: Stage) -> int:
-        """Room for a job and a next one for each process, so that none waits while the driver stores a result."""
+        """Return the room for two jobs per process, so that none waits while the driver stores a result."""
         return 2 * self._most[stage] - self._out[stage]
 
     def submit(self, job: Job) -> None:
-        """Take a job. Not more than there is `room` for."""
+        """Take a job. Submit no more than there is `room` for."""
         self._out[job.stage] += 1
         self.put(job, self._limits, self._answers)
 
@@ -100,10 +100,10 @@ class LocalEngine:
         """Wait for jobs to end. Raises UserError where processes run other code or cannot start."""
         found: list[tuple[Job, Ended]] = []
         while not found or not self._answers.ended.empty():
-            said = self._answers.ended.get()
-            if isinstance(said, UserError):
-                raise said
-            job, ended = said
+            answer = self._answers.ended.get()
+            if isinstance(answer, UserError):
+                raise answer
+            job, ended = answer
             self._out[job.stage] -= 1
             found.append((job, ended))
         return found
@@ -121,7 +121,7 @@ class LocalEngine:
             self._state.notify_all()
 
     def drop(self, answers: Answers) -> None:
-        """End the jobs whose results are no longer wanted."""
+        """End the jobs whose results nobody needs any more."""
         with self._state:
             answers.is_dropped = True
             for worker in self._workers:
@@ -130,7 +130,7 @@ class LocalEngine:
         answers.ended.put(UserError("nobody awaits these jobs any more"))
 
     def next_job(self, worker: _Worker) -> tuple[Job, Limits, Answers] | None:
-        """Wait for a worker's next job; its process ends when it is idle for long. None when there are no more."""
+        """Wait for a worker's next job; end its process if idle for long. Return None if there are no more jobs."""
         waiting = self._waiting[worker.stage]
         with self._state:
             worker.holds = None
@@ -145,7 +145,7 @@ class LocalEngine:
 
 
 class _Worker(threading.Thread):
-    """A thread that serves one process after another through a pipe. ``holds``: who awaits the end of its job."""
+    """A thread that serves one process after another through a pipe. ``holds``: the queue for its job's end."""
 
     def __init__(self, engine: LocalEngine, stage: Stage, number: int) -> None:
         super().__init__(daemon=True)
@@ -154,7 +154,7 @@ class _Worker(threading.Thread):
         self._label = f"{stage} process {number}"
         self._process: Any = None
         self._pipe: Connection[Any, Any]
-        self._said = Path(engine.said.name) / str(number)
+        self._trace = Path(engine.trace_files.name) / str(number)
 
     def run(self) -> None:
         while (taken := self._engine.next_job(self)) is not None:
@@ -164,20 +164,20 @@ class _Worker(threading.Thread):
             except UserError as mistake:
                 self.end()
                 answers.ended.put(mistake)
-            except Exception as error:  # a bug here must not leave the driver waiting
+            except Exception as error:  # a bug here must not block the driver
                 why = "".join(traceback.format_exception(error))[-TRACEBACK_CHARACTERS:]
                 answers.ended.put((job, Ended("failed", why=why, is_bug=True)))
         self.end()
 
     def _carried_out(self, job: Job, limits: Limits, answers: Answers) -> Ended:
-        """Run a job. A death of the process is how the job ended, and so is its time limit."""
-        if self._process is not None and self._pipe.poll():  # idle, it says nothing: it has died
+        """Run a job and return its end, which may be the death of the process or the time limit."""
+        if self._process is not None and self._pipe.poll():  # an idle process sends nothing: it has died
             self.end()
         while self._process is None:
             if answers.is_dropped or self._engine.is_over:
                 return Ended("crashed", why="nobody awaits it any more")
             self._start()
-        with contextlib.suppress(OSError):  # a process that is dead by now does not answer either
+        with contextlib.suppress(OSError):  # a dead process does not answer either
             self._pipe.send((job, limits.memory_mb))
         ended: Ended = self._answer(limits.seconds)
         if ended.state in ("crashed", "timed out"):
@@ -185,12 +185,12 @@ class _Worker(threading.Thread):
         return ended
 
     def _start(self) -> None:
-        """Start a process that can take jobs. Raises UserError where it runs other sources, or none can start."""
+        """Start a process that can take jobs. Raises UserError if it runs other sources or no process can start."""
         engine = self._engine
         self._pipe, theirs = PROCESSES.Pipe()
-        arguments = (theirs, self._label, self.stage, str(self._said), engine.code.get(self.stage), dict(os.environ))
+        arguments = (theirs, self._label, self.stage, str(self._trace), engine.code.get(self.stage), dict(os.environ))
         process = PROCESSES.Process(target=serve, args=arguments, daemon=True)
-        with _starting(), contextlib.suppress(OSError, EOFError):  # where the process to fork from has died
+        with _starting(), contextlib.suppress(OSError, EOFError):  # the server process has died
             process.start()
             self._process = process
         theirs.close()
@@ -211,16 +211,16 @@ class _Worker(threading.Thread):
             raise UserError(what, fix="run the same command again: the trials that are left run by the new code")
 
     def _answer(self, limit_s: float | None) -> Any:
-        """The next message, or how waiting for it ended. Time in which everything stood still does not count."""
+        """Return the next message, or an `Ended` if none comes. Time while the machine is suspended does not count."""
         began, left_s = time.monotonic(), float("inf") if limit_s is None else limit_s
         while left_s > 0:
-            asked, waits_s = time.monotonic(), min(left_s, LOOKS_S)
+            waiting_since, waits_s = time.monotonic(), min(left_s, LOOKS_S)
             try:
                 if self._pipe.poll(waits_s):
                     return self._pipe.recv()
             except (EOFError, OSError):
                 return Ended("crashed", why=self._last_words(), seconds=time.monotonic() - began, worker=self._label)
-            spent_s = time.monotonic() - asked
+            spent_s = time.monotonic() - waiting_since
             if spent_s > waits_s + STOPPED_S:
                 began, spent_s = began + spent_s - waits_s, waits_s
             left_s -= spent_s
@@ -228,12 +228,12 @@ class _Worker(threading.Thread):
         with contextlib.suppress(OSError, AttributeError):
             os.kill(self._process.pid, signal.SIGUSR1)  # its own signal handler writes the traceback
             time.sleep(DUMP_S)
-            where = self._said.read_text()[-TRACEBACK_CHARACTERS:]
+            where = self._trace.read_text()[-TRACEBACK_CHARACTERS:]
         why = f"not done after {limit_s:.3g} s (--time-limit); it was at:\n{where}"
         return Ended("timed out", why=why, seconds=time.monotonic() - began, worker=self._label)
 
     def _last_words(self) -> str:
-        """The cause of the process' death, as far as can be known."""
+        """Return the cause of the process's death, as far as it is known."""
         if self._process is None:
             return "the process that it forks from has died"
         self._process.join(timeout=1.0)
@@ -243,16 +243,16 @@ class _Worker(threading.Thread):
             name = signal.Signals(-code).name if -code in signal.valid_signals() else f"signal {-code}"
             by = ": by a user, or by the system because memory ran out" if name == "SIGKILL" else ""
             why = f"its process was ended by {name}{by}"
-        said = self._said.read_text()[-TRACEBACK_CHARACTERS:] if self._said.exists() else ""
-        return why + (f"\n{said}" if said else "")
+        trace = self._trace.read_text()[-TRACEBACK_CHARACTERS:] if self._trace.exists() else ""
+        return why + (f"\n{trace}" if trace else "")
 
     def strike(self) -> None:
-        """Begin to end the process, without waiting for it; from any thread."""
+        """Kill the process without waiting; from any thread."""
         if (process := self._process) is not None:
             process.kill()
 
     def end(self) -> None:
-        """End the process, whatever it is doing; called by its own thread."""
+        """Kill the process and wait; called by its own thread."""
         if self._process is not None:
             self._process.kill()
             self._process.join(timeout=1.0)
@@ -262,7 +262,7 @@ class _Worker(threading.Thread):
 
 @contextlib.contextmanager
 def _environment(stated: Mapping[str, str]) -> Iterator[None]:
-    """Hold a part of the environment: processes inherit it as they start, libraries read it as they load."""
+    """Set environment variables for a while: processes inherit them at their start, libraries read them when loaded."""
     before = {name: os.environ.get(name) for name in stated}
     os.environ.update(stated)
     try:
@@ -275,8 +275,8 @@ def _environment(stated: Mapping[str, str]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _starting() -> Iterator[None]:
-    """Start a process that never hears Ctrl-C; also from a dask worker, a daemon. The one to fork from finds modules
-    where this one does, not first in the folder that it starts in."""
+    """Start processes that ignore Ctrl-C, even from a dask worker, which is a daemon. The server process finds modules
+    where this process does, not first in the folder in which it starts."""
     config: dict[str, Any] = multiprocessing.current_process()._config  # type: ignore[attr-defined]
     here = multiprocessing.process.ORIGINAL_DIR  # type: ignore[attr-defined]
     own = os.pathsep.join(path or here for path in sys.path)
@@ -297,26 +297,26 @@ def _starting() -> Iterator[None]:
 
 
 def serve(
-    pipe: Connection[Any, Any], name: str, stage: Stage, said: str, code: Code | None, environment: dict[str, str]
+    pipe: Connection[Any, Any], name: str, stage: Stage, trace: str, code: Code | None, environment: dict[str, str]
 ) -> None:
-    """Carry out jobs until the driver closes the pipe. The file ``said`` holds the reason if this process is killed."""
+    """Run jobs until the driver closes the pipe. ``trace``: path of a file for the reason if it is killed."""
     os.environ.clear()
     os.environ.update(environment | ONE_THREAD)
-    words = _prepare(said)
+    file = _prepare(trace)
     try:
-        if stage == "trials":  # before time counts
+        if stage == "trials":  # before the time limit starts to count
             import cv2
 
             import harness.engine.trial  # noqa: F401
 
             cv2.setNumThreads(1)
-            # plug-ins are loaded now, so that the digest is that of what will run
+            # load plug-ins now, so that the digest is that of the code that runs
             for module in code[0] if code else ():
                 importlib.import_module(module)
         pipe.send(source_digest(*code) if code else None)
     except BaseException:
-        traceback.print_exc(file=words)
-        words.flush()
+        traceback.print_exc(file=file)
+        file.flush()
         os._exit(1)
     with contextlib.suppress(EOFError, OSError):
         while True:
@@ -329,10 +329,10 @@ def serve(
                 pipe.send(Ended("failed", why=f"its result cannot be sent: {error}", is_bug=True, worker=name))
 
 
-def _prepare(said: str) -> IO[str]:
-    """Ignore Ctrl-C, end without a driver, and write to the file ``said`` where a crash or a hang happens."""
-    # POSIX ends this process with its driver, whatever it does: a pipe that loses its writer sends SIGIO. On Windows it
-    # ends where it next hears or tells anything
+def _prepare(trace: str) -> IO[str]:
+    """Ignore Ctrl-C, end together with the driver, and write where a crash or hang occurs to the file ``trace``."""
+    # On POSIX this process ends with its driver, whatever it does, because a pipe without a writer sends SIGIO. On
+    # Windows it ends when it next reads from or writes to the pipe.
     with contextlib.suppress(ImportError, AttributeError, OSError):
         import fcntl
 
@@ -340,15 +340,15 @@ def _prepare(said: str) -> IO[str]:
         fcntl.fcntl(drivers_end, fcntl.F_SETOWN, os.getpid())
         fcntl.fcntl(drivers_end, fcntl.F_SETFL, fcntl.fcntl(drivers_end, fcntl.F_GETFL) | os.O_ASYNC)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    words = open(said, "w")  # noqa: SIM115 (open as long as the process lives)
-    faulthandler.enable(words)
+    file = open(trace, "w")  # noqa: SIM115 (open as long as the process lives)
+    faulthandler.enable(file)
     if hasattr(faulthandler, "register"):
-        faulthandler.register(signal.SIGUSR1, words, all_threads=False)
-    return words
+        faulthandler.register(signal.SIGUSR1, file, all_threads=False)
+    return file
 
 
 def _limit_memory(memory_mb: int | None) -> None:
-    """Let allocations beyond so much private memory of this process fail (Linux only)."""
+    """Make allocations fail beyond this much private memory of the process (Linux only)."""
     with contextlib.suppress(ImportError, ValueError, OSError):
         import resource
 
@@ -360,7 +360,7 @@ def _limit_memory(memory_mb: int | None) -> None:
 def render_into_cache(
     target_data: dict[str, Any], camera_data: dict[str, Any], render_data: dict[str, Any], folder: str
 ) -> tuple[bool, float]:
-    """Render a view unless it is cached; only this loads Mitsuba. Returns whether it was there, and seconds."""
+    """Render a view unless it is cached; only this loads Mitsuba. Return whether it was cached, and the seconds."""
     from scenes.optics import RenderConfig
     from scenes.render.cache import cached_view
     from scenes.sensor.camera import CameraConfig, camera_of
@@ -368,13 +368,13 @@ def render_into_cache(
 
     target, optics = TargetConfig.from_data(target_data), camera_of(CameraConfig.from_data(camera_data)).optics
     view, found = cached_view(target, optics, RenderConfig.from_data(render_data), Path(folder))
-    if "drjit" in sys.modules:  # from the second render on each process has its share of the cores: threads wait busily
+    if "drjit" in sys.modules:  # threads wait busily: from the second render on, a process gets its share
         sys.modules["drjit"].set_thread_count(max((os.cpu_count() or 1) // MOST_RENDERERS, 1))
     return found, view.seconds
 
 
 class SerialEngine:
-    """One job at a time in this process, for debuggers and tests: no limits hold, no hang is survived."""
+    """Runs one job at a time in this process, for debuggers and tests, without limits or protection against hangs."""
 
     def __init__(self) -> None:
         self._jobs: deque[Job] = deque()
@@ -384,7 +384,7 @@ class SerialEngine:
         import cv2
         from threadpoolctl import threadpool_limits
 
-        # libraries that are loaded later read the environment, those that are loaded by now are asked
+        # libraries that load later read the environment; those already loaded are limited here
         self._pinned.enter_context(_environment(ONE_THREAD))
         self._pinned.enter_context(threadpool_limits(1))
         self._pinned.callback(cv2.setNumThreads, cv2.getNumThreads())
@@ -396,7 +396,7 @@ class SerialEngine:
         self._pinned.close()
 
     def room(self, stage: Stage) -> int:
-        """Room for one job, whatever its stage."""
+        """Return 1 if there is no job, whatever the stage."""
         return 1 - len(self._jobs)
 
     def submit(self, job: Job) -> None:

@@ -1,8 +1,8 @@
-"""The run of a plan: renders feed trials; detectors learn on hole-free boards, then hole-free trials set thresholds,
-then judged trials use both. What the journal holds is not run again, and views that only that needs are not rendered.
+"""Runs a plan. Renders feed trials; detectors learn on hole-free boards, other hole-free trials set thresholds, and
+judged trials use both. Trials in the journal are not run again, nor are views rendered that only they need.
 
-Every shard calibrates for itself, and unlike processors give unlike last digits. So the journal stores the thresholds
-in use, and after a merge trials that were judged within `AGREES` of the one in use count, filed under it."""
+Each shard calibrates its own thresholds, and different processors give slightly different last digits. So the journal
+stores the thresholds in use; after a merge, trials judged within `AGREES` of them count as judged at them."""
 
 from __future__ import annotations
 
@@ -31,22 +31,22 @@ from harness.vocabulary.geometry import MM
 from harness.vocabulary.seeds import canonical_json, digest
 from scenes.render.cache import read_view
 
-NOTHING = 0.1  # share of a board's face that is judged, up to which a camera that allows no threshold sees nothing
-Quiet = dict[str, dict[str, tuple[float, float]]]  # quiet threshold and judged area in m2, by point, then by trial
+NOTHING = 0.1  # a camera that allows no threshold sees nothing if at most this share of a board's face is judged
+Quiet = dict[str, dict[str, tuple[float, float]]]  # (quiet threshold, judged area in m2) by point, then by trial
 AGREES = 1e-3
-"""Relative difference of equal thresholds: under a tenth of the standard error that one from twenty boards has."""
+"""Relative difference of equal thresholds: less than a tenth of the standard error of one from twenty boards."""
 
 
 class Calibration:
-    """Collects what hole-free trials, added in any order, say of thresholds. ``quiet``: that of all groups' trials."""
+    """Derives thresholds from hole-free trials, which are added in any order. ``quiet``: shared by all groups."""
 
     def __init__(self, group: Group, quiet: Quiet) -> None:
         self._group, self._quiet = group, quiet
         self.unlearned: set[str] = set()
-        """Points whose detector should have learned and did not: they have no threshold, not even a given one."""
+        """Digests of points whose detector failed to learn: they get no threshold, not even a given one."""
 
     def add(self, key: str, runs: Sequence[Mapping[str, Any]]) -> None:
-        """Add the rows ``runs`` of one trial."""
+        """Add the ``runs`` rows of one trial."""
         for run in runs:
             if run["quiet_threshold"] is not None:
                 area_m2 = run.get("inspected_m2", np.nan)
@@ -72,33 +72,33 @@ class Calibration:
         return found, failures
 
     def sets(self, own: Mapping[str, float], journal: Journal) -> list[dict[str, float]]:
-        """Return the thresholds to use (``own``, unless the journal has only others that agree), then others."""
+        """Return sets of thresholds that agree with ``own``, the set to use first: ``own``, or one from the journal."""
         prefix, stored = self._prefix(), []
         for key in journal.thresholds():
             entry = journal.read(key) if prefix and key.startswith(prefix) else None
-            said = entry.record if entry is not None else None
-            if said is None or said.keys() != own.keys():
+            thresholds = entry.record if entry is not None else None
+            if thresholds is None or thresholds.keys() != own.keys():
                 continue
-            if all(isclose(said[name], own[name], rel_tol=AGREES) for name in own):
-                stored.append({name: float(value) for name, value in said.items()})
+            if all(isclose(thresholds[name], own[name], rel_tol=AGREES) for name in own):
+                stored.append({name: float(value) for name, value in thresholds.items()})
         mine = [dict(own)] if dict(own) in stored or not stored else []
         return mine + [other for other in stored if other not in mine]
 
     def store(self, thresholds: Mapping[str, float], journal: Journal) -> None:
-        """Store the thresholds by which this process judges, where they rest on trials."""
+        """Store the thresholds at which this process judges, if trials set them."""
         prefix = self._prefix()
         key = f"{prefix}{digest(dict(thresholds))}"
         if prefix and thresholds and journal.state(key) is None:
             journal.write(key, Ended("done", canonical_json(dict(thresholds))))
 
     def _prefix(self) -> str:
-        """The beginning of the keys of thresholds that rest on the trials that were added; empty without any."""
+        """Return the prefix of the keys of thresholds that are based on the added trials; empty without such trials."""
         keys = sorted({key for point in self._group.points for key in self._quiet.get(point.digest, ())})
         return f"{THRESHOLDS}{digest(keys)}-" if keys else ""
 
 
 def refiled(entry: Ended, judged: TrialTask, task: TrialTask) -> Ended:
-    """Return the entry of a trial judged at thresholds which agree with those of ``task``, with these in every row."""
+    """Return a trial's entry with the thresholds of ``task``, which agree with those at which it was judged."""
     new = {(point.variant, point.frames): point.threshold for point in task.points}
     old = {(point.variant, point.frames): point.threshold for point in judged.points}
     octaves = {"operating": FINDING_OCTAVES, "pixels": PIXEL_OCTAVES}
@@ -117,8 +117,8 @@ def refiled(entry: Ended, judged: TrialTask, task: TrialTask) -> Ended:
 
 
 def threshold_of(point: Point, quiet: Iterable[tuple[float, float]]) -> float | None:
-    """Return a point's threshold: given, or by its hole-free runs, (quiet threshold, judged area in m2) each: the
-    highest of them, or in a study the one for the wanted rate of false calls; None without any. Raises UserError."""
+    """Return a point's threshold: given, or from its hole-free runs (quiet threshold, judged area in m2): the highest
+    or, in a study, the one for the wanted rate of false calls. None without runs. Raises UserError."""
     given, calibrate, quiet = point.config.threshold.k, point.config.threshold.calibrate, list(quiet)
     if given is not None or not quiet:
         return given
@@ -140,10 +140,10 @@ def threshold_of(point: Point, quiet: Iterable[tuple[float, float]]) -> float | 
 
 
 Report = Callable[[Outcome], None]
-AHEAD = 4096  # Trials that may wait to be run: enough for a thousand workers, and a few megabytes
-TRIES = 2  # Tries of a render (two may have been too much for the memory), and of trials that set a threshold
-PARTS_AT_ONCE = 200  # parts that are looked up in the journal before the engine is asked again: some 0.1 s
-TOLD_WHOLE = 200  # failures whose traceback is kept in memory; of the others the journal has it
+AHEAD = 4096  # most trials that wait to be run: enough for a thousand workers, and a few megabytes
+TRIES = 2  # attempts at a render (two at once may need too much memory) or at a trial that sets a threshold
+PARTS_AT_ONCE = 200  # parts looked up in the journal between two calls of the engine: about 0.1 s
+MOST_TRACEBACKS = 200  # failures whose traceback stays in memory; the journal has those of all
 
 
 def run_plan(
@@ -155,9 +155,9 @@ def run_plan(
     shard: Shard = WHOLE,
     retry_failed: bool = False,
 ) -> Outcome:
-    """Run the trials that the journal lacks, with ``retry_failed`` also those that are not done, and draw the pictures
-    of a whole sweep. A job that ends badly is a `Failure` and costs the trials that need it. Raises UserError where
-    nothing can be written or the engine is gone; KeyboardInterrupt passes through, with all ends in the journal."""
+    """Run the trials that the journal lacks (with ``retry_failed``, also those that failed), and draw a whole sweep's
+    pictures. A job that fails becomes a `Failure`; trials that need it are skipped. Raises UserError if nothing can be
+    written or the engine is gone. KeyboardInterrupt passes through; the journal has all finished trials."""
     first, then = parts_of(plan, shard)
     run = _Run(plan, journal, engine, report, shard, retry_failed)
     outcome = run.outcome
@@ -169,7 +169,7 @@ def run_plan(
         run.take_learned()
         run.carry_out([part for part in before if part.batch.role != "learning"])
         run.carry_out([part for number, parts in enumerate(then) if parts for part in run.calibrated(number, parts)])
-        while run.under_way:  # renders that nobody needs
+        while run.under_way:  # renders that no trial waits for
             run.step()
     finally:
         journal.sync()
@@ -183,7 +183,7 @@ def run_plan(
 
 
 def _draw(plan: SweepPlan, outcome: Outcome, engine: JobEngine, there: set[Path]) -> None:
-    """Add the pictures of all groups that were judged, but for studies, whose limits decide what is shown."""
+    """Add the pictures of all judged groups, except in studies, whose limits determine which boards are shown."""
     groups = [group for group in plan.groups if group.damaged.board is None]
     groups = [group for group in groups if any(point.digest in outcome.thresholds for point in group.points)]
     missing = (job for group in groups for job in group.damaged.renders if job.path not in there)
@@ -204,7 +204,7 @@ def _draw(plan: SweepPlan, outcome: Outcome, engine: JobEngine, there: set[Path]
 
 
 def render_missing(jobs: Iterable[RenderJob], engine: JobEngine) -> list[Failure]:
-    """Have views rendered that the cache lacks or holds damaged. Returns a failure for each that could not be."""
+    """Render views that the cache lacks or holds damaged. Return a failure for each that could not be rendered."""
     missing = [_render_job(job) for job in {job.path: job for job in jobs}.values() if read_view(job.path) is None]
     ends = carried_out(missing, engine)
     return [_failure(_lost_view(job.name), ended) for job, ended in ends if ended.state != "done"]
@@ -215,7 +215,7 @@ def _lost_view(name: str) -> str:
 
 
 def carried_out(jobs: Iterable[Job], engine: JobEngine) -> Iterator[tuple[Job, Ended]]:
-    """Have jobs carried out; yields each with its end, in the order in which they end."""
+    """Run jobs; yield each with its end, in the order in which they end."""
     waiting, under_way = deque(jobs), 0
     while waiting or under_way:
         while waiting and engine.room(waiting[0].stage) > 0:
@@ -242,7 +242,7 @@ class _Trial(NamedTuple):
 
 
 class _Run:
-    """The state of a run: jobs under way by name, views in the cache, views wanted after calibration by group."""
+    """The state of a run: jobs that are running, views in the cache, views wanted after calibration."""
 
     def __init__(
         self, plan: SweepPlan, journal: Journal, engine: JobEngine, report: Report, shard: Shard, retry: bool
@@ -256,27 +256,27 @@ class _Run:
         self._renders = {job.path: job for job in plan.renders}
         quiet: Quiet = {}
         self._calibrations = [Calibration(group, quiet) for group in plan.groups]
-        # by group, thresholds that agree with those in use, at which other shards have judged
+        # by group: thresholds of other shards that agree with those in use
         self._others: list[list[dict[str, float]]] = [[] for _ in plan.groups]
-        self._died: Counter[str] = Counter()  # deaths of the process of a render or of a calibrating trial
+        self._deaths: Counter[str] = Counter()  # by job: how often the process of a render or calibrating trial died
         self._queue: deque[_Trial] = deque()
-        self._waiting: dict[Path, list[tuple[PlanPart, list[_Trial]]]] = {}  # parts by the views that they wait for
-        self._ahead = self._begun = 0  # trials that are open and not begun, and those under way
+        self._waiting: dict[Path, list[tuple[PlanPart, list[_Trial]]]] = {}  # by view: parts that wait for it
+        self._unstarted = self._running = 0  # numbers of queued or waiting trials, and of running trials
         self._lost: dict[Path, str] = {}
-        self._asked: set[Path] = set()  # views that were wanted so far
-        self._wanted: deque[Path] = deque()  # views still to be rendered, and those that are wanted later
+        self._requested: set[Path] = set()  # views that were ever requested
+        self._wanted: deque[Path] = deque()  # views to render now; then those to render later
         self._later: deque[Path] = deque()
 
     def carry_out(self, parts: Iterable[PlanPart]) -> None:
-        """Run all trials of parts that the journal lacks."""
+        """Run all trials of the parts that the journal lacks."""
         to_open = deque(parts)
-        while to_open or self._ahead or self._begun:
+        while to_open or self._unstarted or self._running:
             for _ in range(PARTS_AT_ONCE):
-                if not to_open or self._ahead >= AHEAD:
+                if not to_open or self._unstarted >= AHEAD:
                     break
                 self._open(to_open.popleft())
             while self._engine.room("renders") > 0:
-                while self._later and not to_open and not self._wanted:  # what is wanted later is rendered meanwhile
+                while self._later and not to_open and not self._wanted:  # rendered while the engine is idle
                     self._want(self._later.popleft())
                 if not self._wanted:
                     break
@@ -288,24 +288,24 @@ class _Run:
             self.step()
 
     def step(self) -> None:
-        """Wait for jobs to end and take in how they did."""
+        """Wait for jobs to end, and process their results."""
         self._report(self.outcome)
         for job, ended in self._engine.ended() if self.under_way else ():
             if ended.ends_all:
                 raise DiskFull(ended.why)
             work = self.under_way.pop(job.name)
-            self._died[job.name] += ended.state == "crashed"
-            again = ended.state == "crashed" and self._died[job.name] < TRIES
+            self._deaths[job.name] += ended.state == "crashed"
+            again = ended.state == "crashed" and self._deaths[job.name] < TRIES
             if isinstance(work, RenderJob):
                 if again:
                     self._wanted.appendleft(work.path)
                 else:
                     self._render_over(work.path, ended)
                 continue
-            self._begun -= 1
+            self._running -= 1
             if again and work.part.sets_threshold:
                 self._queue.append(work)
-                self._ahead += 1
+                self._unstarted += 1
                 continue
             self._journal.write(work.key, ended)
             self.outcome.peak_mb = max(self.outcome.peak_mb, ended.peak_mb)
@@ -314,7 +314,7 @@ class _Run:
         self._report(self.outcome)
 
     def take_learned(self) -> None:
-        """Write what detectors have learned into files, from which trials read it."""
+        """Write what detectors have learned into files, which trials read."""
         for group, calibration in zip(self._groups, self._calibrations, strict=True):
             for point, path in ((point, Path(file)) for point, file in group.learned.items()):
                 entry = self._journal.read(path.stem)
@@ -324,7 +324,7 @@ class _Run:
                     write_bytes(path, learned_file(entry.record))
 
     def calibrated(self, number: int, judged: list[PlanPart]) -> list[PlanPart]:
-        """Set the thresholds of a group; returns the parts that can be judged by them."""
+        """Set the thresholds of a group. Return the parts that can be judged at them."""
         calibration = self._calibrations[number]
         thresholds, failures = calibration.thresholds()
         if not self._shard.is_whole:
@@ -339,13 +339,13 @@ class _Run:
         return judged if thresholds else []
 
     def _want(self, path: Path) -> None:
-        if path not in self._asked:
-            self._asked.add(path)
+        if path not in self._requested:
+            self._requested.add(path)
             self._wanted.append(path)
             self.outcome.renders.total += 1
 
     def _open(self, part: PlanPart) -> None:
-        """Take from the journal what it holds of a part, and queue the rest once its views are there."""
+        """Take the finished trials of a part from the journal, and queue the others once their views are rendered."""
         missing = [trial for trial in self._trials(part) if not self._found(trial)]
         if not missing:
             return
@@ -356,7 +356,7 @@ class _Run:
         if lost:
             self._skip(missing, lost[0])
             return
-        self._ahead += len(missing)
+        self._unstarted += len(missing)
         if part.sets_threshold:
             self._later += self.judged_paths.pop(part.group, ())
         if not absent:
@@ -365,18 +365,18 @@ class _Run:
             self._waiting.setdefault(path, []).append((part, missing))
 
     def _begin(self, trial: _Trial) -> None:
-        self._ahead -= 1
+        self._unstarted -= 1
         if not self._shard.is_whole and trial.part.sets_threshold:
-            # another shard with the same folder may have run it meanwhile
+            # another shard in the same folder may have run it in the meantime
             self._journal.refresh()
             if self._found(trial):
                 return
-        self._begun += 1
+        self._running += 1
         self.under_way[trial.key] = trial
         self._engine.submit(Job(trial.key, "trials", trial_as_text, (trial.task,)))
 
     def _trials(self, part: PlanPart) -> list[_Trial]:
-        """The trials of a part; judged ones that others judged at agreeing thresholds are filed under their keys."""
+        """Return a part's trials. Those that others judged at agreeing thresholds are filed under this run's keys."""
         group = self._groups[part.group]
         unlearned = self._calibrations[part.group].unlearned
         made = group.trials(part.batch, self.outcome.thresholds, part.repeats, unlearned)
@@ -393,7 +393,7 @@ class _Run:
         return found
 
     def _found(self, trial: _Trial) -> bool:
-        """Return whether the journal says how a trial ended, and nothing asks for another try."""
+        """Return whether the journal has a trial's final end, so that it is not run again."""
         entry = self._journal.read(trial.key)
         if entry is None or entry.state == "skipped" or (self._retry_failed and entry.state != "done"):
             return False
@@ -409,8 +409,8 @@ class _Run:
             return
         self.outcome.trials.failed += 1
         failure = _failure(trial.key, entry)
-        told = len(self.outcome.failures) < TOLD_WHOLE
-        self.outcome.failures.append(failure if told else replace(failure, why=failure.in_short))
+        whole = len(self.outcome.failures) < MOST_TRACEBACKS
+        self.outcome.failures.append(failure if whole else replace(failure, why=failure.in_short))
 
     def _render_over(self, path: Path, ended: Ended) -> None:
         counts, waiting = self.outcome.renders, self._waiting.pop(path, ())
@@ -428,12 +428,12 @@ class _Run:
         self.outcome.failures.append(_failure(f"render {path.stem}", ended))
         self._lost[path] = self.outcome.failures[-1].in_short
         for _, trials in waiting:
-            self._ahead -= len(trials)
+            self._unstarted -= len(trials)
             self._skip(trials, self._lost[path])
-            trials.clear()  # the same list waits for the part's other views
+            trials.clear()  # the part's other views wait with the same list
 
     def _skip(self, trials: Iterable[_Trial], why: str) -> None:
-        """Give up trials that cannot be begun; the next run tries them again."""
+        """Record trials that cannot be started; the next run tries them again."""
         entry = Ended("skipped", why=why)
         for trial in trials:
             self._journal.write(trial.key, entry)
@@ -441,5 +441,5 @@ class _Run:
 
 
 def trial_as_text(task: TrialTask) -> str:
-    """Return a trial's record as the journal keeps it; made where the trial runs, as it takes a millisecond."""
+    """Return a trial's record as JSON for the journal. The worker makes this text, because it takes a millisecond."""
     return record_text(learn(task) if task.role == "learning" else run_trial(task))

@@ -1,4 +1,4 @@
-"""A simulated set-up as a trial needs it, and a cloud with the truth on its grid; detectors are handed clouds only."""
+"""A simulated set-up with what a trial needs, and clouds with the truth on their grid. Detectors get only the cloud."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from scenes.target.custom import TargetConfig
 from scenes.target.flaws import from_line_m
 from scenes.target.truth import Damage, Face, face_of, truth_of
 
-INTACT_MARGIN_PX = 8  # Nearer to damage or rim nothing counts as undamaged: twice the engine's window
+INTACT_MARGIN_PX = 8  # pixels closer to damage or rim do not count as undamaged; twice the engine's window
 FEWEST_PROBES = 100
-PROBES = 500  # Pixels followed over repeats for noise and systematic error: known to 0.5 % with 50 repeats
-FACE_STEPS = 8  # Fixed-point steps to a curved face; each shrinks the error by the face's slope
-FACE_ONLY_M = 50 * MM  # points this far behind the face are nearest to no place on it
+PROBES = 500  # pixels followed over repeats for noise and systematic error: 0.5 % accuracy with 50 repeats
+FACE_STEPS = 8  # fixed-point steps to a curved face; each reduces the error by the face's slope
+FACE_ONLY_M = 50 * MM  # points farther behind the face are ignored by `face_errors_m`
 
 
 @dataclass(frozen=True)
 class SetUpRef:
-    """Names a set-up in few bytes, for a worker. ``target`` has its damage; ``damaged``: whether the view shows it."""
+    """A small reference to a set-up, for workers. ``target`` has its damage; ``damaged``: whether the view shows it."""
 
     view_path: str
     camera: CameraConfig
@@ -42,8 +42,8 @@ class SetUpRef:
 
 @dataclass(frozen=True)
 class SetUp:
-    """One target before one unit. ``truth`` is the target's damage with its centre in view, also where the view was
-    rendered without it (``damaged`` False): the same places without holes. Arrays cover ``unit.region``, (h, w)."""
+    """One target in front of one unit. ``truth`` is the target's damage with its centre in view; if the view was
+    rendered without damage (``damaged`` False), these places have no holes. Arrays cover ``unit.region``, (h, w)."""
 
     unit: SimulatedUnit
     damaged: bool
@@ -53,7 +53,7 @@ class SetUp:
 
     @cached_property
     def on_face_m(self) -> np.ndarray:
-        """(h, w, 3): where each pixel's central ray meets the undamaged face, board frame; NaN off the board."""
+        """Points (h, w, 3) where each pixel's central ray meets the undamaged face, board frame; NaN off the board."""
         slopes = self.unit.view.slopes[self.unit.cut]
         T_board_camera = invert(self.T_camera_board)
         rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
@@ -67,25 +67,25 @@ class SetUp:
 
     @property
     def board_xy_m(self) -> np.ndarray:
-        """(h, w, 2): the same, along the face in plan."""
+        """The same points in plan, (h, w, 2)."""
         return self.on_face_m[..., :2]
 
     @cached_property
     def seen_z_m(self) -> np.ndarray:
-        """(h, w): z of what each pixel's central ray meets in the rendered view, floors of holes included."""
+        """Depth z (h, w) of what each pixel's central ray meets in the rendered view, including the floors of holes."""
         view, cut = self.unit.view, self.unit.cut
         return np.asarray(view.range_m[cut] / np.sqrt(1 + (view.slopes[cut] ** 2).sum(axis=-1)))
 
     @cached_property
     def outlines(self) -> dict[int, np.ndarray]:
-        """Flat indices of the pixels whose central ray enters each damage; at least the nearest pixel."""
+        """Flat indices of the pixels whose central ray enters each damage, or of the nearest pixel."""
         return outlined(self.truth, self.board_xy_m)
 
     @cached_property
     def seen_depth_m(self) -> dict[int, float]:
-        """Depth by damage at which the central rays through it end behind the face, along the optical axis: median of
-        those that come within 1 mm of the deepest (walls are seen in passing), of what stands out of the highest, and
-        negative; behind a through-hole the backing's. Strips of tape count as face."""
+        """Depth of each damage along the optical axis at which the central rays through it end behind the face: the
+        median of those within 1 mm of the deepest (others hit walls). For raised damage, the same for the highest,
+        negative; behind a through-hole, the backing's. Strips of tape count as face."""
         face_z_m = transform_points(self.T_camera_board, self.on_face_m)[..., 2]
         depth_m, found = (self.seen_z_m - face_z_m).ravel(), {}
         for damage in self.truth:
@@ -97,7 +97,7 @@ class SetUp:
 
     @cached_property
     def intact(self) -> np.ndarray:
-        """(h, w) bool: undamaged face well away from damage and rim."""
+        """Pixels (h, w) bool of undamaged face well away from damage and rim."""
         whole = self.on_board.copy()
         for pixels in self.outlines.values():
             whole.ravel()[pixels] = False
@@ -105,12 +105,12 @@ class SetUp:
 
     @cached_property
     def on_board(self) -> np.ndarray:
-        """(h, w) bool: pixels whose central ray meets the face or a hole in it."""
+        """Pixels (h, w) bool whose central ray meets the face or a hole in it."""
         return np.isfinite(self.board_xy_m[..., 0])
 
     @cached_property
     def bare(self) -> np.ndarray:
-        """(h, w) bool: face well away from the rim, damaged or not: what a hole-free board shows undamaged."""
+        """Pixels (h, w) bool of the face well away from the rim, which a hole-free board shows undamaged."""
         return _eroded(self.on_board)
 
     @cached_property
@@ -122,14 +122,14 @@ class SetUp:
 
     @cached_property
     def probes(self) -> np.ndarray:
-        """(p,) flat indices of evenly spread undamaged pixels; over damage too where those are too few."""
+        """Flat indices (p,) of evenly spread undamaged pixels, or of pixels on damage too if those are too few."""
         intact = np.flatnonzero(self.intact)
         intact = intact if len(intact) >= FEWEST_PROBES else np.flatnonzero(self.bare)
         return intact[:: max(1, len(intact) // PROBES)][:PROBES]
 
 
 def outlined(truth: Sequence[Damage], places_m: np.ndarray) -> dict[int, np.ndarray]:
-    """Return the flat indices of the places (h, w, 2) inside each damage by its id; the nearest where none is."""
+    """Return the flat indices of the places (h, w, 2) inside each damage, by id; the nearest place if none is."""
     x, y = (np.ascontiguousarray(places_m[..., axis]).ravel() for axis in (0, 1))
     found = {damage.id: np.flatnonzero(damage.within(x, y)) for damage in truth}
     for damage in truth:
@@ -140,34 +140,34 @@ def outlined(truth: Sequence[Damage], places_m: np.ndarray) -> dict[int, np.ndar
 
 
 def _eroded(mask: np.ndarray) -> np.ndarray:
-    """A mask less a rim of `INTACT_MARGIN_PX`."""
+    """Return a mask without a rim of `INTACT_MARGIN_PX`."""
     square = np.ones((2 * INTACT_MARGIN_PX + 1,) * 2, np.uint8)
     return np.asarray(cv2.erode(mask.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0)
 
 
 def met_on_face(points_m: np.ndarray, directions: np.ndarray, face: Face) -> np.ndarray:
-    """Return (..., 3): where the lines through points along directions (both (..., 3), board frame) meet a face."""
+    """Return the points (..., 3) where lines through points along directions (..., 3), board frame, meet a face."""
     place, before = points_m, None
     for _ in range(FACE_STEPS):
         height = np.nan_to_num(face.height_m(place[..., 0], place[..., 1]))
         if before is not None and np.array_equal(height, before):
-            break  # on a flat face the second step is the last
+            break  # on a flat face the first step is exact
         before = height
         place = points_m + ((height - points_m[..., 2]) / directions[..., 2])[..., None] * directions
     return np.asarray(place)
 
 
-KEPT, KEPT_BYTES = 32, 200_000_000  # Set-ups kept, and bytes of views: three of a lidar with 31 frequencies
+KEPT, KEPT_BYTES = 32, 200_000_000  # set-ups kept, and bytes of their views: three of a lidar with 31 frequencies
 _kept: OrderedDict[SetUpRef, SetUp] = OrderedDict()
 
 
 def load_set_up(ref: SetUpRef) -> SetUp:
-    """Return the set-up behind a reference, kept for the worker's next trials within ``KEPT`` and ``KEPT_BYTES``."""
+    """Return the set-up of a reference. Workers keep set-ups for later trials, within ``KEPT`` and ``KEPT_BYTES``."""
     if ref not in _kept:
         T_camera_board, view = ref.target.pose.T_camera_board, read_view(Path(ref.view_path))
         if view is None:
-            said = f"{ref.view_path}: the stored render is missing or damaged"
-            raise UserError(said, fix="run the same command again")
+            what = f"{ref.view_path}: the stored render is missing or damaged"
+            raise UserError(what, fix="run the same command again")
         unit, truth = SimulatedUnit(camera_of(ref.camera), ref.camera, view), truth_of(ref.target, T_camera_board)
         in_view = unit.camera.images(np.array([damage.centre_camera_m for damage in truth]).reshape(-1, 3))
         seen = tuple(damage for damage, there in zip(truth, in_view, strict=True) if there)
@@ -182,10 +182,10 @@ def load_set_up(ref: SetUpRef) -> SetUp:
 
 @dataclass(frozen=True)
 class KnownCloud:
-    """A cloud and where the truth lies in it. ``T_board_cloud`` (4, 4): the cloud's frame to the board's, true.
-    ``outlines``: by damage the flat indices of the pixels (cells, points) that see into it, at least one. ``places_m``
-    (h, w, 2): where each lies on the face in plan, NaN off the board. ``undamaged`` (h, w) bool: face well away from
-    damage and rim. ``seen_depth_m``: by damage, how far behind the face a view of it ends."""
+    """A cloud with the truth. ``T_board_cloud`` (4, 4): the true pose, cloud's frame to board's. ``outlines``: by
+    damage, the flat indices of the pixels (cells, points) that see into it, at least one. ``places_m`` (h, w, 2):
+    position of each on the face in plan, NaN off the board. ``undamaged`` (h, w) bool: face well away from damage and
+    rim. ``seen_depth_m``: by damage, the depth behind the face of what is seen in it."""
 
     cloud: Cloud
     T_board_cloud: np.ndarray
@@ -197,7 +197,7 @@ class KnownCloud:
     seen_depth_m: Mapping[int, float]
 
     def on_board(self, centres_m: np.ndarray) -> np.ndarray:
-        """Return (m, 2) places on the face along lines of sight through centres (m, 3) in the cloud's frame."""
+        """Return the places (m, 2) on the face that lines of sight through centres (m, 3) of the cloud's frame meet."""
         board = transform_points(self.T_board_cloud, np.asarray(centres_m).reshape(-1, 3))
         if self.cloud.projection == "parallel":
             direction = np.broadcast_to(self.T_board_cloud[:3, 2], board.shape)
@@ -206,32 +206,32 @@ class KnownCloud:
         return met_on_face(board, direction, face_of(self.target.board))[:, :2]
 
     def centre_in_cloud_m(self, damage: Damage) -> np.ndarray:
-        """Return the (3,) true centre of a damage on the face, in the cloud's frame."""
+        """Return the true centre (3,) of a damage on the face, in the cloud's frame."""
         return transform_points(invert(self.T_board_cloud), damage.centre_board_m)
 
     def area_m2(self, pixels: np.ndarray) -> float:
-        """Return the face's area in plan under pixels (h, w) bool; without a grid by their share of the whole."""
+        """Return the area in plan of the face under pixels (h, w) bool; without a grid, by their share of points."""
         there = pixels & np.isfinite(self.places_m[..., 0])
         if not self.cloud.organised:
             board = self.target.board
             return board.width_mm * board.height_mm * MM**2 * float(there.sum()) / max(there.size, 1)
         areas = pixel_areas(self.places_m)
         known = np.isfinite(areas)
-        # at the outline a neighbour is off the board: such a pixel is taken for one like the others
+        # at the outline a neighbour is off the board: such a pixel counts as an average one
         usual = np.median(areas[known]) if known.any() else 0.0
         return float(np.where(known, areas, usual)[there].sum())
 
 
 def known_view(set_up: SetUp, cloud: Cloud, *, hole_free: bool) -> KnownCloud:
-    """Return one view's average with the truth along each pixel's central ray."""
-    # where the camera is so far that nothing undamaged is left beside the damage, a hole-free board but for its rim
+    """Return the average of one view, with the truth along each pixel's central ray."""
+    # if the camera is so far away that nothing undamaged is left between damage, use a hole-free board without its rim
     undamaged = set_up.bare if hole_free and not set_up.intact.any() else set_up.intact
     of_truth = (set_up.target, set_up.truth, set_up.outlines, set_up.board_xy_m, undamaged, set_up.seen_depth_m)
     return KnownCloud(cloud, invert(set_up.T_camera_board), *of_truth)
 
 
 def known_map(first: SetUp, cloud: Cloud, T_reference_cloud: np.ndarray, *, hole_free: bool) -> KnownCloud:
-    """Return a map, ``first`` being the reference view's set-up, with the truth by each point's own place."""
+    """Return a map with the truth at the place of each point. ``first``: the set-up of the reference view."""
     T_board_cloud = invert(first.T_camera_board) @ T_reference_cloud
     place = board_places_m(cloud, T_board_cloud)
     margin_m = INTACT_MARGIN_PX * max(first.pitch_mm) * MM
@@ -245,13 +245,13 @@ def known_map(first: SetUp, cloud: Cloud, T_reference_cloud: np.ndarray, *, hole
 
 
 def far_from(truth: Sequence[Damage], places_m: np.ndarray, margin_m: float) -> np.ndarray:
-    """Return (h, w) bool: places (h, w, 2) farther than a margin from all damage."""
+    """Return (h, w) bool: whether places (h, w, 2) are farther than a margin from all damage."""
     x, y = (np.ascontiguousarray(places_m[..., axis]) for axis in (0, 1))
     return ~np.any([np.zeros(x.shape, bool), *(damage.within(x, y, margin_m) for damage in truth)], axis=0)
 
 
 def board_places_m(cloud: Cloud, T_board_cloud: np.ndarray) -> np.ndarray:
-    """Return the (h, w, 2) place on the board of each point; of a map's empty cells too, by its grid."""
+    """Return the place (h, w, 2) on the board of each point; of a map's empty cells too, from its grid."""
     points = cloud.points_m
     if cloud.projection == "parallel":
         x, y = _ticks(points[..., 0]), _ticks(points[..., 1].T)
@@ -262,7 +262,7 @@ def board_places_m(cloud: Cloud, T_board_cloud: np.ndarray) -> np.ndarray:
 
 
 def _ticks(places: np.ndarray) -> np.ndarray:
-    """(w,) equally spaced co-ordinates of the columns of (h, w) places, those of empty columns filled in."""
+    """Return the equally spaced co-ordinates (w,) of the columns of places (h, w), including empty columns."""
     known = np.flatnonzero(np.isfinite(places).any(axis=0))
     ticks = np.nanmedian(places[:, known], axis=0)
     step, first = np.polyfit(known, ticks, 1) if len(known) > 1 else (0.0, float(ticks[0]))
@@ -272,8 +272,8 @@ def _ticks(places: np.ndarray) -> np.ndarray:
 
 
 def face_errors_m(known: KnownCloud, places_m: np.ndarray) -> np.ndarray:
-    """Return (p,) how far behind the true face the cloud's point nearest to each place (p, 2) of the board lies, along
-    the board's normal; NaN where the nearest lies more than three of the cloud's mean spacings aside."""
+    """Return how far (p,) behind the true face the cloud's point nearest to each place (p, 2) of the board lies, along
+    the board's normal; NaN if that point is more than three of the cloud's mean spacings away."""
     points = transform_points(known.T_board_cloud, known.cloud.points_m[known.cloud.valid])
     points = points[np.abs(points[:, 2]) < FACE_ONLY_M]
     if not len(points):
@@ -287,8 +287,8 @@ def face_errors_m(known: KnownCloud, places_m: np.ndarray) -> np.ndarray:
 def highest_within(
     places_m: np.ndarray, score: np.ndarray, lines_m: Sequence[np.ndarray] | np.ndarray, radius_m: float
 ) -> np.ndarray:
-    """Return (n,) the highest of the finite scores (h, w) within a radius of each centre (2,) or line (k, 2); NaN where
-    there is none. ``places_m`` (h, w, 2): where each pixel lies, NaN where it lies nowhere."""
+    """Return the highest (n,) of the finite scores (h, w) within a radius of each centre (2,) or line (k, 2); NaN if
+    there is none. ``places_m`` (h, w, 2): the place of each pixel, NaN if it has none."""
     flat, scores, found = places_m.reshape(-1, 2), score.ravel(), []
     for line in map(np.atleast_2d, lines_m):
         near = _about(flat, scores, *(line.min(axis=0) - radius_m), *(line.max(axis=0) + radius_m))
@@ -301,7 +301,7 @@ def highest_within(
 def _about(  # type: ignore[no-untyped-def]
     places: np.ndarray, scores: np.ndarray, west: float, north: float, east: float, south: float
 ):
-    """Return the numbers of the places (n, 2) in a rectangle that have a finite score."""
+    """Return the indices of the places (n, 2) in a rectangle that have a finite score."""
     inside = np.empty(len(places), np.int64)
     count = 0
     for i in range(len(places)):
@@ -313,8 +313,8 @@ def _about(  # type: ignore[no-untyped-def]
 
 @numba.njit(**PLAIN)
 def pixel_areas(places_m: np.ndarray) -> np.ndarray:
-    """Return (h, w) area that pixels at ``places_m`` (h, w, 2) cover of a plane: the parallelogram of central
-    differences, at the edge one-sided ones. NaN beside a pixel that lies nowhere; h and w are 2 at least."""
+    """Return the areas (h, w) that pixels at ``places_m`` (h, w, 2) cover in plan: parallelograms of central
+    differences, one-sided at the edge. NaN beside a pixel without a place. h and w are at least 2."""
     h, w, _ = places_m.shape
     areas = np.empty((h, w))
     for v in range(h):

@@ -1,4 +1,4 @@
-"""A validated experiment becomes its folder of results."""
+"""Runs a validated experiment, and writes its folder of results."""
 
 from __future__ import annotations
 
@@ -40,21 +40,22 @@ from harness.vocabulary.seeds import digest
 from scenes.render.cache import in_use, read_view, trim_cache
 from scenes.sensor.camera import camera_of, guessed_precision
 
-MOST_FAILURES, FAILURE = 200, ("what", "state", "why")  # failures that are listed; the journal has all
+MOST_FAILURES, FAILURE = 200, ("what", "state", "why")  # failures to list; the journal has all of them
 
 
 def run_study(experiment: Experiment, out: Path, options: EngineOptions, command: str) -> int:
-    """Run, write tables and report, print the summary; of a shard only the journal. Returns 0, 1, or 130."""
+    """Run an experiment, write tables and report, print a summary; for a shard, only the journal. Returns 0, 1 or
+    130."""
     began = time.monotonic()
-    origin = record(command)  # now: a commit that is made while the sweep runs is not what it ran
+    origin = record(command)  # recorded now: a commit during the sweep does not change the code that runs
     origin["started"] = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     folder, cache = experiment.folder(out), out / ".cache" / "renders"
     _refuse_newer(folder)
     detectors = {point.config.detector.name for point in experiment.points}
     try:
-        # other processes need not have been started in the same folder
+        # other processes may have started in another folder
         plan = plan_of(experiment, cache.absolute(), folder.absolute())
-        # the first file written: an unwritable folder shows before any work is done
+        # the first file written shows whether the folder is writable, before any work
         write_text(folder / EXPERIMENT.name, resolved_yaml(experiment))
         journal = Journal(folder / "journal")
         with in_use(cache), locked(folder, options.shard), engine_of(options, detectors, cache) as engine:
@@ -94,7 +95,7 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
 
 
 def _refuse_newer(folder: Path) -> None:
-    """Results of a newer tofpod are not written over. Raises UserError."""
+    """Refuse to overwrite the results of a newer tofpod. Raises UserError."""
     try:
         version = strict_json(bounded_bytes(folder / PROVENANCE.name, RECORD_BYTES))["results_version"]
     except (OSError, ValueError, KeyError, TypeError):
@@ -104,7 +105,7 @@ def _refuse_newer(folder: Path) -> None:
 
 
 def _records(journal: Journal, outcome: Outcome) -> Iterator[dict[str, Any]]:
-    """Records of all finished trials, in order of their keys; read as they are needed, to save memory."""
+    """Yield the records of all finished trials in the order of their keys; reading them one by one saves memory."""
     for key in outcome.finished:
         entry = journal.read(key)
         if entry is None or entry.record is None:
@@ -122,7 +123,7 @@ def _write_study(
     provenance: dict[str, Any],
     engine: JobEngine,
 ) -> list[str | Grid]:
-    """Write a study's record, tables and report. Returns what a terminal shows of it."""
+    """Write a study's record, tables and report. Return what the terminal shows."""
     failed = failures_by_point(plan, outcome.failures, outcome.thresholds)
     study = record_of(experiment, plan, tables, failed, provenance)
     if not study.set_ups:
@@ -131,7 +132,7 @@ def _write_study(
     write_text(folder / STUDY.name, record_text(study))
     result = evaluate_study(study, tables, experiment.data)
     shown = list(shown_in(plan, result.limits))
-    # of trials that were run on other machines the views may not be here
+    # trials that ran on other machines may have no views here
     lost = render_missing((job for damage in shown for job in damage.batch.renders), engine)
     outcome.failures += lost
     examples = [study_example(damage, outcome.thresholds) for damage in shown if not lost]
@@ -142,7 +143,7 @@ def _write_study(
 
 
 def title_of(experiment: Experiment) -> str:
-    """Return the title of an experiment's page: its own, and the axes."""
+    """Return the title of an experiment's page: its own title, and the axes."""
     axes = list(names_of(experiment.data.get("sweep") or {}).values())
     by = ", by " + " and ".join(filter(None, (", ".join(axes[:-1]), axes[-1]))) if axes else ""
     return (experiment.config.title or in_words(experiment.config.name)) + by
@@ -151,22 +152,22 @@ def title_of(experiment: Experiment) -> str:
 def _write_report(
     folder: Path, experiment: Experiment, outcome: Outcome, tables: ResultTables, provenance: dict[str, Any]
 ) -> list[str | Grid]:
-    """Write the summaries and the report of what is no study. Returns what a terminal shows of it."""
+    """Write the summaries and the report of an experiment that is not a study. Return what the terminal shows."""
     facts = experiment.data
     found = summaries(tables, outcome.examples, with_claims=is_thesis(facts))
     write_tables(folder, as_files(found), provenance)
-    told = (provenance, resolved_yaml(experiment), title_of(experiment), facts)
-    write_report(folder, tables, outcome.examples, *told, found=found)
+    about = (provenance, resolved_yaml(experiment), title_of(experiment), facts)
+    write_report(folder, tables, outcome.examples, *about, found=found)
     return final_tables(tables, found)
 
 
 def _nothing_to_report(experiment: Experiment, outcome: Outcome) -> int:
-    """Conclude a run without any result: the user's mistake is raised; a bug keeps its traceback (once) and gives 1."""
+    """End a run without results: raise the user's mistake, or print a bug's traceback once and return 1."""
     name, detector = experiment.config.name, experiment.config.detector.name
     if bug := next((failure for failure in outcome.failures if failure.is_bug), None):
         count = outcome.trials.failed
-        told = f"no trial of {name} succeeded; {count} failed, the first as above (detector {detector!r})"
-        print(f"{bug.why}\n{told}", file=sys.stderr)
+        summary = f"no trial of {name} succeeded; {count} failed, the first as above (detector {detector!r})"
+        print(f"{bug.why}\n{summary}", file=sys.stderr)
         return 1
     own = [failure for failure in outcome.failures if failure.state != "skipped"]
     why = own[0].why if len({failure.in_short for failure in own}) == 1 else _reasons(outcome)
@@ -177,29 +178,29 @@ def _nothing_to_report(experiment: Experiment, outcome: Outcome) -> int:
 
 
 def _reasons(outcome: Outcome) -> str:
-    """The causes of failures, without the trials that were skipped because of them."""
+    """Return the causes of failures, without trials that were skipped because of them."""
     own = {failure.in_short for failure in outcome.failures if failure.state != "skipped"}
     return "; ".join(sorted(own)[:3]) or "nothing was planned"
 
 
 def _counts(outcome: Outcome) -> dict[str, int]:
-    """The number of failures by state."""
+    """Return the number of failures by state."""
     counts = Counter(failure.state for failure in outcome.failures)
     return {state: counts[state] for state in STATES if counts[state]}
 
 
 def _tell_failures(outcome: Outcome) -> None:
     if counts := _counts(outcome):
-        said = ", ".join(f"{count} {state}" for state, count in counts.items())
+        totals = ", ".join(f"{count} {state}" for state, count in counts.items())
         again = "the same command, with --retry-failed, runs them again"
         again = again if set(counts) - {"skipped"} else "the same command runs what was skipped"
-        print(f"{said}: {_reasons(outcome)}\n{again}", file=sys.stderr)
+        print(f"{totals}: {_reasons(outcome)}\n{again}", file=sys.stderr)
 
 
 def _provenance(
     experiment: Experiment, plan: SweepPlan, outcome: Outcome, tables: ResultTables, origin: dict[str, Any]
 ) -> dict[str, Any]:
-    """Everything that a reader needs to repeat the numbers or to doubt them."""
+    """Return everything that a reader needs to reproduce or question the results."""
     variant = next((view.variant for view in (read_view(job.path) for job in plan.renders) if view is not None), None)
     runs, renders, trials = tables.runs, outcome.renders, outcome.trials
     sources = {point.config.simulated.camera.name: point.config.simulated.camera for point in experiment.points}
@@ -225,12 +226,12 @@ def _provenance(
     }
 
 
-SIMULATION = ("scenes.sensor.source",)  # modules that decide frames, with all that they import
+SIMULATION = ("scenes.sensor.source",)  # with all that they import, these modules determine frames
 INSPECTED = {
     "board": int, "hole": str, "repeat": int, "true_diameter_mm": float, "true_depth_mm": float, "true_x_mm": float,
     "true_y_mm": float, "signal": float,
 }  # fmt: skip
-"""Columns of the holes' table that go into the record, without the word "true"."""
+"""Columns of the table of holes that go into the record, without the prefix "true"."""
 
 
 def record_of(
@@ -240,7 +241,7 @@ def record_of(
     failed: Mapping[str, Sequence[Failure]],
     provenance: Mapping[str, Any],
 ) -> StudyRecord:
-    """Return a study's record, without set-ups of which no damaged board was judged. ``failed``: by point digest."""
+    """Return a study's record, without set-ups that have no judged damaged board. ``failed``: by point digest."""
     calibrate = experiment.config.threshold.calibrate
     found = {point.digest: group for group in plan.groups for point in group.points}
     counts = {digest: len(failures) for digest, failures in failed.items()}
@@ -270,8 +271,8 @@ def _set_up(point: Point, group: Group, tables: ResultTables, failed: int) -> Se
     boards = [batch.set_ups[0].target for batch in group.then if batch.role == "damaged"]
     targets = [[board.board.to_data(), *(damage.to_data() for damage in board.damages)] for board in boards]
     renders = (path.stem for batch in group.then for path in batch.paths)
-    loudest = calibrating[calibrating["quiet_threshold"].notna()]  # runs that judged no pixel are left out
-    # equal where every frame of every judged board is
+    loudest = calibrating[calibrating["quiet_threshold"].notna()]  # without runs that judged no pixel
+    # equal if every frame of every judged board is equal
     decided_by = [source_digest(SIMULATION, PACKAGES), *renders, point.frames_key, config.capture.to_data()]
     study = config.study
     return set_up_of(
@@ -299,7 +300,7 @@ def _set_up(point: Point, group: Group, tables: ResultTables, failed: int) -> Se
 
 
 def set_up_of(holes: pd.DataFrame, runs: pd.DataFrame, **named: Any) -> SetUpRecord:
-    """Return a set-up's record: threshold, hits and false calls by the tables of its judged boards, and ``named``."""
+    """Return a set-up's record: threshold, hits and false calls from tables of its judged boards, and ``named``."""
     judged = runs[runs["threshold"].notna()]
     threshold = float(judged["threshold"].iloc[0])
     by_depth, by_no_return = holes["detected"].to_numpy(bool), holes["no_return"].to_numpy(bool)
@@ -339,16 +340,16 @@ def failures_by_point(
     every = [(group, batch) for group in plan.groups for batch in group.batches] if by_key else []
     for group, batch in every:
         for key, task in group.trials(batch, thresholds if batch in group.then else {}):
-            for asked in task.points if key in by_key else ():
-                found.setdefault(asked.digest, []).append(by_key[key])
+            for point in task.points if key in by_key else ():
+                found.setdefault(point.digest, []).append(by_key[key])
     return found
 
 
 def without_limit(
     points: Iterable[Point], outcome: Outcome, failed: Mapping[str, list[Failure]], judged: Iterable[SetUpRecord]
 ) -> list[str]:
-    """Return sentences on the points that are not among the ``judged`` set-ups, with their commonest failure."""
-    known, said = {(one.variant, one.frames) for one in judged}, dict[str, list[str]]()
+    """Return sentences on the points that are not among the ``judged`` set-ups, each with its most common failure."""
+    known, by_cause = {(one.variant, one.frames) for one in judged}, dict[str, list[str]]()
     for point in (one for one in points if (one.variant, one.config.capture.frames) not in known):
         own = [one for one in failed.get(point.digest, ()) if one.state != "skipped"]
         causes = [one.in_short for one in own]
@@ -356,5 +357,5 @@ def without_limit(
         why = Counter([*causes, "its trials did not finish"]).most_common(1)[0][0]
         if own and all(one.state == "failed" and not one.is_bug for one in own):
             why = f"the camera sees no part of the board that can be judged ({why})"
-        said.setdefault(why, []).append(in_words(point.label))
-    return [f"no limit for {'; '.join(labels)}: {why}" for why, labels in said.items()]
+        by_cause.setdefault(why, []).append(in_words(point.label))
+    return [f"no limit for {'; '.join(labels)}: {why}" for why, labels in by_cause.items()]

@@ -1,4 +1,4 @@
-"""Records of trials as tables: one row per trial and hole, one per trial, one per probe pixel, one per variant."""
+"""Converts records of trials into tables: one row per trial and damage, per trial, per probe pixel, and per variant."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from harness.vocabulary.geometry import MM
 from harness.vocabulary.path_names import names_of, unit_of
 
 RECORDED = {"holes": trials.TRIALS, "runs": trials.RUNS, "noise": trials.NOISE, "registrations": trials.REGISTRATIONS}
-"""Tables by the name that records call their rows by; probes apart, which are taken together over repeats."""
+"""Tables by the names of their rows in records; probes are separate, because they are combined over repeats."""
 OF_STUDY = {table.name: table for table in trials.STUDY_ONLY}
-RECORDS_AT_ONCE = 100  # records that are held as mappings before they become columns, which take a tenth of the memory
-UNKNOWN = np.iinfo(np.int32).min  # stands among whole numbers for a value that is not known
+RECORDS_AT_ONCE = 100  # records held as mappings before they become columns, which need a tenth of the memory
+UNKNOWN = np.iinfo(np.int32).min  # marks an unknown value among whole numbers
 
 
 def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> trials.ResultTables:
-    """Collect records into tables in a fixed order; every axis but frames is a column, except those of a study."""
+    """Collect records into tables in a fixed order. Every axis but frames is a column, except in a study's tables."""
     parts: dict[str, list[dict[str, Any]]] = {name: [] for name in (*RECORDED, *OF_STUDY)}
     grids: dict[tuple[float, ...], np.ndarray] = {}
     probes: list[dict[str, Any]] = []
@@ -42,8 +42,8 @@ def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> t
                 made.append(columns_of(rows, grids))
     paths = list(experiment.points[0].axes)
     names = names_of(paths)
-    said = [{"path": path, "name": names[path], "unit": unit_of(path)} for path in paths]
-    axes = pd.DataFrame(said, columns=["path", "name", "unit"])
+    rows_of_axes = [{"path": path, "name": names[path], "unit": unit_of(path)} for path in paths]
+    axes = pd.DataFrame(rows_of_axes, columns=["path", "name", "unit"])
     variants = _variants(experiment)
     placed = variants.set_index("variant")[paths]
 
@@ -51,7 +51,7 @@ def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> t
         return table if table.empty or axes.empty else table.join(placed, on="variant")
 
     def ordered(name: str, declared: Table) -> pd.DataFrame:
-        """Join a table's parts column by column, so that no more than one is held twice."""
+        """Join the parts of a table column by column, so that only one column at a time is held twice."""
         own = parts.pop(name)
         sizes = [len(next(iter(part.values()))) for part in own]
         names = dict.fromkeys(column for part in own for column in part)
@@ -77,7 +77,7 @@ def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> t
 
 
 def columns_of(rows: Sequence[Mapping[str, Any]], grids: dict[tuple[float, ...], np.ndarray]) -> dict[str, Any]:
-    """Rows as columns: of None and numbers floats with NaN; lists of thresholds one of ``grids``, which takes new."""
+    """Convert rows to columns: numbers and None to floats with NaN, equal lists of thresholds to one of ``grids``."""
     found = {}
     for name, column in pd.DataFrame(rows).items():
         if isinstance(column.iloc[0], list):
@@ -87,7 +87,7 @@ def columns_of(rows: Sequence[Mapping[str, Any]], grids: dict[tuple[float, ...],
                 kept = [np.array(counts, np.int32) for counts in column]
             column = pd.Series(kept, dtype=object)
         elif column.dtype == object and column.map(lambda value: isinstance(value, str)).any():
-            # texts of all records that are alike are one in memory
+            # equal texts of all records share one object in memory
             column = column.map(lambda value: intern(value) if isinstance(value, str) else value)
         elif column.dtype == object:
             column = column.astype(float)
@@ -96,7 +96,7 @@ def columns_of(rows: Sequence[Mapping[str, Any]], grids: dict[tuple[float, ...],
 
 
 def _probes(rows: list[dict[str, Any]]) -> pd.DataFrame:
-    """Mean error and temporal deviation of each probe over hole-free repeats, less each repeat's own displacement."""
+    """Return each probe's mean error and temporal deviation over hole-free repeats, without repeats' displacements."""
     grouped: dict[tuple[str, int], list[np.ndarray]] = {}
     for row in sorted(rows, key=lambda row: (row["variant"], row["frames"], row["repeat"])):
         grouped.setdefault((row["variant"], row["frames"]), []).append(row["error_tenth_um"])
@@ -126,7 +126,7 @@ def _probes(rows: list[dict[str, Any]]) -> pd.DataFrame:
 
 
 def _variants(experiment: Experiment) -> pd.DataFrame:
-    """The changes of each set-up and variation, their reasons, and their places on the axes."""
+    """Return the changes of each set-up and variation, their reasons, and their values on the axes."""
     paths = list(experiment.points[0].axes)
     seen: dict[str, dict[str, Any]] = {}
     for point in experiment.points:
@@ -153,7 +153,7 @@ def _variants(experiment: Experiment) -> pd.DataFrame:
 
 
 def _reason(experiment: Experiment, point: Point) -> str:
-    """The reason that the experiment's file gives for a variation; empty for its set-ups."""
+    """Return the reason that the experiment's file gives for a variation; empty for set-ups."""
     study = experiment.config.sensitivity
     changed = set(point.values) - {FRAMES}
     for variation in study.vary if study is not None and point.is_variation else ():
@@ -167,7 +167,7 @@ def _reason(experiment: Experiment, point: Point) -> str:
 
 
 def write_tables(folder: Path, tables: Mapping[Table, pd.DataFrame], provenance: Mapping[str, Any]) -> None:
-    """Write tables, with what names the run in the schema of every Parquet file."""
+    """Write tables; the schema of every Parquet file identifies the run."""
     keys = ("results_version", "experiment", "digest", "seed", "commit", "dirty", "versions")
     for table, frame in tables.items():
         write_table(folder, table, frame, {key: provenance[key] for key in keys})

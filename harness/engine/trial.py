@@ -1,8 +1,7 @@
-"""One trial: frames of one set-up, their averages, the maps made of them, every detector that asked for them, measured
-against the truth.
+"""One trial: simulate the frames of a set-up, average them, merge views into maps, and run the detectors on the result.
 
-Averages are drawn at once where that is equal in distribution (plain means of `FEWEST_FRAMES` frames and more, where
-the camera's model can). Frames that jump are left out by their displacement, which is known exactly here."""
+Averages are drawn at once if that gives the same distribution (plain means of `FEWEST_FRAMES` frames or more, if the
+camera's model supports it). Frames that jump are then left out by their displacement, which is known exactly."""
 
 from __future__ import annotations
 
@@ -37,10 +36,10 @@ from scenes.sensor.source import SimulatedCapture, SimulatedUnit
 from scenes.sensor.unit import FrameTotals
 
 FEWEST_FRAMES = 20
-"""Fewer frames cost less than sorting a view's pixels. By number only: no result hangs on what was sorted before."""
-FLAT_ALBEDO = 0.6  # of a flat field's plane: painted wood or paper, as the boards of the experiments
+"""Drawing fewer frames costs less than sorting a view's pixels. Results depend on the number only, not on the cost."""
+FLAT_ALBEDO = 0.6  # albedo of a flat field's plane: painted wood or paper, like the boards of the experiments
 MOST_DISTURBED = 0.5
-"""Share of `AverageConfig.disturbed_fraction` that pixels' own noise may disturb; it scatters by a thousandth."""
+"""Share of `AverageConfig.disturbed_fraction` that the pixels' own noise may disturb; it varies by a thousandth."""
 
 
 def averages_of(
@@ -50,9 +49,9 @@ def averages_of(
     exact: bool,
     flat_field: FlatFieldConfig | None = None,
 ) -> dict[int, Cloud]:
-    """Return averages of the first n frames of a capture for each n in ``counts``, equal in distribution to
-    `detectors.average.prefix_averages`, which is used (and raises) where ``exact`` or nothing else will do. Averages
-    drawn at once nest, and so do those drawn frame by frame. A ``flat_field`` is taken off."""
+    """Return the averages of the first n frames of a capture for each n in ``counts``. Their distribution is that of
+    `detectors.average.prefix_averages`, which is used (and may raise) if ``exact`` or if averages cannot be drawn at
+    once. Larger averages contain the frames of smaller ones drawn in the same way. A ``flat_field`` is subtracted."""
     many = sorted({n for n in counts if n >= FEWEST_FRAMES})
     clouds = _at_once(capture, many, config) if many and not exact and config.method == "mean" else {}
     rest = [n for n in counts if n not in clouds]
@@ -65,7 +64,7 @@ def averages_of(
 
 @lru_cache(maxsize=4)
 def flat_field_of(camera: CameraConfig, config: FlatFieldConfig, seed: int) -> FlatField:
-    """Return what a unit makes of a flat plane across its axis, kept. Raises UserError where no pixel has a range."""
+    """Return a unit's flat field, measured on a plane across its axis. Raises UserError where no pixel has a range."""
     facts = camera_of(camera)
     view = plane_view(facts, facts.nominal_lens.whole, config.distance_m, FLAT_ALBEDO)
     capture = SimulatedUnit(facts, camera, view).capture(config.frames, seed, "flat field")
@@ -74,11 +73,11 @@ def flat_field_of(camera: CameraConfig, config: FlatFieldConfig, seed: int) -> F
 
 
 def _at_once(capture: SimulatedCapture, counts: list[int], config: AverageConfig) -> dict[int, Cloud]:
-    """The averages that can be drawn at once, of `REFERENCE_FRAMES` frames and more."""
+    """Return the averages that can be drawn at once."""
     summer = capture.unit.at_once
     if summer is None or counts[-1] > capture.n_frames or (config.judge_frames and not summer.sure_pixels):
         return {}
-    # one frame's noise as the judge finds it: with its rounding
+    # noise of one frame, with rounding, as `detectors.average` estimates it
     noise_m = float(np.hypot(summer.noise_m, capture.z_step_m / np.sqrt(12)))
     left_out = _left_out(capture, summer, config, noise_m) if config.judge_frames else {}
     sums: FrameTotals | None = None
@@ -96,7 +95,7 @@ def _at_once(capture: SimulatedCapture, counts: list[int], config: AverageConfig
 
 
 def _left_out(capture: SimulatedCapture, summer: AtOnce, config: AverageConfig, noise_m: float) -> dict[int, LeftOut]:
-    """The frames, by number, left out for a jump as it is; the judge's error, a sixth of the limit, is not drawn."""
+    """Return the frames, by number, that jump. The estimate's error, a sixth of the limit, is not simulated."""
     sampled = summer.sure_pixels / -(-summer.sure_pixels // SAMPLED_PIXELS)
     error_m = 1.2533 * noise_m * np.sqrt(2.0 * CORRELATED_PIXELS / max(sampled, CORRELATED_PIXELS))
     limit_m = max(config.jump_sigmas * error_m, config.jump_mm * MM)
@@ -109,20 +108,20 @@ def _left_out(capture: SimulatedCapture, summer: AtOnce, config: AverageConfig, 
 
 
 def _disturbed(cloud: Cloud, noise_m: float, config: AverageConfig) -> bool:
-    """Return whether frames may be left out because many of their pixels lose their range or change."""
+    """Return whether so many pixels lose their range or change that frames may be left out."""
     judged = 2 * cloud.count > cloud.n_frames
     if not judged.any():
         return True
     change_m = max(config.changed_sigmas * noise_m, config.changed_mm * MM)
     lost = 1 - cloud.count[judged].mean() / cloud.n_frames
-    # below a quarter of the change, 6 in 100,000 do
+    # of pixels with less than a quarter of the change, 6 in 100,000 change
     loud = judged & (cloud.variance_m2 > (change_m / 4) ** 2)
     changed = special.erfc(change_m / np.sqrt(2 * cloud.variance_m2[loud])).sum() / judged.sum()
     return bool(lost + changed > MOST_DISTURBED * config.disturbed_fraction)
 
 
 def _cloud(capture: SimulatedCapture, totals: FrameTotals, left_out: tuple[LeftOut, ...]) -> Cloud | None:
-    """The average that the sums make, as `detectors.average` makes it; None where no pixel has a range."""
+    """Return the average from sums over frames, as `detectors.average` computes it; None where no pixel has a range."""
     count = totals.count
     if not count.any():
         return None
@@ -147,13 +146,13 @@ def _cloud(capture: SimulatedCapture, totals: FrameTotals, left_out: tuple[LeftO
     )
 
 
-Clouds = Mapping[int, Cloud]  # one view's averages by number of frames
-BOARD_STEPS = 9  # places along each side of the board at which a registration's error is taken
+Clouds = Mapping[int, Cloud]  # averages of one view, by number of frames
+BOARD_STEPS = 9  # points along each side of the board where a registration's error is evaluated
 
 
 class MapMaker:
-    """Maps of one trial: ``clouds`` by view, then frames. ``poses``: the views' declaration; ``labels`` of the trial's
-    random errors of the poses. ``truth``, ``guesses``: T_reference_view."""
+    """Makes the maps of one trial. ``clouds``: by view, then by number of frames. ``poses``: declaration of the views.
+    ``labels``: of the random stream of the poses' errors. ``truth``, ``guesses``: T_reference_view of each view."""
 
     def __init__(
         self, set_ups: Sequence[SetUp], clouds: Sequence[Clouds], poses: AnyViews, labels: Sequence[str | int]
@@ -174,7 +173,7 @@ class MapMaker:
         return canonical_json([self._registration_key(mapping, frames), mapping.merge.to_data()])
 
     def known(self, mapping: MappingConfig, frames: int, *, hole_free: bool) -> KnownCloud:
-        """Return the map with the truth on it."""
+        """Return the map together with the truth."""
         merged = self.merged(mapping, frames)
         return known_map(self._set_ups[0], merged.cloud, merged.T_reference_cloud, hole_free=hole_free)
 
@@ -186,7 +185,7 @@ class MapMaker:
         return cast("Merged", self._made[key])
 
     def prepared(self, mapping: MappingConfig, frames: int, count: int | None = None) -> tuple[PreparedView, ...]:
-        """Return the views with their targets cut out and their marks found."""
+        """Return the views with their target cut out and their marks found."""
         keys = []
         for number in range(self.count(mapping) if count is None else count):
             keys.append(canonical_json([number, frames, mapping.crop.to_data(), mapping.marks.to_data()]))
@@ -196,7 +195,7 @@ class MapMaker:
         return tuple(self._made[key] for key in keys)
 
     def registrations(self, mapping: MappingConfig, frames: int) -> tuple[Registration, ...]:
-        """Return a registration for each view."""
+        """Return the registration of each view."""
         count, key = self.count(mapping), self._registration_key(mapping, frames)
         if mapping.registration.method in PAIRWISE:
             most = sum(frames in clouds for clouds in self._clouds)
@@ -207,7 +206,7 @@ class MapMaker:
         return tuple(self._made[key][: self.count(mapping)])
 
     def registration_rows(self, mapping: MappingConfig, frames: int) -> list[dict[str, Any]]:
-        """Return a row for each view but the first, once for each registration (columns: `REGISTRATIONS`)."""
+        """Return a row for each view but the first (columns: `REGISTRATIONS`), once for each registration."""
         key = self._registration_key(mapping, frames)
         if key in self._told or self.count(mapping) == 1:
             return []
@@ -216,7 +215,7 @@ class MapMaker:
         return [self._row(number, view, registration) for number, (view, registration) in enumerate(found) if number]
 
     def seconds(self, mapping: MappingConfig, frames: int) -> float:
-        """Return the seconds that registering and merging took, whether for this point or for one that shares it."""
+        """Return the seconds that registration and merging took, even if another point shares them."""
         spent = sum(registration.seconds for registration in self.registrations(mapping, frames))
         return float(spent + self.merged(mapping, frames).seconds)
 
@@ -234,10 +233,10 @@ class MapMaker:
         both = (registration.T_reference_view, self.guesses[number])
         (in_plane, across), guessed = (registration_error_m(T, self.truth[number], places_m, normal) for T in both)
         predicted = predicted_error_m(registration, places_m, normal)
-        told = ("method", "overlap", "pairs", "iterations", "converged", "seconds", "failure")
+        columns = ("method", "overlap", "pairs", "iterations", "converged", "seconds", "failure")
         return {
             "view": number,
-            **{name: getattr(registration, name) for name in told},
+            **{name: getattr(registration, name) for name in columns},
             "tre_mm": float(np.hypot(in_plane, across)) / MM,
             "tre_in_plane_mm": in_plane / MM,
             "tre_across_mm": across / MM,
@@ -252,9 +251,9 @@ class MapMaker:
 def registration_error_m(
     T_reference_view: np.ndarray, true_T_reference_view: np.ndarray, points_m: np.ndarray, normal: np.ndarray
 ) -> tuple[float, float]:
-    """Return the root mean square target registration error against the true poses over points (n, 3) of the reference
-    frame, metres: in the plane across ``normal`` (3,), and along it (Fitzpatrick, West and Maurer 1998). An error that
-    a whole view shares counts: of a camera that ranges d too far, under an angle a, d sin(a) in the plane."""
+    """Return the root mean square target registration error over points (n, 3) of the reference frame, in metres: in
+    the plane perpendicular to ``normal`` (3,), and along ``normal`` (Fitzpatrick, West and Maurer 1998). An error that
+    a whole view shares counts too: a camera that ranges d too far at an angle a adds d sin(a) in the plane."""
     moved = transform_points(T_reference_view @ invert(true_T_reference_view), points_m) - points_m
     across = moved @ normal
     in_plane = np.linalg.norm(moved - across[:, None] * normal, axis=-1)
@@ -262,15 +261,15 @@ def registration_error_m(
 
 
 Role = Literal["learning", "calibration", "hole_free", "damaged"]
-"""Purpose of a trial's target: to learn on, to set a threshold (in a study only), to count false calls, to be found."""
+"""Purpose of a board: to learn from, to set a threshold (only in a study), to count false calls, or to be inspected."""
 TABLES = ("runs", "holes", "probes", "noise", "registrations", *STUDY_TABLES)
-LAGS = (1, 2, 3)  # distances in pixels at which the noise's correlation is taken
-FEWEST_PAIRS = 50  # pairs of pixels below which a correlation is not told: its standard error would exceed 0.14
+LAGS = (1, 2, 3)  # distances in pixels for the correlation of noise
+FEWEST_PAIRS = 50  # fewest pairs of pixels for a correlation; with fewer, its standard error would exceed 0.14
 
 
 @dataclass(frozen=True)
 class PointTask:
-    """A point's demands. ``threshold`` None: being calibrated. ``learned``: file of what its detector learned."""
+    """A point's part of a trial. ``threshold``: None in calibration. ``learned``: file of what its detector learned."""
 
     digest: str
     variant: str
@@ -289,7 +288,7 @@ class PointTask:
 
 @dataclass(frozen=True)
 class TrialTask:
-    """Frames of one set-up, drawn once, judged by points that share them. ``board``: its number in a study."""
+    """Frames of one set-up, drawn once and judged by all points that share them. ``board``: its number in a study."""
 
     set_ups: tuple[SetUpRef, ...]
     seed: int
@@ -306,18 +305,18 @@ class TrialTask:
 
     @property
     def labels(self) -> tuple[str | int, ...]:
-        """Labels that separate the random streams of trials, and of a study's boards."""
+        """Labels of the random stream: different for all trials and boards."""
         return (self.role, self.repeat) if self.board is None else (self.role, self.repeat, "board", self.board)
 
 
 def run_trial(task: TrialTask) -> Rows:
-    """Run one trial; rows for the tables of `TABLES` (columns: `harness.engine.tables`)."""
+    """Run one trial. Return rows by table, as in `TABLES` (columns: `harness.engine.tables`)."""
     set_ups = [load_set_up(ref) for ref in task.set_ups]
     record: Rows = {name: [] for name in TABLES}
     by_average: dict[str, list[PointTask]] = {}
     for point in task.points:
-        asked = [point.average.to_data(), point.exact, point.flat_field and point.flat_field.to_data()]
-        by_average.setdefault(canonical_json(asked), []).append(point)
+        averaging = [point.average.to_data(), point.exact, point.flat_field and point.flat_field.to_data()]
+        by_average.setdefault(canonical_json(averaging), []).append(point)
     for points in by_average.values():
         began = time.perf_counter()
         clouds = [_clouds(set_up, number, task, points) for number, set_up in enumerate(set_ups)]
@@ -343,7 +342,7 @@ def cloud_of(task: TrialTask, point: PointTask) -> Cloud:
 
 
 def _clouds(set_up: SetUp, number: int, task: TrialTask, points: Sequence[PointTask]) -> dict[int, Cloud]:
-    """One view's averages, of as many frames as the points that use this view ask for."""
+    """Return the averages of one view at all numbers of frames of the points that use it."""
     views = [None if point.mapping is None else point.mapping.views for point in points]
     counts = sorted({point.frames for point, n in zip(points, views, strict=True) if n is None or number < n})
     if not counts:
@@ -353,7 +352,7 @@ def _clouds(set_up: SetUp, number: int, task: TrialTask, points: Sequence[PointT
 
 
 def capture_of(set_up: SetUp, number: int, task: TrialTask, frames: int) -> SimulatedCapture:
-    """Return the frames of one view in one trial. The first view's are those of an experiment that has no other."""
+    """Return the frames of one view in one trial. Those of the first view are the same without other views."""
     return set_up.unit.capture(frames, task.seed, *task.labels, *(("view", number) if number else ()))
 
 
@@ -366,7 +365,7 @@ def _point_rows(
     done: dict[str, Rows],
     seconds: dict[str, float],
 ) -> Rows:
-    """The rows of one point, by table. ``done``: rows of points that came to the same."""
+    """Return the rows of one point, by table. ``done``: rows of earlier points, reused if their inputs are the same."""
     common: dict[str, Any] = {"variant": point.variant, "frames": point.frames, "repeat": task.repeat}
     if task.board is not None:
         common["board"] = task.board
@@ -382,8 +381,8 @@ def _point_rows(
         of_map = {"views_used": used, "views_left_out": maps.count(mapping) - used}
         of_map["seconds_map"] = maps.seconds(mapping, point.frames)
         source = maps.key(mapping, point.frames)
-    asked = (point.detector, point.settings_json, point.threshold, point.radius_m)
-    key = canonical_json([source, *asked, point.learned, point.overlap])
+    judging = (point.detector, point.settings_json, point.threshold, point.radius_m)
+    key = canonical_json([source, *judging, point.learned, point.overlap])
     if key not in done:
         if maps is None or mapping is None:
             known = known_view(first, views[point.frames], hole_free=task.hole_free)
@@ -393,7 +392,7 @@ def _point_rows(
                 errors_m = face_errors_m(known, first.board_xy_m.reshape(-1, 2)[first.probes])
                 probes = [{"error_tenth_um": _tenth_um(errors_m)}]
         began = time.perf_counter()
-        judged = judge(known, *asked, overlap=point.overlap, hole_free=task.hole_free, learned=point.learned)
+        judged = judge(known, *judging, overlap=point.overlap, hole_free=task.hole_free, learned=point.learned)
         judged.run["seconds_detect"] = time.perf_counter() - began
         if task.board is None:
             done[key] = {"runs": [judged.run], "holes": judged.holes, "probes": probes}
@@ -409,7 +408,7 @@ def _point_rows(
 
 
 def _board_rows(task: TrialTask, set_up: SetUp, clouds: dict[int, Cloud], points: Sequence[PointTask]) -> Rows:
-    """Rows by variant and number of frames: "probes", errors of z; "noise", as in `tables.trials.NOISE`."""
+    """Return rows by variant and number of frames: "probes", errors of z; "noise", as in `tables.trials.NOISE`."""
     pair = [frame.z_m for frame in islice(capture_of(set_up, 0, task, 2).frames(), 2)]
     noise = pair_noise(pair[0], pair[-1], set_up.bare)
     rows: Rows = {"probes": [], "noise": []}
@@ -425,13 +424,13 @@ def _board_rows(task: TrialTask, set_up: SetUp, clouds: dict[int, Cloud], points
 
 
 def _tenth_um(errors_m: np.ndarray) -> list[int | None]:
-    """Errors as whole tenths of a micrometre, for records that stay small."""
+    """Return errors in whole tenths of a micrometre, which keep records small."""
     return [round(float(error) * 1e7) if np.isfinite(error) else None for error in errors_m]
 
 
 def pair_noise(first_z_m: np.ndarray, second_z_m: np.ndarray, where: np.ndarray) -> dict[str, float]:
-    """Return the standard deviation of one frame's temporal noise and its correlations from two frames' z (h, w),
-    metres, less the median difference. Pixels ``where`` (h, w) both are valid count; NaN where they are too few."""
+    """Return the standard deviation of one frame's temporal noise and its correlations, from two frames' z (h, w) in
+    metres without their median difference. Only valid pixels in ``where`` (h, w) count; NaN if there are too few."""
     difference = (first_z_m.astype(float) - second_z_m.astype(float)) / np.sqrt(2)
     there = where & np.isfinite(difference)
     if there.sum() < FEWEST_PAIRS:

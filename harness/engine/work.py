@@ -1,5 +1,5 @@
-"""The interface between plans and engines: jobs go in, and each comes back exactly once with how it
-ended; one part of a sweep (`--shard 3/10`); and the options of every program that runs an experiment."""
+"""The interface between plans and engines: every submitted job comes back exactly once, with how it ended. Also shards
+(`--shard 3/10`), and the options of all programs that run experiments."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
     from harness.report.clouds import ExampleCloud, MappedExample
 
 State = Literal["done", "failed", "crashed", "timed out", "skipped"]
-"""The ends of a job. Failed: it raised; crashed: its process died; skipped: what it needs is not there."""
+"""The ends of a job. Failed: it raised; crashed: its process died; skipped: something that it needs is missing."""
 STATES: tuple[State, ...] = get_args(State)
-Stage = Literal["renders", "trials"]  # renders load Mitsuba and some 2 GB; everything else runs where trials run
+Stage = Literal["renders", "trials"]  # renders load Mitsuba and need 2 GB; all other jobs run as trials
 Code = tuple[tuple[str, ...], tuple[str, ...]]  # modules and packages: the arguments of `source_digest`
 TRACEBACK_CHARACTERS = 4000
 
 
 @dataclass(frozen=True)
 class Job:
-    """``function(*arguments)``, importable by its name; arguments and result are plain data or frozen dataclasses."""
+    """``function(*arguments)``, an importable function; arguments and result are plain data or frozen dataclasses."""
 
     name: str
     stage: Stage
@@ -43,8 +43,8 @@ class Job:
 
 @dataclass(frozen=True)
 class Ended:
-    """The end of a job. ``value``: its result, of a trial the text of its record. ``why``: a user's mistake, or the end
-    of a bug's traceback. ``peak_mb``: resident memory at most, 0 where unknown. ``ends_all``: the disk is full."""
+    """The end of a job. ``value``: its result; of a trial, its record as text. ``why``: a user's mistake, or the end of
+    a bug's traceback. ``peak_mb``: peak resident memory, 0 if unknown. ``ends_all``: the disk is full."""
 
     state: State
     value: Any = None
@@ -57,29 +57,29 @@ class Ended:
 
     @cached_property
     def record(self) -> dict[str, Any] | None:
-        """Rows by table of a trial that is done."""
+        """Rows of a finished trial, by table."""
         return None if self.value is None else json.loads(self.value)
 
 
 class JobEngine(Protocol):
-    """An engine that runs jobs. Used as a context: left by an exception it drops its jobs within two seconds."""
+    """An engine that runs jobs. As a context manager, it drops its jobs within two seconds of an exception."""
 
     def __enter__(self) -> JobEngine: ...
     def __exit__(self, *error: object) -> None: ...
 
     def room(self, stage: Stage) -> int:
-        """Number of further jobs of a stage that it can use now: its queue stays short, whatever the plan's size."""
+        """Return how many more jobs of a stage the engine can use; its queue stays short, whatever the plan's size."""
 
     def submit(self, job: Job) -> None:
         """Take a job."""
 
     def ended(self) -> list[tuple[Job, Ended]]:
-        """Wait for jobs to end; at least one. Raises UserError where the engine itself is gone."""
+        """Wait until at least one job has ended; return those that have. Raises UserError if the engine is gone."""
 
 
 @dataclass(frozen=True)
 class Failure:
-    """A trial, a render or a threshold that did not end well; fields as of `Ended`."""
+    """A trial, render or threshold that did not succeed; fields as in `Ended`."""
 
     what: str
     why: str
@@ -88,14 +88,14 @@ class Failure:
 
     @property
     def in_short(self) -> str:
-        """One line: of a bug the last of its traceback, otherwise the first of the message."""
+        """The last line of a bug's traceback, or else the first line of the message."""
         lines = self.why.strip().splitlines() or [self.state]
         return lines[-1] if self.is_bug else lines[0]
 
 
 @dataclass
 class StageCounts:
-    """Counts of renders or trials: ``done`` in this run, ``found`` finished before it, ``failed``, of ``total``."""
+    """Numbers of renders or trials: ``done`` in this run, ``found`` finished earlier, ``failed``, and in ``total``."""
 
     done: int = 0
     found: int = 0
@@ -105,13 +105,13 @@ class StageCounts:
 
     @property
     def over(self) -> int:
-        """The number that need no more work."""
+        """Number of those that need no more work."""
         return self.done + self.found + self.failed
 
 
 @dataclass
 class Outcome:
-    """The result of a run. ``finished``: journal keys of the trials that are done; ``failures``: the rest, by name."""
+    """The result of a run. ``finished``: journal keys of the finished trials; ``failures``: all others, by name."""
 
     finished: list[str] = field(default_factory=list)
     failures: list[Failure] = field(default_factory=list)
@@ -131,8 +131,8 @@ class Limits:
 
 
 def attempt(job: Job, worker: str) -> Ended:
-    """Run a job here; an exception becomes its end. The engine has to notice if the process dies."""
-    with contextlib.suppress(OSError):  # count the peak of memory anew (Linux)
+    """Run a job in this process; an exception becomes its end. If the process dies, the engine has to notice."""
+    with contextlib.suppress(OSError):  # reset the peak of memory (Linux)
         Path("/proc/self/clear_refs").write_text("5")
     began = time.monotonic()
     state: State = "failed"
@@ -164,8 +164,8 @@ LOCK = ".lock"
 
 @dataclass(frozen=True)
 class Shard:
-    """Part ``number`` of ``count``, from 1: a contiguous part of a plan's judged trials, and the hole-free trials that
-    set its thresholds, beginning at a place of its own, so that shards with a common folder share them."""
+    """Part ``number`` (from 1) of ``count``: a contiguous part of a plan's judged trials, and all hole-free trials that
+    set its thresholds. Each shard begins these at a different place, so that shards in one folder share them."""
 
     number: int = 1
     count: int = 1
@@ -192,7 +192,7 @@ class Shard:
         return range((self.number - 1) * total // self.count, self.number * total // self.count)
 
     def rotated(self, things: Sequence[T]) -> list[T]:
-        """Return all items, beginning at this shard's own place."""
+        """Return all items, beginning at this shard's own starting point."""
         start = self.part(len(things)).start
         return [*things[start:], *things[:start]]
 
@@ -202,8 +202,8 @@ WHOLE = Shard()
 
 @contextlib.contextmanager
 def locked(folder: Path, shard: Shard = WHOLE) -> Iterator[None]:
-    """Hold a folder that exists: a whole sweep alone, shards together, but each part is run once at a time. Raises
-    UserError where another process holds it; systems without locks hold nothing, and a line on stderr says so."""
+    """Lock an existing folder: for a whole sweep exclusively, for shards together, but only once for each shard. Raises
+    UserError if another process holds it. Systems without locks continue, with a warning on stderr."""
     with _held(folder / LOCK, shared=not shard.is_whole):
         if shard.is_whole:
             yield
@@ -217,8 +217,8 @@ def _held(path: Path, *, shared: bool) -> Iterator[None]:
     with opened_lock(path) as file:
         answer = lock(file, shared=shared, wait=False)
         if answer == "busy":
-            said = f"{path.parent}: another sweep is running in this folder"
-            raise UserError(said, fix="wait for it, or name another folder with --out")
+            what = f"{path.parent}: another sweep is running in this folder"
+            raise UserError(what, fix="wait for it, or name another folder with --out")
         if answer == "no locks":
             print(f"{path.parent}: cannot be locked on this system: do not start a second sweep in it", file=sys.stderr)
         yield
@@ -227,13 +227,13 @@ def _held(path: Path, *, shared: bool) -> Iterator[None]:
 # ---------------------------------------------------------------- options
 
 
-DEFAULT_LIMITS = Limits(seconds=900.0, memory_mb=4000)  # a trial takes seconds and 300 MB; maps of many views 2 GB
-LEAST_MEMORY_GB = 0.5  # a process that has loaded what trials need holds 0.2 GB
+DEFAULT_LIMITS = Limits(seconds=900.0, memory_mb=4000)  # a trial needs seconds and 300 MB; maps of many views need 2 GB
+LEAST_MEMORY_GB = 0.5  # a process that has loaded the code of trials needs 0.2 GB
 
 
 @dataclass(frozen=True)
 class EngineOptions:
-    """``jobs``: processes, or workers of a cluster. ``scheduler`` None: this machine; ``serial``: this process."""
+    """``jobs``: processes, or a cluster's workers. ``scheduler`` None: this machine. ``serial``: in this process."""
 
     jobs: int = 2
     limits: Limits = DEFAULT_LIMITS
@@ -245,7 +245,7 @@ class EngineOptions:
 
 
 def engine_of(options: EngineOptions, detectors: Iterable[str] = (), folder: Path = Path()) -> JobEngine:
-    """Return the engine, not yet begun, for trials of ``detectors``; ``folder``: of renders. Raises UserError."""
+    """Return the engine, not yet started, for trials of ``detectors``. ``folder``: of renders. Raises UserError."""
     from harness.engine.processes import LocalEngine, SerialEngine
 
     if options.serial:
@@ -258,7 +258,7 @@ def engine_of(options: EngineOptions, detectors: Iterable[str] = (), folder: Pat
 
 
 def code_of(detectors: Iterable[str]) -> dict[Stage, Code]:
-    """Return the code that decides the numbers of each stage, for trials of these ``detectors``."""
+    """Return the code that determines the results of each stage, for trials of these ``detectors``."""
     from harness.engine.plan import PACKAGES, trial_code
     from scenes.render import cache
 
@@ -267,7 +267,7 @@ def code_of(detectors: Iterable[str]) -> dict[Stage, Code]:
 
 
 def add_engine_options(parser: argparse.ArgumentParser) -> None:
-    """Add these options, in a group of their own."""
+    """Add these options to a parser, in their own group."""
     add = parser.add_argument_group("execution").add_argument
     processes = "processes, or workers of a cluster (default: 2)"
     add("--jobs", type=whole_number(4096), default=2, metavar="N", help=processes)
@@ -285,13 +285,13 @@ def add_engine_options(parser: argparse.ArgumentParser) -> None:
 
 
 def engine_options(options: argparse.Namespace) -> EngineOptions:
-    """Return the options that were given. Raises UserError where they contradict each other."""
+    """Return the options that were given. Raises UserError if they contradict each other."""
     if options.serial and options.scheduler is not None:
         raise UserError("--serial and --scheduler: ask for different engines", fix="leave one of them out")
     if options.memory_limit < LEAST_MEMORY_GB:
         legal = f"{LEAST_MEMORY_GB:g} GB or more; 1 GB is enough for most trials"
-        said = f"--memory-limit {options.memory_limit:g}: a process needs more than that to start"
-        raise UserError(said, legal=legal)
+        what = f"--memory-limit {options.memory_limit:g}: a process needs more than that to start"
+        raise UserError(what, legal=legal)
     limits = Limits(options.time_limit, round(1000 * options.memory_limit))
     shard = WHOLE if options.shard is None else Shard.of(options.shard)
     where = (options.scheduler, options.serial, shard, options.retry_failed, options.cache_limit)

@@ -187,9 +187,9 @@ def threshold_for_rate(
     # The margin is for rounding where (n + 1) * wanted is a whole number.
     k = min(int(np.floor((n + 1) * wanted * (1 + 1e-12))) - 1, n - 1)
     if k < 0:
-        said = f"{n} hole-free runs of {area_m2:.2g} m² are too few for a rate of {rate_per_m2:g} per m² of false calls"
+        what = f"{n} hole-free runs of {area_m2:.2g} m² are too few for a rate of {rate_per_m2:g} per m² of false calls"
         fix = "simulate more hole-free boards, or ask for a higher rate"
-        raise UserError(said, legal=f"at least {int(np.ceil(1 / wanted * (1 - 1e-12))) - 1} runs", fix=fix)
+        raise UserError(what, legal=f"at least {int(np.ceil(1 / wanted * (1 - 1e-12))) - 1} runs", fix=fix)
     value = float(np.sort(scores)[n - 1 - k])
     above = int(np.sum(scores > value))
     bound = float(special.betaincinv(above + 1, n - above, confidence))

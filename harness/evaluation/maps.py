@@ -66,8 +66,8 @@ def maps_of(tables: ResultTables) -> list[MapSetUp]:
         named = [row.get(axis) for axis in (REGISTRATION, MERGE)]
         ways = [name if isinstance(name, str) and name != "null" else "" for name in named]
         place = ", ".join(value_text(path, row[path]) for path in others)
-        told = place, bool(row["is_variation"]), str(row["reference"])
-        found.append(MapSetUp(str(row["variant"]), views(row), ways[0], ways[1], *told))
+        facts = place, bool(row["is_variation"]), str(row["reference"])
+        found.append(MapSetUp(str(row["variant"]), views(row), ways[0], ways[1], *facts))
     return found
 
 
@@ -80,10 +80,10 @@ def compare_maps(tables: ResultTables, summary: pd.DataFrame) -> pd.DataFrame:
     compared = compare_set_ups(tables, summary, [str(name) for name in maps["variant"]], half_sizes=False)
     if compared.empty:
         return compared
-    told = {"views_left_out": ("views_left_out", "mean"), "seconds_map": ("seconds_map", "median")}
-    told |= {"surface_std_mm": ("surface_noise_mm", "std")}
+    columns = {"views_left_out": ("views_left_out", "mean"), "seconds_map": ("seconds_map", "median")}
+    columns |= {"surface_std_mm": ("surface_noise_mm", "std")}
     damaged = tables.runs[tables.runs["role"] == "damaged"]
-    means = damaged.groupby(["variant", "frames"], as_index=False).agg(**told)
+    means = damaged.groupby(["variant", "frames"], as_index=False).agg(**columns)
     return compared.merge(maps, "left", "variant").merge(means, "left", ["variant", "frames"])
 
 

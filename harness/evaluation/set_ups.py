@@ -184,14 +184,14 @@ def effect_costs(tables: ResultTables) -> pd.DataFrame:
         by_switches = {frozenset(name for name, is_on in of.items() if is_on): name for name, of in switches.items()}
         everything = max(by_switches, key=len)
         effects = [(name.replace("_", " "), frozenset([name])) for name in switches[by_switches[everything]]]
-        asked = [(effect, "nothing", nothing, one) for effect, one in effects]
-        asked += [(effect, "all others", everything - one, everything) for effect, one in effects]
-        asked.append(("all", "nothing", nothing, everything))
+        wanted = [(effect, "nothing", nothing, one) for effect, one in effects]
+        wanted += [(effect, "all others", everything - one, everything) for effect, one in effects]
+        wanted.append(("all", "nothing", nothing, everything))
         holes = tables.holes[tables.holes["variant"].isin(by_switches.values())]
         for frames, rows in holes.groupby("frames"):
             there = {str(name): ladder_of(part) for name, part in rows.groupby("variant")}
             ladders = {on: there[variant] for on, variant in by_switches.items() if variant in there}
-            for effect, against, off, on in asked:
+            for effect, against, off, on in wanted:
                 if cost := _cost(ladders, off, on):
                     found.append({"place": place, "frames": frames, "effect": effect, "against": against, **cost})
     return EFFECTS.frame(found)

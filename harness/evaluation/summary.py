@@ -119,11 +119,11 @@ def _fitted(holes: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
     """Depth, which only the model gives, and the standard errors that each fit states, compared with the truth."""
     miss = (holes["model_diameter_mm"] - holes["true_diameter_mm"]).abs() / holes["model_diameter_se_mm"]
     covered = (miss <= 1.96).astype(float).where(miss.notna())
-    told = {"model_diameter_se_mean_mm": ("model_diameter_se_mm", "mean")}
-    told |= {"model_diameter_covered": ("covered", "mean")}
-    told |= {f"model_depth_{how}_mm": ("model_depth_mm", how) for how in ("mean", "std")}
-    told |= {"model_depth_se_mean_mm": ("model_depth_se_mm", "mean")}
-    out = holes.assign(covered=covered).groupby(GROUP, sort=False).agg(**told)
+    columns = {"model_diameter_se_mean_mm": ("model_diameter_se_mm", "mean")}
+    columns |= {"model_diameter_covered": ("covered", "mean")}
+    columns |= {f"model_depth_{how}_mm": ("model_depth_mm", how) for how in ("mean", "std")}
+    columns |= {"model_depth_se_mean_mm": ("model_depth_se_mm", "mean")}
+    out = holes.assign(covered=covered).groupby(GROUP, sort=False).agg(**columns)
     out["model_depth_bias_mm"] = out["model_depth_mean_mm"] - truth["seen_depth_mm"]
     return out
 

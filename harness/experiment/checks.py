@@ -109,9 +109,9 @@ def _target_problems(config: ExperimentConfig, simulated: SimulatedSource, sourc
     apart_mm = [dist(a.centre_mm, b.centre_mm) for a, b in combinations(target.damages, 2)]
     pitch_mm = drawn.apart_mm if drawn is not None else min(apart_mm, default=None)
     if pitch_mm is not None and config.matching.radius_mm > pitch_mm / 2:
-        said = f"a matching radius of {config.matching.radius_mm:g} mm lets a detection count for either of two damages"
+        what = f"a matching radius of {config.matching.radius_mm:g} mm lets a detection count for either of two damages"
         legal = f"at most {pitch_mm / 2:g} mm for damages whose centres are {pitch_mm:g} mm apart"
-        yield Problem(said, source.place_of(("matching", "radius_mm")), legal=legal)
+        yield Problem(what, source.place_of(("matching", "radius_mm")), legal=legal)
 
 
 @lru_cache(maxsize=10_000)

@@ -116,6 +116,6 @@ def lens_numbers(recording: Path, cameras: Iterable[str]) -> dict[str, Any]:
         if (nominal.width, nominal.height) != (lens.width, lens.height):
             legal = f"{nominal.width} x {nominal.height}, as {name} has"
             fix = "name a recording of the same camera in the same mode, or choose another source.camera.name"
-            said = f"{recording}: the calibration is for {lens.width} x {lens.height} pixels"
-            raise UserError(said, legal=legal, fix=fix)
+            what = f"{recording}: the calibration is for {lens.width} x {lens.height} pixels"
+            raise UserError(what, legal=legal, fix=fix)
     return numbers_of_lens(lens)

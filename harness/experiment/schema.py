@@ -1,8 +1,8 @@
-"""The keys of an experiment's YAML, and its points: what decides their numbers, and the digests that name them.
+"""The keys of an experiment's YAML, and its points: the values that determine their results, and their digests.
 
-Ranges of single fields are here; what concerns several together is in `checks`. A digest covers content that can change
-a number and nothing else: not the name, the number of repeats, or the other points. So adding a value to an
-axis leaves every other point, its seeds and its finished trials as they were."""
+Ranges of single fields are here; conditions on several fields are in `checks`. A digest covers only content that can
+change a number: not the name, the number of repeats or the other points. So a new value on an axis leaves all other
+points, their seeds and their finished trials unchanged."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ Repeats = Annotated[int, Field(ge=1, le=MAX_REPEATS)]
 Frames = Annotated[int, Field(ge=1, le=MAX_FRAMES)]
 Boards = Annotated[int, Field(ge=1, le=MAX_BOARDS)]
 ListAsTuple = BeforeValidator(lambda values: tuple(values) if isinstance(values, list) else values)
-"""Strict mode takes no list for a tuple, and within a mapping nothing has made a tuple of it yet."""
+"""Strict mode rejects a list where a tuple is declared; `Config` converts lists, but not those within a mapping."""
 AxisValues = Annotated[tuple[Any, ...], Field(min_length=1, max_length=1000), ListAsTuple]
 DottedPath = Annotated[str, Field(min_length=1, max_length=200)]
 Label = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]{1,80}$", description="one line of at most 80 characters")]
@@ -52,54 +52,54 @@ StudyFrames = Annotated[tuple[Frames, ...], Field(min_length=1, max_length=100),
 
 
 class SimulatedSource(Config):
-    """Frames come from a simulated camera that looks at a declared target, from one place or from several ``views``."""
+    """Frames of a simulated camera that looks at a declared target, from one pose or from several ``views``."""
 
     kind: Literal["simulated"]
     target: AnyTargetConfig
     camera: CameraConfig = CameraConfig()
     render: RenderConfig = RenderConfig()
-    views: AnyViews | None = Field(None, discriminator="kind", description="none: the target's own pose only")
+    views: AnyViews | None = Field(None, discriminator="kind", description="several poses; null: the target's own")
 
 
 class CaptureSource(Config):
-    """Frames come from a real capture; see `detectors.recordings.open_capture`. Paths count from the YAML's folder."""
+    """Frames of a real capture; see `detectors.recordings.open_capture`. Paths are relative to the YAML's folder."""
 
     kind: Literal["capture"]
     paths: tuple[FileName, ...] = Field(
-        min_length=1, max_length=100_000, description="files or a folder of depth frames"
+        min_length=1, max_length=100_000, description="files of depth frames, or a folder"
     )
-    unit: str | None = Field(None, description="of stored depth, where the files do not say")
-    intrinsics: FileName | None = Field(None, description="a file with the lens, or a camera's name")
+    unit: str | None = Field(None, description="unit of the stored depth, where the files do not state it")
+    intrinsics: FileName | None = Field(None, description="a file of lens intrinsics, or a camera's name")
 
 
 class CaptureConfig(Config):
-    """Number of frames that are averaged, and the kind of average."""
+    """The number of frames that are averaged, and how."""
 
     frames: Frames
     average: AverageConfig = AverageConfig()
     flat_field: FlatFieldConfig | None = Field(
-        None, description="a plane that the unit is shown first: the pattern found there is taken off"
+        None, description="a plane captured first, whose fixed pattern is subtracted from every frame"
     )
     exact: bool = Field(
-        False, description="draw each simulated frame; false: a mean at once where that is equal in distribution"
+        False, description="true simulates each frame; false draws the mean where its distribution is the same"
     )
 
 
 class DetectorConfig(Config):
-    """A detector by name; its settings are its own declaration, checked with the rest."""
+    """The detector, by name, and its settings; each detector declares its own (below)."""
 
     name: str = "thesis"
     settings: dict[str, Any] = Field(default_factory=dict)
 
 
 class CalibrateConfig(Config):
-    """A threshold from hole-free runs: the lowest k that gives no false cluster in so many ``repeats`` of the same
-    set-up; or, in a study, the lowest with the wanted rate of false calls on so many ``boards`` of their own."""
+    """Calibration of the threshold on hole-free boards: the lowest k without a detection in ``repeats`` runs of the
+    same set-up or, in a study, the lowest k that meets the rate of false calls on ``boards`` extra boards."""
 
     repeats: Repeats | None = None
-    boards: Boards | None = Field(None, description="of a study: boards of their own, never judged")
+    boards: Boards | None = Field(None, description="of a study: extra boards for calibration only")
     false_calls_per_m2: Annotated[float, Field(gt=0, le=1e6)] | None = Field(
-        None, description=f"of a study: the rate that is wanted; none: {DEFAULT_RATE_PER_M2:g}"
+        None, description=f"of a study: the rate of false calls to meet; null: {DEFAULT_RATE_PER_M2:g}"
     )
 
     @model_validator(mode="before")
@@ -118,9 +118,9 @@ class CalibrateConfig(Config):
 
 
 class ThresholdConfig(Config):
-    """A threshold k that is given, or calibrated: one of the two."""
+    """The detector's threshold k, given or calibrated: one of the two."""
 
-    k: Annotated[float, Field(gt=0, le=1000)] | None = Field(None, description="in units of the detector's scale")
+    k: Annotated[float, Field(gt=0, le=1000)] | None = Field(None, description="in units of the detector's score")
     calibrate: CalibrateConfig | None = None
 
     @model_validator(mode="after")
@@ -131,76 +131,76 @@ class ThresholdConfig(Config):
 
 
 class MatchingConfig(Config):
-    """Rule by which a detection counts for a damage: the nearest centre within this radius on the face, one to one; of
-    long damage (slot, gouge, chip) the distance counts from its centre line."""
+    """The rule by which a detection counts as a hit: it is matched one to one with the nearest damage within a radius
+    on the face. The distance to long damage (slot, gouge, chip) is that to its centre line."""
 
     radius_mm: Annotated[float, Field(ge=0.5, le=1000)] = 15.0
     overlap: Annotated[float, Field(gt=0.0, le=1.0)] | None = Field(
         None,
-        description="share of a detection's pixels on the damage (outline grown by two pixels) from which on it counts "
-        "too, wherever its centre lies; further ones that lie so are parts of the damage, no false calls",
+        description="a detection is also a hit, wherever its centre lies, if at least this share of its pixels lies on "
+        "the damage (outline grown by two pixels); further such detections are parts of it and no false calls",
     )
 
 
 class ValuesVariation(Config):
-    """One key tried at other values, one at a time."""
+    """A variation: one key is set to each of the values in turn."""
 
     path: DottedPath
     values: AxisValues
     reason: Reason
-    frames: StudyFrames | None = Field(None, description="none: as the study's")
+    frames: StudyFrames | None = Field(None, description="numbers of frames; null: as in sensitivity.frames")
 
 
 class LabelledVariation(Config):
-    """Several keys changed together, under one label."""
+    """A variation: several keys change together, under one label."""
 
     label: Label
     set: Annotated[dict[DottedPath, Any], Field(min_length=1, max_length=50)]
     reason: Reason
-    frames: StudyFrames | None = Field(None, description="none: as the study's")
+    frames: StudyFrames | None = Field(None, description="numbers of frames; null: as in sensitivity.frames")
 
 
 class SensitivityConfig(Config):
-    """One-at-a-time variations of the experiment, each run at a few numbers of frames with fewer repeats."""
+    """Variations of the experiment, one at a time, each run at a few numbers of frames with fewer repeats."""
 
     repeats: Repeats
-    calibration_repeats: Repeats | None = Field(None, description="hole-free ones of a variation; null: as threshold")
+    calibration_repeats: Repeats | None = Field(None, description="hole-free runs; null: as in threshold")
     frames: StudyFrames
     vary: Annotated[tuple[ValuesVariation | LabelledVariation, ...], Field(min_length=1, max_length=500)]
 
 
 class StudyConfig(Config):
-    """A study of the probability of detection on random boards: ``boards`` with damage, and ``hole_free_boards`` on
-    which false calls are counted; every point is judged on the same, and ``repeats`` draw the noise anew on each.
-    ``units`` draws cameras with own patterns: every damaged board is inspected by all, every other by its own."""
+    """A study of the probability of detection on random boards: ``boards`` have damage, and false calls are counted on
+    ``hole_free_boards``. All set-ups inspect the same boards; ``repeats`` draw the noise anew on each. ``units`` are
+    cameras with different fixed patterns: all inspect each damaged board, and a different one each hole-free board."""
 
     boards: Boards
     hole_free_boards: Boards
     units: Annotated[int, Field(ge=2, le=1000)] | None = Field(
-        None, description="of the camera; none: one unit, source.camera.unit_seed, for which alone limits then hold"
+        None, description="number of units; null: only source.camera.unit_seed, and limits hold for that unit alone"
     )
 
 
 class ExperimentConfig(Config):
-    """One complete experiment, and the axes over which it is swept."""
+    """One experiment, and the axes over which it is swept."""
 
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$", description="it names a folder of results")
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$", description="the folder of its results, too")
     title: Annotated[str, Field(max_length=300)] = ""
-    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 1
+    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = Field(1, description="draws the noise")
     source: Annotated[SimulatedSource | CaptureSource, Field(discriminator="kind")]
     capture: CaptureConfig
     mapping: MappingConfig | None = Field(None, description="how several views become one cloud")
     detector: DetectorConfig = DetectorConfig()
     threshold: ThresholdConfig
     matching: MatchingConfig = MatchingConfig()
-    study: StudyConfig | None = Field(None, description="needs a family of boards, such as target: {name: drawn}")
-    repeats: Repeats = 1
+    study: StudyConfig | None = Field(None, description="needs a family of boards (target: {name: drawn})")
+    repeats: Repeats = Field(1, description="draws of the noise in each set-up")
     sweep: Annotated[dict[DottedPath, AxisValues], Field(max_length=20)] = Field(default_factory=dict)
     draws: Annotated[int, Field(ge=2, le=1000)] | None = Field(
-        None, description="of the sweep's set-ups so many are drawn at random, alike ones taken once; none: all are run"
+        None, description="runs so many set-ups of the sweep, drawn at random, alike ones once; null: runs all"
     )
     switches: DottedPath | None = Field(
-        None, description="a mapping of switches: a set-up with none on, with each alone, with all but each, with all"
+        None, description="path of a mapping of switches: runs none, each alone, all but each, and all of them on"
     )
     sensitivity: SensitivityConfig | None = None
 
@@ -216,7 +216,7 @@ DETECTOR_SETTINGS = ("detector", "settings")
 
 
 def splices_of(data: Any) -> shape.Splices:
-    """Return the model of the detector's settings where they stand; nothing for a detector that does not exist."""
+    """Return the path of the detector's settings and their model; nothing for a detector that does not exist."""
     detector = shape.child(data, "detector")
     name = detector.get("name", "thesis") if isinstance(detector, dict) else "thesis"
     known = isinstance(name, str) and name in detector_names()
@@ -230,15 +230,15 @@ def declared_of(data: Any) -> shape.Declared:
 
 MAIN = "main"  # The only set-up of an experiment whose only axis, if any, is the number of frames
 NO_NUMBERS = ("name", "title", "repeats", "study", "sweep", "draws", "switches", "sensitivity")
-"""Keys that decide which trials are run, not what a trial gives."""
+"""Keys that determine which trials are run, but not the result of any trial."""
 
 
 @dataclass(frozen=True)
 class Point:
-    """A resolved experiment without axes. ``values``: dotted path -> value, for the paths that make the point.
-    ``variant``: label of its set-up or variation; ``label`` tells points apart. ``axes``: resolved values of all axes
-    but the number of frames, which tell set-ups apart. ``reference``: of a variation the set-up with the same ``axes``
-    ("" for none), else the point's own. ``digest`` names the point's numbers, ``frames_key`` those of its frames."""
+    """A resolved experiment without axes. ``values`` maps dotted paths to the values that make the point. ``variant``
+    labels its set-up or variation, ``label`` the point. ``axes`` holds the values of all axes but the number of frames.
+    ``reference`` is the set-up with the same ``axes`` that a variation varies ("" for none), else the point's own.
+    ``digest`` identifies the point's results, ``frames_key`` those of its frames."""
 
     label: str
     variant: str
@@ -262,7 +262,7 @@ class Experiment:
 
     @property
     def digest(self) -> str:
-        """Names the experiment's results: all points with their repeats, in order."""
+        """The digest that names the experiment's results, over all points with their repeats, in order."""
         points = [[point.variant, point.label, point.digest, point.config.repeats] for point in self.points]
         return digest(points if self.config.study is None else [self.config.study.to_data(), *points])
 
@@ -272,7 +272,7 @@ class Experiment:
 
 
 def point_of(label: str, variant: str, values: Mapping[str, Any], config: ExperimentConfig) -> Point:
-    """Return a point from its resolved declaration."""
+    """Return the point of a resolved declaration, with its digests."""
     source = config.source
     if isinstance(source, CaptureSource):
         files = [[file.name, file_digest(file)] for file in recording_of(source).files]
@@ -280,7 +280,7 @@ def point_of(label: str, variant: str, values: Mapping[str, Any], config: Experi
         named = load_camera(camera_name).lens.to_data() if camera_name else None
         frames = {"kind": source.kind, "files": files, "unit": source.unit, "lens": named}
     else:
-        # the full target (of a family of boards what they are drawn from) and the camera's numbers
+        # the full target, or the distribution of a family of boards, and the camera's numbers
         drawn = isinstance(source.target, DrawnTargetConfig)
         target = source.target.to_data() if drawn else source.target.declare().to_data()
         camera, work = camera_of(source.camera), source.render.to_data()
@@ -303,7 +303,7 @@ def detector_version(config: ExperimentConfig) -> int:
 @lru_cache(maxsize=1000)
 def recording_of(source: CaptureSource) -> Recording:
     """Open the recording behind a source, its first frame read and checked. Raises UserError for its files."""
-    from detectors.recordings import open_capture  # brings the readers of every format
+    from detectors.recordings import open_capture  # imports the readers of all formats
 
     name = source.intrinsics
     lens = lens_named(name) if name and name in lens_names() else None

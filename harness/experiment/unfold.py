@@ -181,8 +181,8 @@ def _frame_settings(frames: Any, at: KeyPath) -> tuple[Setting, ...]:
 
 
 def _label(settings: Iterable[Setting]) -> str:
-    said = (setting.name or f"{setting.path}={on_one_line(setting.value)}" for setting in settings)
-    return ", ".join(said) or "the experiment as it stands"
+    parts = (setting.name or f"{setting.path}={on_one_line(setting.value)}" for setting in settings)
+    return ", ".join(parts) or "the experiment as it stands"
 
 
 def _axis_problems(axes: list[list[Setting]], source: Source) -> Iterator[Problem]:
@@ -272,11 +272,11 @@ def _drafts(
     axes: list[list[Setting]], telling: list[str], variations: list[Draft], config: ExperimentConfig
 ) -> Iterator[Draft]:
     """Yield the product of the axes, the last one fastest; then every variation at every number of frames."""
-    names, told = names_of(telling), dict[int, str]()
+    names, texts = names_of(telling), dict[int, str]()
     for axis in axes:
         for one in axis if axis[0].path in telling else ():
             value = value_text(one.path, differing(one.value, (other.value for other in axis)))
-            told[id(one)] = one.name or f"{names[one.path]}={value}"
+            texts[id(one)] = one.name or f"{names[one.path]}={value}"
     chosen = list(product(*axes))
     if config.draws is not None:
         groups: dict[str, list[tuple[Setting, ...]]] = {}
@@ -286,8 +286,8 @@ def _drafts(
         chosen = [each for number in sorted(order) for each in [*groups.values()][number]]
     for settings in chosen:
         # a set-up is called like ``camera=kinect_v2, distance=0.75 m``
-        said = [told[id(one)] for one in settings if one.path in telling]
-        yield Draft(_label(settings), ", ".join(said) or MAIN, settings, settings[-1].written_at if settings else ())
+        parts = [texts[id(one)] for one in settings if one.path in telling]
+        yield Draft(_label(settings), ", ".join(parts) or MAIN, settings, settings[-1].written_at if settings else ())
     common = _frame_settings(config.sensitivity and config.sensitivity.frames, ("sensitivity", "frames"))
     for variation in variations:
         for frames in variation.frames or common:

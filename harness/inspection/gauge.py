@@ -161,8 +161,8 @@ def seen_on(gauge: Gauge, judged: Judged, detector: str, threshold: float) -> Ga
             warnings.append(f"{board.name}: {doubt}")
         own, beside = _matched(board, counted, judged, invert(T_camera_board))
         if unjudged := [str(row.hole.id) for row in own if row.found == "NA"]:
-            told = "is too near the edge of the judged area: it counts neither as a hit nor as a miss"
-            warnings.append(f"{board.name}: hole {', '.join(unjudged)} {told}")
+            outside = "is too near the edge of the judged area: it counts neither as a hit nor as a miss"
+            warnings.append(f"{board.name}: hole {', '.join(unjudged)} {outside}")
         rows += own
         calls += beside
     if not rows:
@@ -193,13 +193,13 @@ def _matched(
         away = seen - centre
         away = away[np.linalg.norm(away, axis=-1) < radius_m + hole.diameter_mm / 2 * MM]
         sides = np.floor(np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi / SIDES)).astype(int) % SIDES
-        told: tuple[Any, ...] = ("miss", None, None)
+        outcome: tuple[Any, ...] = ("miss", None, None)
         if len(np.unique(sides)) < SIDES:
-            told = ("NA", None, None)
+            outcome = ("NA", None, None)
         elif number in pairs:
             offset_mm = float(np.linalg.norm(places[pairs[number]] - centre)) / MM
-            told = ("hit", offset_mm, judged.detections[pairs[number]].score)
-        rows.append(GaugeRow(board.name, hole, counted, *told))
+            outcome = ("hit", offset_mm, judged.detections[pairs[number]].score)
+        rows.append(GaugeRow(board.name, hole, counted, *outcome))
     inside = (np.abs(places) < np.array([board.width_mm, board.height_mm]) / 2 * MM).all(axis=-1)
     for mark in board.marks:
         inside &= (np.abs(places - np.array([mark.x_mm, mark.y_mm]) * MM) > mark.side_mm * MM).any(axis=-1)

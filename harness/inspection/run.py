@@ -106,20 +106,20 @@ def threshold_of(
     own = own_threshold(detector, cloud, evidence, arguments.false_calls or asked.DEFAULT_FALSE_CALLS)
     names = ("threshold", "expected", "low", "high", "peaks", "floor", "objects", "rim_pixels")
     notes = {**evidence.notes, "own_null": {name: getattr(own, name) for name in names}}
-    told = f"{own.peaks} peaks towards the camera"
+    peaks = f"{own.peaks} peaks towards the camera"
     if own.objects:
-        told += f"; expect more beside objects, tags and edges in the picture ({own.objects} places)"
+        peaks += f"; expect more beside objects, tags and edges in the picture ({own.objects} places)"
     if not cloud.organised:
-        told += "; objects on the target were not looked for"
+        peaks += "; objects on the target were not looked for"
     if own.rim_pixels:
-        told += f"; {own.rim_pixels} pixels along the rim are mixed with the background and are not judged"
+        peaks += f"; {own.rim_pixels} pixels along the rim are mixed with the background and are not judged"
     if own.doubts:
         k = max(DEFAULT_K, own.threshold) if math.isfinite(own.threshold) else DEFAULT_K
         warnings = tuple(f"the capture cannot set its own threshold, {k:.3g} is used: {why}" for why in own.doubts)
-        origin = f"a fallback, {k:.3g} units of score: the number of false calls is unknown; {told}"
+        origin = f"a fallback, {k:.3g} units of score: the number of false calls is unknown; {peaks}"
         return k, origin, replace(own.evidence, notes=notes, warnings=(*evidence.warnings, *warnings))
     expected, low, high = map(_calls, (own.expected, own.low, own.high))
-    calls = f"{expected} false calls expected, 95 % interval {low} to {high}, from {told}"
+    calls = f"{expected} false calls expected, 95 % interval {low} to {high}, from {peaks}"
     return own.threshold, f"from this capture's own null: {calls}", replace(own.evidence, notes=notes)
 
 
@@ -149,16 +149,16 @@ def with_sizes_told(judged: Judged) -> Judged:
     if not cloud.organised:
         return judged
     outside = np.pad(~holes_filled(np.isfinite(judged.evidence.residual_m)), 1, constant_values=True)
-    rim, said = grown(outside, 1)[1:-1, 1:-1].ravel(), []
+    rim, doubts = grown(outside, 1)[1:-1, 1:-1].ravel(), []
     both = zip(judged.findings, judged.detections, strict=True)
     if cut := [str(finding.id) for finding, detection in both if rim[detection.pixels].any()]:
-        said.append(f"findings that reach the rim of the judged area ({', '.join(cut)}) may be larger than stated")
+        doubts.append(f"findings that reach the rim of the judged area ({', '.join(cut)}) may be larger than stated")
     open_ = [str(each.id) for each in judged.findings if each.kind == "no return" or each.depth_mm > OPEN_MM]
     if open_ and cloud.noise_reach_px >= FILTER_PX:
         most_mm = cloud.noise_reach_px * float(np.nanmedian(np.abs(np.diff(cloud.points_m[..., 0], axis=1)))) / MM
         far = f"holes that show what lies far behind, or nothing ({', '.join(open_)}), may be up to {most_mm:.2g} mm"
-        said.append(f"{far} wider than stated: the camera's filter mixes their rim into them")
-    return replace(judged, evidence=replace(judged.evidence, warnings=(*judged.evidence.warnings, *said)))
+        doubts.append(f"{far} wider than stated: the camera's filter mixes their rim into them")
+    return replace(judged, evidence=replace(judged.evidence, warnings=(*judged.evidence.warnings, *doubts)))
 
 
 def _calls(expected: float) -> str:
@@ -307,9 +307,9 @@ def _merged(
     if failed:
         reasons = "\n  ".join(f"{each.view}: {each.failure.removeprefix(f'{each.view}: ')}" for each in failed)
         several = f"{len(failed)} of {len(registrations)} views" if len(failed) > 1 else "one view"
-        said = f"{several} cannot be registered to {registrations[0].view} by {failed[0].method}:\n  {reasons}"
+        what = f"{several} cannot be registered to {registrations[0].view} by {failed[0].method}:\n  {reasons}"
         pose = "correct --poses where it is wrong" if has_poses else "state where they stand (--poses)"
-        raise UserError(said, fix=f"leave such views out, {pose}, or choose another --register or --marks")
+        raise UserError(what, fix=f"leave such views out, {pose}, or choose another --register or --marks")
     mapped = Mapped(tuple(prepared), registrations, merge(tuple(prepared), registrations, config.merge))
     return mapped, _registration_data(mapped)
 

@@ -119,8 +119,8 @@ def write_camera(
     for section in dict.fromkeys(fact.section for fact in (*facts, rate)):
         lines += [f"{section}:"] if section else []
         for fact in (*facts, rate):
-            told = f"{{value: {_text(fact.value)}, tag: {fact.tag}, source: {json.dumps(fact.source)}}}"
-            lines += [f"{'  ' if section else ''}{fact.key}: {told}"] if fact.section == section else []
+            text = f"{{value: {_text(fact.value)}, tag: {fact.tag}, source: {json.dumps(fact.source)}}}"
+            lines += [f"{'  ' if section else ''}{fact.key}: {text}"] if fact.section == section else []
     write_text(path, "\n".join(lines) + "\n")
     return read_camera(path)
 
@@ -160,20 +160,20 @@ def _empirical(found: Characteristics, albedo: float, source: str) -> Iterator[S
     yield Stated("noise", "range_mm", law.range_m / MM, source)
     yield Stated("noise", "sigma_mm", law.sigma_m / MM, source)
     for key, value, error in zip(("range_exponent", "brightness_exponent"), law.exponents, law.errors, strict=True):
-        told = (f"standard error {error:.2g}; {source}", "O") if np.isfinite(error) else (f"assumed: {NOT_TOLD}", "M")
-        yield Stated("noise", key, value, *told)
+        origin = (f"standard error {error:.2g}; {source}", "O") if np.isfinite(error) else (f"assumed: {NOT_TOLD}", "M")
+        yield Stated("noise", key, value, *origin)
     doubt = "not determined without a flat surface" if pattern is None else "; ".join((source, *pattern.field.warnings))
     yield Stated("fixed_pattern", "deviation_mm", 0.0 if pattern is None else pattern.field.rms_m / MM, doubt)
     shared = np.ones((2, 1)) if found.pattern_correlation is None else found.pattern_correlation
-    for section, both, said in (("noise", found.correlation, source), ("fixed_pattern", shared, doubt)):
-        yield Stated(section, "rows", taps_of(both[1]), said)
-        yield Stated(section, "columns", taps_of(both[0]), said)
+    for section, both, reason in (("noise", found.correlation, source), ("fixed_pattern", shared, doubt)):
+        yield Stated(section, "rows", taps_of(both[1]), reason)
+        yield Stated(section, "columns", taps_of(both[0]), reason)
     yield Stated("dropouts", "amplitude", np.nan_to_num(drops.amplitude, nan=1.0), source)
     yield Stated("dropouts", "share", drops.share, f"of {int(drops.pixels.sum())} pixels on surfaces; {source}")
-    told = (f"{edge.lines} lines of pixels across edges; {source}", "O") if edge else (f"edges are {NOT_TOLD}", "M")
+    origin = (f"{edge.lines} lines of pixels across edges; {source}", "O") if edge else (f"edges are {NOT_TOLD}", "M")
     blurred = edge is not None and edge.flying_px > 0.05
-    yield Stated("edge", "gap_px", edge.gap_px if edge else 0.0, *told)
-    yield Stated("edge", "blur_px", (edge.gap_px + edge.flying_px) / EDGE_SHARE if edge and blurred else 0.0, *told)
+    yield Stated("edge", "gap_px", edge.gap_px if edge else 0.0, *origin)
+    yield Stated("edge", "blur_px", (edge.gap_px + edge.flying_px) / EDGE_SHARE if edge and blurred else 0.0, *origin)
     yield Stated("edge", "least_step_mm", 20.0, "smaller steps are taken to cost no return; not measured", "M")
     yield Stated("engine", "min_range_mm", 0.0, f"limits of range are {NOT_TOLD}", "M")
     yield Stated("engine", "max_range_mm", 20_000.0, f"limits of range are {NOT_TOLD}", "M")
@@ -206,8 +206,8 @@ def _refitted(like: str, found: Characteristics, albedo: float, source: str) -> 
         faint = float(np.exp(np.interp(-0.5, -share[falling], np.log(level[falling]))))
         pairs = zip(found.captures, again, strict=True)
         ratios = [(a.amplitude / b.amplitude)[a.steady & b.steady] for a, b in pairs]  # type: ignore[operator]
-        told = f"half of the pixels of amplitude {faint:.4g} return nothing; {source}"
-        yield Stated("engine", "min_amplitude_units", faint / float(np.nanmedian(np.concatenate(ratios))), told)
+        origin = f"half of the pixels of amplitude {faint:.4g} return nothing; {source}"
+        yield Stated("engine", "min_amplitude_units", faint / float(np.nanmedian(np.concatenate(ratios))), origin)
 
 
 def _field(camera: AmcwCamera, found: Characteristics) -> Iterator[tuple[str, Any]]:

@@ -127,8 +127,8 @@ def write_certificate(
         body += [note(POD.format(study.hit_radius_mm))]
     body += [heading("Validity"), bullets((share, *CONDITIONS)), note(f"{date.today().isoformat()}: {command}")]
     text = page(f"Certificate of measurement: {about['unit']}", answer, body, warnings=found.doubts)
-    told = {"results_version": RESULTS_VERSION, "about": about, "answer": answer, "figures": rows}
-    told |= {"surfaces": FLAT_SURFACES.data(surfaces), "conditions": [share, *CONDITIONS]}
-    told |= {"limits": LIMITS.data(limits), "doubts": found.doubts, "command": command}
+    data = {"results_version": RESULTS_VERSION, "about": about, "answer": answer, "figures": rows}
+    data |= {"surfaces": FLAT_SURFACES.data(surfaces), "conditions": [share, *CONDITIONS]}
+    data |= {"limits": LIMITS.data(limits), "doubts": found.doubts, "command": command}
     write_text(folder / "certificate.html", text)
-    write_json(folder / "certificate.json", told)
+    write_json(folder / "certificate.json", data)

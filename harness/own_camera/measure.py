@@ -260,21 +260,21 @@ def noise_law(cells: Sequence[NoiseCell]) -> RangeLaw:
     weight, y, log_r = np.array(pixels, float), np.log(sigma_m), np.log(r)
     light_at_1m = float(np.average(np.log(light) - np.log(np.cos(np.radians(angle_deg))), weights=weight))
     columns = np.stack([np.ones(len(y)), log_r, np.log(light) - light_at_1m], axis=-1)
-    told = np.array([True, *(np.ptp(columns[:, 1:], axis=0) > np.log(TELLING_RATIO))])
+    varied = np.array([True, *(np.ptp(columns[:, 1:], axis=0) > np.log(TELLING_RATIO))])
     law, root, signs = ASSUMED.copy(), np.sqrt(weight), np.sign(ASSUMED)
     while True:
         errors = np.full(3, np.nan)
-        design, rest = columns[:, told] * root[:, None], (y - columns[:, ~told] @ law[~told]) * root
-        law[told] = np.linalg.lstsq(design, rest, rcond=None)[0]
-        spread = float(((rest - design @ law[told]) ** 2).sum() / max(len(y) - told.sum(), 1))
-        errors[told] = np.sqrt(np.diag(np.linalg.pinv(design.T @ design)) * spread)
-        doubtful = (errors > UNSURE) | (told & (law * signs < 0))
+        design, rest = columns[:, varied] * root[:, None], (y - columns[:, ~varied] @ law[~varied]) * root
+        law[varied] = np.linalg.lstsq(design, rest, rcond=None)[0]
+        spread = float(((rest - design @ law[varied]) ** 2).sum() / max(len(y) - varied.sum(), 1))
+        errors[varied] = np.sqrt(np.diag(np.linalg.pinv(design.T @ design)) * spread)
+        doubtful = (errors > UNSURE) | (varied & (law * signs < 0))
         doubtful[0] = False
         if not doubtful.any():
             break
-        # on one slanted surface range and brightness change together: the one that is known less is not told
+        # on one slanted surface range and brightness change together: the one that is known less is not varied
         worst = int(np.argmax(np.where(doubtful, errors, -1.0)))
-        told[worst], law[worst] = False, ASSUMED[worst] if errors[worst] > UNSURE else 0.0
+        varied[worst], law[worst] = False, ASSUMED[worst] if errors[worst] > UNSURE else 0.0
     facing, number = y - law[2] * columns[:, 2], np.floor(log_r / np.log(RANGE_CELLS) + 1e-9)
     groups = [number == one for one in np.unique(number)]
     at, level = (np.exp([np.average(v[g], weights=weight[g]) for g in groups]) for v in (log_r, facing))
@@ -351,8 +351,8 @@ def surfaces_of(capture: StillCapture) -> Iterator[SurfaceFigures]:
         rms_mm, *forms_mm = np.mean([_form(frame, slopes) for frame in z_m[:: max(1, len(z_m) // 5)]], axis=0).tolist()
         at = float(np.median(mean_m)), float(np.degrees(np.arccos(np.median(capture.cosine.ravel()[few]))))
         fill = float(np.isfinite(capture.z_m[:, capture.whole(mask)]).mean())
-        told: list[Any] = [*at, temporal, rms_mm, _form(mean_m, slopes)[0], *forms_mm, fill]
-        yield SurfaceFigures(capture.name, number, *told)
+        values: list[Any] = [*at, temporal, rms_mm, _form(mean_m, slopes)[0], *forms_mm, fill]
+        yield SurfaceFigures(capture.name, number, *values)
 
 
 def _form(z_m: np.ndarray, slopes: np.ndarray) -> tuple[float, float, float]:
@@ -392,9 +392,9 @@ def edge_of(captures: Sequence[StillCapture]) -> EdgeFigures | None:
                 for at in np.flatnonzero((np.diff(line[known]) != 0) & (np.diff(known) <= WIDEST_PX)):
                     last, first = known[at : at + 2]
                     between = share[row, last + 1 : first]
-                    told = (1 - between).sum(), between.sum(), abs(z_m[row, first] - z_m[row, last])
-                    if told[2] > LEAST_STEP_M:
-                        lines[capture.name, frozenset(line[[last, first]])][axis].append(told)
+                    counts = (1 - between).sum(), between.sum(), abs(z_m[row, first] - z_m[row, last])
+                    if counts[2] > LEAST_STEP_M:
+                        lines[capture.name, frozenset(line[[last, first]])][axis].append(counts)
     # along the axis that cuts across more of the edge: the other one meets it aslant
     rows = np.array([row for both in lines.values() for row in max(both, key=len)])
     if len(rows) < LEAST_BIN_PX // 10:
@@ -443,36 +443,36 @@ class Characteristics:
     @cached_property
     def doubts(self) -> tuple[str, ...]:
         """Full sentences on what these captures cannot show, or show wrongly."""
-        said, law, first = [], self.law, self.captures[0]
+        notes, law, first = [], self.law, self.captures[0]
         if not self.surfaces:
-            said.append("no flat surface was found: angle, plane fit, fill rate, fixed pattern and edges are unknown")
+            notes.append("no flat surface was found: angle, plane fit, fill rate, fixed pattern and edges are unknown")
         if np.isnan(law.errors[0]):
             near, far = law.range_m.min(), law.range_m.max()
-            said.append(f"surfaces between {near:.2f} and {far:.2f} m do not show how the noise grows with range: the"
+            notes.append(f"surfaces between {near:.2f} and {far:.2f} m do not show how the noise grows with range: the"
                         f" power {law.exponents[0]:g} is assumed")  # fmt: skip
         if not self.has_amplitude:
-            said.append("no amplitude is recorded: noise and dropouts of darker surfaces are unknown")
+            notes.append("no amplitude is recorded: noise and dropouts of darker surfaces are unknown")
         if np.isnan(law.errors[1]):
-            said.append("brightness hardly varies, or only together with range: how noise depends on it is unknown,"
+            notes.append("brightness hardly varies, or only together with range: how noise depends on it is unknown,"
                         f" and the power -{law.exponents[1]:g} is assumed")  # fmt: skip
         noise, sigma_m = first.noise_m[:, first.steady], float(np.sqrt(np.nanmedian(first.variance_m2[first.steady])))
         alike = float(np.nanmean(noise[1:] * noise[:-1]) / np.nanmean(noise**2)) + 1 / len(noise)
         if alike > SLOW:
-            said.append(f"successive frames share their noise (correlation {alike:.2f}): they were averaged over time"
-                        " or repeated, and single frames are noisier than stated")  # fmt: skip
+            notes.append(f"successive frames share their noise (correlation {alike:.2f}): they were averaged over time"
+                         " or repeated, and single frames are noisier than stated")  # fmt: skip
         reach = int(np.argmax([*(self.correlation.max(axis=0) < 0.1), True]))
         if reach > WIDE_PX:
-            said.append(f"neighbours share their noise over {reach} pixels: the depth was upsampled, aligned to another"
-                        " camera, compressed or smoothed")  # fmt: skip
+            notes.append(f"neighbours share their noise over {reach} pixels: the depth was upsampled, aligned to"
+                         " another camera, compressed or smoothed")  # fmt: skip
         if sigma_m < COARSE * first.step_m:
-            said.append(f"the noise ({sigma_m / MM:.2g} mm) is hidden by the rounding to {first.step_m / MM:.3g} mm,"
+            notes.append(f"the noise ({sigma_m / MM:.2g} mm) is hidden by the rounding to {first.step_m / MM:.3g} mm,"
                         " and its size before rounding is uncertain")  # fmt: skip
         if drifted := [one.name for one in self.captures if abs(one.drift_m) > JUMP_M]:
-            said.append(f"the distance drifts by more than {JUMP_M / MM:g} mm during {', '.join(drifted)}: the camera"
+            notes.append(f"the distance drifts by more than {JUMP_M / MM:g} mm during {', '.join(drifted)}: the camera"
                         " warmed up, or moved")  # fmt: skip
         if jumped := len(self.jumps_m):
-            said.append(f"{jumped} of {self.frames} frames are displaced as a whole and are left out of the noise")
-        return (*said, *(self.pattern.field.warnings if self.pattern is not None else ()))
+            notes.append(f"{jumped} of {self.frames} frames are displaced as a whole and are left out of the noise")
+        return (*notes, *(self.pattern.field.warnings if self.pattern is not None else ()))
 
 
 def characteristics(
@@ -495,8 +495,8 @@ def characteristics(
     pattern = separated(flat, first.lens) if flat else None
     surfaces = tuple(figures for capture in captures for figures in surfaces_of(capture))
     shared = _pattern_correlation(pattern, correlation) if pattern is not None and pattern.field.rms_m > 0 else None
-    told = dropouts_of(captures), surfaces, edge_of(captures), pattern, shared
-    return Characteristics(tuple(captures), cells, noise_law(cells), correlation, *told)
+    parts = dropouts_of(captures), surfaces, edge_of(captures), pattern, shared
+    return Characteristics(tuple(captures), cells, noise_law(cells), correlation, *parts)
 
 
 def _pattern_correlation(pattern: Separated, of_noise: np.ndarray) -> np.ndarray:

@@ -126,11 +126,11 @@ def write_page(
     curves = [row for source, one in sources.items() for row in _curves(source, one)]
     write_table(folder, OWN_CURVES, OWN_CURVES.frame(curves))
     drawn = svg("captures", (8.6, 15.5), title, lambda canvas: _draw(canvas, found, curves))
-    said = (
+    notes = (
         "Simulated are frames of the camera's file before the same surfaces, whose smooth shape is the captures'; they "
         "are analysed as the captures are. A ratio of 1 says that the file repeats the camera."
     )
-    body = [figure({"captures": drawn}, "captures", CAPTION), heading("Measured and simulated"), paragraph(said)]
+    body = [figure({"captures": drawn}, "captures", CAPTION), heading("Measured and simulated"), paragraph(notes)]
     body += [OWN_FIGURES.grid(rows, heads=heads).html(), *command_of(command)]
     write_text(path, page(title, answer, body, warnings=warnings))
     origin = {"results_version": RESULTS_VERSION, **record(command), **facts, "warnings": warnings}

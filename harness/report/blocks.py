@@ -67,8 +67,8 @@ def page(
 def tag(name: str, *content: str | Markup, **attributes: str) -> Markup:
     """An element; attributes without a value are left out, ``kind`` is its class."""
     named = ((key.replace("_", "-") if key != "kind" else "class", value) for key, value in attributes.items() if value)
-    said = Markup("").join(Markup(' {}="{}"').format(key, value) for key, value in named)
-    return Markup("<{0}{1}>{2}</{0}>").format(Markup(name), said, joined(content, ""))
+    written = Markup("").join(Markup(' {}="{}"').format(key, value) for key, value in named)
+    return Markup("<{0}{1}>{2}</{0}>").format(Markup(name), written, joined(content, ""))
 
 
 def joined(parts: Iterable[str | Markup], between: str = "\n") -> Markup:
@@ -109,12 +109,12 @@ def command_of(command: str) -> list[Markup]:
 
 def closing(provenance: Mapping[str, Any], experiment_yaml_text: str, left_out: str = "") -> list[Markup]:
     """The sections of every page of a sweep; ``left_out``: a sentence on frames that were left out of averages."""
-    said: dict[str, list[str]] = {}
+    reasons: dict[str, list[str]] = {}
     for each in provenance.get("failures", ()):
-        said.setdefault(f"{each['state']}: {each['why']}", []).append(each["what"])
-    missing = f"{many(sum(map(len, said.values())), 'part')} of the experiment failed: not in any number above."
-    parts = [heading("Failures"), paragraph(missing if said else "No trial failed.")]
-    for why, parts_of in said.items():
+        reasons.setdefault(f"{each['state']}: {each['why']}", []).append(each["what"])
+    missing = f"{many(sum(map(len, reasons.values())), 'part')} of the experiment failed: not in any number above."
+    parts = [heading("Failures"), paragraph(missing if reasons else "No trial failed.")]
+    for why, parts_of in reasons.items():
         more = f" and {len(parts_of) - NAMED} others" if len(parts_of) > NAMED else ""
         parts.append(tag("p", f"{', '.join(parts_of[:NAMED])}{more}: {why}", kind="fail"))
     parts += [paragraph(left_out)] if left_out else []
@@ -129,8 +129,8 @@ def closing(provenance: Mapping[str, Any], experiment_yaml_text: str, left_out: 
     lines = (tag("tr", tag("th", name, scope="row"), tag("td", value)) for name, value in recorded)
     parts += [heading("Provenance")]
     table = tag("table", tag("tbody", joined(lines)), kind="prov")
-    told = (cost, table, *command_of(provenance.get("command", "not recorded")))
-    folds = fold("Cost, versions and command", *told)
+    blocks = (cost, table, *command_of(provenance.get("command", "not recorded")))
+    folds = fold("Cost, versions and command", *blocks)
     return [*parts, folds, fold("The resolved experiment", tag("pre", experiment_yaml_text))]
 
 

@@ -132,8 +132,8 @@ def examples_figure(name: str, examples: Sequence[StudyExample], title: str, *, 
         for down in range(max(map(len, columns)))
     ]
     every = [one for line in columns for one in line]
-    said = "; ".join(f"{one.diameter_mm:.1f} mm, {titles[one.where].lower()}, {_outcome(one)}" for one in every)
-    return _cuts(name, rows, f"{title}: {said}.")
+    captions = "; ".join(f"{one.diameter_mm:.1f} mm, {titles[one.where].lower()}, {_outcome(one)}" for one in every)
+    return _cuts(name, rows, f"{title}: {captions}.")
 
 
 def _outcome(example: StudyExample) -> str:

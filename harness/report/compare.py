@@ -109,23 +109,23 @@ def answer(comparison: Comparison) -> str:
     rows = comparison.rows
     worse = [row for row in rows if row.is_worse]
     if worse:
-        said = "; ".join(f"{row.label}: {row.why}" for row in worse[:3])
+        reasons = "; ".join(f"{row.label}: {row.why}" for row in worse[:3])
         verb = "is" if len(worse) == 1 else "are"
-        return f"{len(worse)} of {len(rows)} set-ups {verb} worse. {said}{'; ...' if len(worse) > 3 else '.'}"
+        return f"{len(worse)} of {len(rows)} set-ups {verb} worse. {reasons}{'; ...' if len(worse) > 3 else '.'}"
     counts = {mark: len(comparison.marked(mark)) for mark in SIGNS}
     return f"No set-up is worse: {', '.join(f'{n} {mark}' for mark, n in counts.items() if n) or 'there is none'}."
 
 
 def remarks(comparison: Comparison) -> list[str]:
     """Reasons of the marks in `SAID`, and what differs between the studies."""
-    said = [f"{row.label}: {row.mark}, {row.why}" for row in comparison.rows if row.mark in SAID and row.why]
+    reasons = [f"{row.label}: {row.mark}, {row.why}" for row in comparison.rows if row.mark in SAID and row.why]
     pairs = [row for row in comparison.rows if row.first is not None and row.second is not None]
     by_change: dict[str, list[str]] = {}
     for row in pairs:
         for change in row.changed:
             by_change.setdefault(change, []).append(row.label)
     differs = [what + ("" if len(at) == len(pairs) else f" ({'; '.join(at)})") for what, at in by_change.items()]
-    return [*said, *([f"what differs: {'; '.join(differs)}"] if differs else [])]
+    return [*reasons, *([f"what differs: {'; '.join(differs)}"] if differs else [])]
 
 
 def compare_data(comparison: Comparison) -> dict[str, Any]:

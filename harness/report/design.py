@@ -184,7 +184,7 @@ def design_data(design: StudyDesign) -> dict[str, Any]:
     """Return the plan as JSON's types; an infinite size becomes None."""
     guess = design.guess
     curve = {"link": guess.link, "log_size": guess.log_size, "mu": float(guess.mu), "sigma": float(guess.sigma)}
-    said: dict[str, Any] = {
+    data: dict[str, Any] = {
         "recommendation": answer(design),
         "unit": design.unit,
         "guess": {**curve, "a50": guess.size_at(0.5), "a90": guess.size_at(0.9), "origin": design.origin},
@@ -196,7 +196,7 @@ def design_data(design: StudyDesign) -> dict[str, Any]:
         "hole_free": vars(design.hole_free) if design.hole_free else None,
         "notes": notes(design),
     }
-    return dict(jsonable(said))
+    return dict(jsonable(data))
 
 
 def save_design_png(path: Path, design: StudyDesign) -> None:
@@ -214,13 +214,13 @@ def _draw(canvas: Figure, design: StudyDesign) -> None:
     left.vlines(places, np.minimum(lows, top), np.minimum(ends, top), color=blocks.BLUE, lw=2.2)
     left.plot(places, np.minimum(bounds, 9 * top), "o", color=blocks.BLUE, ms=7, mec="white", label="median, 10–90 %")
     for place, bound, end in zip(places, bounds, ends, strict=True):
-        said = "none" if not np.isfinite(bound) else "↑" if end > top else ""
-        left.text(place, top, said, ha="center", va="top", color=blocks.BLUE)
-    said = plain(f"the guess's a90: {design.text(true_size)}")
-    left.axhline(true_size, color=blocks.RED, lw=1.2, label=said)
+        label = "none" if not np.isfinite(bound) else "↑" if end > top else ""
+        left.text(place, top, label, ha="center", va="top", color=blocks.BLUE)
+    label = plain(f"the guess's a90: {design.text(true_size)}")
+    left.axhline(true_size, color=blocks.RED, lw=1.2, label=label)
     if design.goal is not None:
-        said = plain(f"wanted: {design.text(design.goal)}")
-        left.axhline(design.goal, color=blocks.GREEN, lw=1.2, ls="--", label=said)
+        label = plain(f"wanted: {design.text(design.goal)}")
+        left.axhline(design.goal, color=blocks.GREEN, lw=1.2, ls="--", label=label)
     left.set(xlim=(-0.6, len(places) - 0.4), ylim=(0.95 * min(true_size, *lows), max(top, 1.02 * (design.goal or 0))))
     left.set_xticks(places, [str(one.targets) for one in design.plans])
     left.set(xlabel="targets", ylabel=axis_text("a90/95 to expect", design.unit))

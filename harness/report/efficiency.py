@@ -37,13 +37,13 @@ def answer(rows: Sequence[Efficiency]) -> str:
     known = sorted((row for row in rows if np.isfinite(row.most.efficiency)), key=lambda row: row.most.efficiency)
     if not known:
         return "No detector has a curve against the ideal observer's d', so there is no efficiency."
-    said = []
+    sentences = []
     for row in (known[-1], known[0])[: len(known)]:
-        said.append(
+        sentences.append(
             f"{row.limit.record.detector} ({row.limit.record.label}) has {percent(row.most.efficiency)} % at a90: "
             f"{size(row.limit.a90_mm, row.limit.largest_mm)} mm, and the ideal observer {size(row.most.ideal_mm)} mm"
         )
-    return f"Highest efficiency: {said[0]}." + (f" Lowest: {said[1]}." if len(said) > 1 else "")
+    return f"Highest efficiency: {sentences[0]}." + (f" Lowest: {sentences[1]}." if len(sentences) > 1 else "")
 
 
 def efficiency_figure(rows: Sequence[Efficiency]) -> str:

@@ -87,13 +87,13 @@ def template_pdf(boards: Any, dictionary: str, paper: str) -> bytes:
                 left, low = x - board.width_mm / 2, y - board.height_mm / 2
                 figure, axes = _sheet((left - MARGIN_MM, low - MARGIN_MM - FOOT_MM, *sheet), board.name)
                 draw_board(axes, board, dictionary)
-                said = f"{board.name}, tile {number} of {len(places)}: print at 100 %"
-                _frame(axes, (left, low, sheet[0] - 2 * MARGIN_MM, sheet[1] - 2 * MARGIN_MM - FOOT_MM), said)
+                title = f"{board.name}, tile {number} of {len(places)}: print at 100 %"
+                _frame(axes, (left, low, sheet[0] - 2 * MARGIN_MM, sheet[1] - 2 * MARGIN_MM - FOOT_MM), title)
                 pages.savefig(figure)
     return buffer.getvalue()
 
 
-def _frame(axes: Axes, at: tuple[float, float, float, float], said: str) -> None:
+def _frame(axes: Axes, at: tuple[float, float, float, float], title: str) -> None:
     """Clip what lies beyond a tile, and draw its cutting corners, scale bar and name."""
     from matplotlib.patches import Rectangle
 
@@ -110,7 +110,7 @@ def _frame(axes: Axes, at: tuple[float, float, float, float], said: str) -> None
     axes.plot([left, left + SCALE_MM], [bar, bar], color=INK, lw=0.8)
     for tick in np.arange(0, SCALE_MM + 1, 10):
         axes.plot([left + tick] * 2, [bar, bar + 2], color=INK, lw=0.5)
-    axes.annotate(f"{SCALE_MM:g} mm   {said}", (left + SCALE_MM + 3, bar), fontsize=7, color=INK, va="center")
+    axes.annotate(f"{SCALE_MM:g} mm   {title}", (left + SCALE_MM + 3, bar), fontsize=7, color=INK, va="center")
 
 
 def _sheet(view_mm: tuple[float, float, float, float], name: str) -> tuple[Figure, Axes]:

@@ -50,10 +50,10 @@ def answer(found: Mapod) -> str:
 def sizes_grid(found: Mapod) -> Grid:
     """Simulated, measured and combined sizes."""
     last, rows = found.steps[-1], list[tuple[str, ...]]()
-    for name, said in (("simulated", found.simulated), ("measured", found.measured)):
-        if said is not None:
-            bound = sized(said.bound.value, "") if said.bound.demonstrated else "not demonstrated"
-            rows.append((name, sized(said.a50, ""), sized(said.a90, ""), bound, said.counts))
+    for name, sizes in (("simulated", found.simulated), ("measured", found.measured)):
+        if sizes is not None:
+            bound = sized(sizes.bound.value, "") if sizes.bound.demonstrated else "not demonstrated"
+            rows.append((name, sized(sizes.a50, ""), sized(sizes.a90, ""), bound, sizes.counts))
         else:
             rows.append((name, "-", "-", "not demonstrated", found.why))
     both = f"{found.set_up}, corrected by {last.targets} real targets"
@@ -63,7 +63,7 @@ def sizes_grid(found: Mapod) -> Grid:
 
 def notes(found: Mapod) -> list[str]:
     """Sentences on prior, tests and stop rule."""
-    said = [
+    lines = [
         "Transfer function: real damage of size k a is found as easily as simulated damage of size a, and the rise "
         f"of the curve is w times as wide. Prior: ln k and ln w about 0 by Student's distribution with {FREEDOM:g} "
         f"degrees of freedom, with scales of a factor {PRIOR_SIZE:g} in k and {PRIOR_WIDTH:g} in w, and "
@@ -75,13 +75,13 @@ def notes(found: Mapod) -> list[str]:
         f"{found.agrees:.2g}; below 0.05 that is a contradiction.",
         f"Stop rule: enough where a90/95 is at most {ENOUGH:g} times a90. It was fixed before any board.",
     ]
-    return [*said, *found.read.notes, VALIDITY]
+    return [*lines, *found.read.notes, VALIDITY]
 
 
 def doubts(found: Mapod) -> list[str]:
     """Return sentences on the reasons to doubt the combined limit."""
-    said = [f"{found.unlike}: a difference counts as an error of the simulation"] if found.unlike else []
-    return said + ["the real hits and misses contradict the simulation"] * found.contradicted
+    texts = [f"{found.unlike}: a difference counts as an error of the simulation"] if found.unlike else []
+    return texts + ["the real hits and misses contradict the simulation"] * found.contradicted
 
 
 def mapod_parts(found: Mapod) -> list[str | Grid]:

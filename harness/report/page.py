@@ -186,8 +186,8 @@ class Layout:
         # a column that variations leave empty has no whole numbers
         held = [set_ups[path].convert_dtypes().tolist() for path in paths[:-1]]
         for variant, *places in zip(set_ups["variant"], *held, strict=True):
-            said = map("{}={}".format, paths, map(canonical_json, places))
-            rows.setdefault(", ".join(map(in_words, said)), []).append(str(variant))
+            labels = map("{}={}".format, paths, map(canonical_json, places))
+            rows.setdefault(", ".join(map(in_words, labels)), []).append(str(variant))
         if any(len(names) != len(values) for names in rows.values()):  # set-ups drawn at random fill no grid
             return Layout({in_words(str(name)): [str(name)] for name in set_ups["variant"]})
         numbers = tuple(float(v) for v in values) if all(isinstance(v, int | float) for v in values) else ()
@@ -243,8 +243,8 @@ def set_ups_answer(compared: pd.DataFrame, layout: Layout, costs: pd.DataFrame, 
     if len(rows) > MOST_ROWS:
         ends = (min(found, key=found.__getitem__), max(found, key=found.__getitem__))
         rows = [" to ".join(f"{found[name]} ({in_words(name)})" for name in ends)]
-    said = [f"Found of {int(compared['holes'].max())} holes{where} with {_averaged(frames[-1])}: {'; '.join(rows)}."]
-    said = said if costs.empty else []
+    parts = [f"Found of {int(compared['holes'].max())} holes{where} with {_averaged(frames[-1])}: {'; '.join(rows)}."]
+    parts = parts if costs.empty else []
     for (named, count), at in costs_by_place(costs).items():
         together = at.get(("all", "nothing"))
         if together is None or count not in frames:
@@ -254,10 +254,10 @@ def set_ups_answer(compared: pd.DataFrame, layout: Layout, costs: pd.DataFrame, 
         each = [row for (effect, against), row in at.items() if against == "nothing" and effect != "all"]
         dearest = max(each, key=lambda row: np.nan_to_num(row["loss_mm"], nan=-np.inf), default=None)
         alone = f"; alone, {dearest['effect']} does most: {cost_text(dearest)}" if dearest else ""
-        said.append(f"With {place}{_averaged(count)}, {moved}{alone}.")
+        parts.append(f"With {place}{_averaged(count)}, {moved}{alone}.")
     if verdict:
-        said.append(f"{verdict.claim} ({verdict.text.rstrip('.')}) is {verdict.verdict}.")
-    return " ".join(said)
+        parts.append(f"{verdict.claim} ({verdict.text.rstrip('.')}) is {verdict.verdict}.")
+    return " ".join(parts)
 
 
 def _averaged(frames: int) -> str:

@@ -96,7 +96,7 @@ def found_figure(rows: Sequence[sections.Row]) -> str:
 
 def answer_sentence(cases: Sequence[maps.MapCase], verdicts: Sequence[Verdict] = ()) -> str:
     """Say how many holes one view finds, and the most views by the way that finds most; the verdicts too."""
-    said = []
+    sentences = []
     for case in cases:
         alone = case.single()
         if alone is None:
@@ -112,14 +112,14 @@ def answer_sentence(cases: Sequence[maps.MapCase], verdicts: Sequence[Verdict] =
             open_ = f" ({states.count('undecided')} undecided)" if "undecided" in states else ""
             counts.append(f"{way} {states.count('found')}{'' if counts else f' of {len(states)} holes'}{open_}")
         where = f"{case.place}: " if len(cases) > 1 else ""
-        said.append(f"{where}With {maps.frames_text(alone.frames)} {', '.join(counts)}.")
-    if not said:
+        sentences.append(f"{where}With {maps.frames_text(alone.frames)} {', '.join(counts)}.")
+    if not sentences:
         return "No trial of any set-up finished, so there is no answer."
     if verdicts:
         leads = dict.fromkeys(LEADS[verdict.verdict] for verdict in verdicts if verdict.claim == "H1")
-        said.insert(0, f"Do more views beat one? {' / '.join(leads)}.")
-        said.append(f"{', '.join(f'{verdict.claim} is {verdict.verdict}' for verdict in verdicts)}.")
-    return " ".join(said)
+        sentences.insert(0, f"Do more views beat one? {' / '.join(leads)}.")
+        sentences.append(f"{', '.join(f'{verdict.claim} is {verdict.verdict}' for verdict in verdicts)}.")
+    return " ".join(sentences)
 
 
 def map_files(examples: Sequence[MappedExample]) -> dict[str, MappedExample]:

@@ -28,8 +28,8 @@ def scene_svg(facts: Mapping[str, Any]) -> Markup:
     target = facts["source"]["target"].get("name", "target")
     target = {"drawn": "target with damage drawn at random", "thesis": "board with eleven holes"}.get(target, target)
     words = f"{', '.join(names)} at {distance} from a {target}{behind}. Not to scale."
-    told = {"words": words, "camera": named, "distance": distance, "target": "target", "behind": gap}
-    return Markup(template("scene.html").render(**told))
+    labels = {"words": words, "camera": named, "distance": distance, "target": "target", "behind": gap}
+    return Markup(template("scene.html").render(**labels))
 
 
 def _values(facts: Mapping[str, Any], path: str) -> list[Any]:

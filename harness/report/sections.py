@@ -43,11 +43,11 @@ def sweep_page(
 ) -> str:
     """Return the page of a sweep by the template ``name``: what all have in common, and its own ``parts``."""
     warnings = about.provenance.get("warnings", ())
-    told = {"title": about.title, "answer": answer, "warnings": warnings, "figures": figures}
+    base = {"title": about.title, "answer": answer, "warnings": warnings, "figures": figures}
     seen = int(tables.holes.groupby("variant")["hole"].nunique().min()) if len(tables.holes) else None
-    told |= {"scene": scene_svg(about.facts), "conditions": conditions_of(about.facts, seen), "calls_note": CALLS_NOTE}
+    base |= {"scene": scene_svg(about.facts), "conditions": conditions_of(about.facts, seen), "calls_note": CALLS_NOTE}
     end = closing(about.provenance, about.experiment_yaml_text, left_out(tables.runs))
-    return template(name).render(**told, closing=joined(end), **parts)
+    return template(name).render(**base, closing=joined(end), **parts)
 
 
 RULES_NOTE = (
@@ -77,8 +77,8 @@ class Varied(NamedTuple):
 def _why(varied: Varied) -> str:
     """Return the reason for a variation, and its settings where its name does not say them."""
     variant = varied.variant
-    said = variant["settings"].strip("{}").replace('"', "").replace(": ", "=")
-    return "\n".join(filter(None, (variant["reason"], "" if said == variant["variant"] else variant["settings"])))
+    settings = variant["settings"].strip("{}").replace('"', "").replace(": ", "=")
+    return "\n".join(filter(None, (variant["reason"], "" if settings == variant["variant"] else variant["settings"])))
 
 
 def _side(label: str, side: str) -> Column:
@@ -126,46 +126,46 @@ def varied_section(tables: ResultTables, compared: pd.DataFrame, frames: Sequenc
         others = there.get(variant["reference"], [])
         for number, one in enumerate(there.get(str(variant["variant"]), [None])):
             alike = [other for other in others if one is not None and other["frames"] == one["frames"]]
-            again = {"reason": "", "settings": ""} if number else {}  # why is said once
+            again = {"reason": "", "settings": ""} if number else {}  # the reason appears once
             rows.append(Varied({**variant, **again}, one, next(iter([*alike, *others[-1:]]), None)))
     if not rows:
         return Markup("")
-    said = (
+    text = (
         "Each row changes something in the one set-up that it names, and is compared with it; ≠: other holes are found."
         " A variation with fewer repeats and hole-free runs has a lower threshold."
     )
     grid = VARIED.grid(rows, heads={"changes": ""} if of else None)
-    return joined([heading("If facts were otherwise"), paragraph(said), grid.html()])
+    return joined([heading("If facts were otherwise"), paragraph(text), grid.html()])
 
 
 def claims_section(title: str, verdicts: Sequence[Verdict]) -> Markup:
     """A heading and the table of claims; nothing without verdicts. Pages of other targets hold none of it."""
     if not verdicts:
         return Markup("")
-    rows, told = [vars(verdict) for verdict in verdicts], ("claim", "says", "verdict", "evidence")
+    rows, keys = [vars(verdict) for verdict in verdicts], ("claim", "says", "verdict", "evidence")
     criteria = fold("Criteria, fixed beforehand", CLAIMS.grid(rows, only=("claim", "criterion")).html())
-    return joined([heading(title), paragraph(RULES_NOTE), CLAIMS.grid(rows, only=told).html(), criteria])
+    return joined([heading(title), paragraph(RULES_NOTE), CLAIMS.grid(rows, only=keys).html(), criteria])
 
 
 def counted_verdicts(verdicts: Sequence[Verdict]) -> str:
     """Return ``Of 7 claims, 5 are borne out (C1, ...), 2 are undecided (...).``; empty without verdicts."""
     named = {answer: [one.claim for one in verdicts if one.verdict == answer] for answer in MARKS}
-    said = [
+    parts = [
         f"{len(names)} {'is' if len(names) == 1 else 'are'} {answer} ({', '.join(names)})"
         for answer, names in named.items()
         if names
     ]
-    return f" Of {many(len(verdicts), 'claim')}, {', '.join(said)}." if said else ""
+    return f" Of {many(len(verdicts), 'claim')}, {', '.join(parts)}." if parts else ""
 
 
 def rule_note(repeats: int, *more: str) -> Markup:
     """State below the answer what counts as found, and what the intervals do not cover."""
     draws = "The one repeat is one draw" if repeats == 1 else f"The repeats are {repeats} draws"
-    said = (
+    text = (
         f"{draws} of the noise before the same board in the same place with one unit of each camera: the intervals "
         "hold for these set-ups, not for other boards, places or units."
     )
-    return note(" ".join((found_rule(repeats), *more, said)))
+    return note(" ".join((found_rule(repeats), *more, text)))
 
 
 def left_out(runs: pd.DataFrame) -> str:
@@ -251,5 +251,5 @@ def ways_grid(compared: pd.DataFrame) -> Grid:
     ]
     heads = ("registration, merge", *(many(n, "view") for n in views))
     of_holes = f" of {max(row['holes'] for row in rows)}" if rows else ""
-    said = " / ".join(f"N={n}" for n in frames)
-    return Grid.of(heads, cells, title=f"holes found{of_holes} with {said} frames a view (+: undecided)")
+    numbers = " / ".join(f"N={n}" for n in frames)
+    return Grid.of(heads, cells, title=f"holes found{of_holes} with {numbers} frames a view (+: undecided)")

@@ -42,8 +42,8 @@ def overlay_figure(limits: Sequence[SetUpLimit]) -> str:
     """Draw `draw_overlay` for a page."""
     names = [name_of(limit) for limit in limits]
     lines = sum(-(-len(name) // LONGEST_NAME) for name in names) / _names_across(names)
-    said = " ".join(limit_sentence(limit) for limit in limits)
-    return svg("overlay", (5.4, 3.4 + 0.2 * lines), said, lambda figure: draw_overlay(figure, limits))
+    sentences = " ".join(limit_sentence(limit) for limit in limits)
+    return svg("overlay", (5.4, 3.4 + 0.2 * lines), sentences, lambda figure: draw_overlay(figure, limits))
 
 
 def _names_across(names: Sequence[str]) -> int:
@@ -199,9 +199,9 @@ def axis_figure(axis: study.AxisGroup, name: str) -> str:
             pairs = [pair for _, line in shown for pair in zip(line.values, line.limits, strict=True)]
             without = sum(at == value and not is_within_sizes(limit) for at, limit in pairs)
             if without:
-                said = "no limit" if len(shown) == 1 else f"no limit\n({without})"
+                words = "no limit" if len(shown) == 1 else f"no limit\n({without})"
                 style = {"ha": "center", "va": "bottom", "fontsize": 8, "color": GREY}
-                axes.text(place, 1.02, said, transform=axes.get_xaxis_transform(), **style)
+                axes.text(place, 1.02, words, transform=axes.get_xaxis_transform(), **style)
         if logarithmic:
             axes.set_xscale("log")
             axes.minorticks_off()
@@ -312,5 +312,5 @@ def _surface_notes(result: StudyResult) -> list[str]:
         if why:
             reasons.setdefault(why, []).append(name_of(one.limit))
     every = len(result.set_ups)
-    said = {why: "" if len(names) == every else f" ({', '.join(names)})" for why, names in reasons.items()}
-    return [f"{why}{where}." for why, where in said.items()]
+    notes = {why: "" if len(names) == every else f" ({', '.join(names)})" for why, names in reasons.items()}
+    return [f"{why}{where}." for why, where in notes.items()]

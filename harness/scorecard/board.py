@@ -196,11 +196,11 @@ def run_board(options: argparse.Namespace, recording: Recording | None, command:
             f"{options.board}: declares no drilled board in front of a simulated camera, or no threshold k",
             legal="source.kind: simulated, source.target.name: custom with holes, threshold: {k: ...}",
         )
-    camera, frames, told, rows = camera_of(source.camera), config.capture.frames, [], []
+    camera, frames, remarks, rows = camera_of(source.camera), config.capture.frames, [], []
     image, judged = image_of(target, camera, recording.lens if recording else None), {}
     if recording is not None:
         left_out = {left.name: left.why for left in average(recording, AverageConfig()).left_out}
-        told = [f"{name} is left out: {why}" for name, why in left_out.items()]
+        remarks = [f"{name} is left out: {why}" for name, why in left_out.items()]
         z_m = np.stack([frame.z_m for frame in recording.frames() if frame.name not in left_out]).astype(float)
         frames, judged["capture"] = len(z_m), measured(z_m, image, target, config, detectors)
     for point in points:
@@ -212,10 +212,10 @@ def run_board(options: argparse.Namespace, recording: Recording | None, command:
             rows.append(Beside(label, *key, count, known, value))
         print(f"simulated: {label}", flush=True)
     answer = _answer(rows) if recording else "No capture is given: the simulation stands alone."
-    print("\n".join([answer, *told]))
+    print("\n".join([answer, *remarks]))
     drawn = svg("peaks", (7.2, 4.4), "Peaks of the holes", lambda canvas: _draw(canvas, target, judged))
     body = [figure({"peaks": drawn}, "peaks", CAPTION), heading("All numbers"), BESIDE.grid(rows).html()]
-    under = [*map(note, told), paragraph(f"{frames} frames of each set-up. {HOW}")]
+    under = [*map(note, remarks), paragraph(f"{frames} frames of each set-up. {HOW}")]
     title = f"{config.title or config.name} beside the simulated {camera.title}"
     show([BESIDE.grid(rows)])
     write_table(options.out, BESIDE, BESIDE.frame(rows))

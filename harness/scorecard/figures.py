@@ -197,15 +197,15 @@ def measured(requests: Iterable[Request], effort: Effort, jobs: int) -> dict[Req
         scenes[canonical_json([request[0], *scene_of(request[2])])].append(request)
     groups = list(scenes.values())
     results: dict[Request, Reading] = {}
-    said = time.monotonic()
+    last_s = time.monotonic()
     # processes that start anew: a forked one would share the locks of this one's libraries
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
         mapped = map if jobs == 1 else pool.map
         found = mapped(measure_group, groups, [effort] * len(groups))
         for group, readings in zip(groups, found, strict=True):
             results |= zip(group, readings, strict=True)
-            if time.monotonic() - said > SAID_EVERY_S:
-                said = time.monotonic()
+            if time.monotonic() - last_s > SAID_EVERY_S:
+                last_s = time.monotonic()
                 print(f"measured {len(results)} of {sum(map(len, groups))} numbers", file=sys.stderr, flush=True)
     return results
 
@@ -256,8 +256,8 @@ def _reading(name: str, low: str, high: str, note: str) -> tuple[Column, ...]:
 
 
 def _ratio(row: Beside) -> str:
-    told = row.unit == "mm" and row.measured.value > 0 and np.isfinite(row.simulated.value)
-    return f"{row.simulated.value / row.measured.value:.2f}" if told else "–"
+    known = row.unit == "mm" and row.measured.value > 0 and np.isfinite(row.simulated.value)
+    return f"{row.simulated.value / row.measured.value:.2f}" if known else "–"
 
 
 def _named(score: Score) -> str:

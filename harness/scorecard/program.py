@@ -73,8 +73,8 @@ def run_scorecard(options: argparse.Namespace, command: str) -> int:
         if score.passes and score.figure.fails:
             print(f"{score.figure.name} passes: remove `fails` from its entry", file=sys.stderr)
         if score.fell_behind:
-            told = "simulated {:.4g}, passes from {:g} to {:g}".format(score.simulated.value, *score.figure.limits)
-            print(f"{score.figure.name} ({score.figure.what()}) fails: {told}", file=sys.stderr)
+            text = "simulated {:.4g}, passes from {:g} to {:g}".format(score.simulated.value, *score.figure.limits)
+            print(f"{score.figure.name} ({score.figure.what()}) fails: {text}", file=sys.stderr)
     return int(any(score.fell_behind for score in scores))
 
 

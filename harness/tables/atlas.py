@@ -1,4 +1,4 @@
-"""The table of the atlas: limits at any distance and number of frames, read off the surfaces of set-ups computed."""
+"""The table of the atlas: limits at any distance and number of frames, interpolated between computed set-ups."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from harness.evaluation.atlas import Answer, LimitSurface, Outside
 from harness.tables.schema import Column, Estimate, Table
 
 DAMAGE = {"through": "through-hole", "blind": "blind hole", "dent": "dent"}
-"""Words for kinds of damage; others are called by their own name."""
+"""Words for kinds of damage; other kinds keep their name."""
 DISTANCES = 25
-"""Distances on a curve, evenly spaced in their logarithm."""
+"""Number of distances on a curve; their logarithms are evenly spaced."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A surface read at a place, with the answer there. ``title``: the camera's; ``size_mm``: asked for, or NaN."""
+    """The answer of a surface at a place. ``title``: the camera's. ``size_mm``: the size in question, or NaN."""
 
     surface: LimitSurface
     title: str
@@ -29,7 +29,7 @@ class Row:
 
     @property
     def damage(self) -> str:
-        """The kind of damage with its depth, as ``blind hole 6 mm deep``."""
+        """The kind of damage with its depth, such as ``blind hole 6 mm deep``."""
         depth = self.place.get("depth_mm")
         return damage_words(self.surface.kind) + ("" if depth is None else f" {depth:g} mm deep")
 
@@ -47,31 +47,31 @@ def _a90(row: Row) -> Estimate:
 
 ATLAS = Table(
     "atlas",
-    "one row per camera, damage, detector, distance and number of frames: the limit that the atlas states there",
+    "one row per camera, damage, detector, distance and number of frames: the limit that the atlas states",
     (
-        Column("camera", "camera", "title", "the camera's title"),
-        Column("camera_name", "", "surface.camera", "its name in experiments"),
+        Column("camera", "camera", "title", "title of the camera"),
+        Column("camera_name", "", "surface.camera", "name of the camera in experiments"),
         Column("damage", "damage", "damage", "kind of damage, with its depth"),
         Column("detector", "detector", "surface.detector", "name of the detector"),
         Column("distance_m", "distance (m)", lambda row: row.place["distance_m"], "distance of the target"),
-        Column("frames", "frames", lambda row: int(row.place["frames"]), "frames averaged"),
-        Column("albedo", "albedo", lambda row: row.place.get("albedo"), "the target's, where the atlas has several"),
-        Column("depth_mm", "", lambda row: row.place.get("depth_mm"), "depth of the damage, where it has one"),
+        Column("frames", "frames", lambda row: int(row.place["frames"]), "number of averaged frames"),
+        Column("albedo", "albedo", lambda row: row.place.get("albedo"), "the target's, if the atlas has several"),
+        Column("depth_mm", "", lambda row: row.place.get("depth_mm"), "depth of the damage, if it has one"),
         Column(
             "a90_mm",
             "a90 (mm)",
             _a90,
-            "size found 90 % of the time, with the 95 % interval of the surface; beyond the largest inspected where "
-            "all set-ups around miss such damage; none where one of them has no limit",
+            "size found 90 % of the time, with the 95 % interval of the surface; beyond the largest inspected size if "
+            "all neighbouring set-ups miss such damage; empty if one of them has no limit",
             interval=True,
         ),
-        Column("largest_mm", "", "answer.largest_mm", "largest size inspected there; none where a90 is unknown"),
-        Column("surface_error", "", "surface.error", "of the surface: rms of ln a90, each set-up left out in turn"),
+        Column("largest_mm", "", "answer.largest_mm", "largest inspected size; empty if a90 is unknown"),
+        Column("surface_error", "", "surface.error", "rms error of ln a90 when each set-up is left out in turn"),
         Column(
             "found",
             "found?",
             lambda row: "" if np.isnan(row.size_mm) else row.answer.verdict(row.size_mm),
-            "whether damage of the size asked for is found nine times out of ten: yes, no, undecided",
+            "whether damage of the given size is found nine times out of ten: yes, no or undecided",
         ),
     ),
     title="the atlas: size found 90 % of the time",
@@ -82,7 +82,7 @@ ATLAS = Table(
 def rows_at(
     surfaces: Iterable[LimitSurface], titles: Mapping[str, str], place: Mapping[str, float], size_mm: float = np.nan
 ) -> tuple[list[Row], list[tuple[str, str]]]:
-    """Return the rows at a place, best first, and why surfaces give no answer there, each with its camera's title."""
+    """Return the rows at a place, smallest limit first, and (reason, camera's title) of surfaces without an answer."""
     rows, refused = [], []
     for surface in surfaces:
         own = {axis: place[axis] for axis in surface.grid if axis in place}
@@ -95,7 +95,7 @@ def rows_at(
 
 
 def curves(surfaces: Sequence[LimitSurface], titles: Mapping[str, str]) -> list[Row]:
-    """Return every surface at `DISTANCES` distances, at each number of frames, depth and albedo that was computed."""
+    """Return rows of every surface at `DISTANCES` distances and each computed number of frames, depth and albedo."""
     rows = []
     for surface in surfaces:
         ends = surface.grid["distance_m"]

@@ -1,4 +1,4 @@
-"""Tables of one's own camera: figures of its captures beside simulations, its diagrams' points, its certificate."""
+"""Tables of a user's camera: figures of its captures and of simulations, points of its diagrams, its certificate."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from harness.tables.schema import Column, Estimate, Table
 
 LEAST = {"mm": 0.01, "px": 0.05, "1": 0.05, "1/px": 0.01}
-"""Measured values below these, by unit, are as good as none: a ratio to them says nothing."""
+"""Measured values below these, by unit, are too small for a ratio to them to mean anything."""
 
 
 @dataclass(frozen=True)
 class OwnFigure:
-    """One figure: ``measured``, ``simulated`` from the camera file, of the nearest ``known`` camera; NaN without."""
+    """One figure: ``measured``, ``simulated`` from the camera file, and of the nearest ``known`` camera (or NaN)."""
 
     figure: str
     where: str
@@ -24,12 +24,12 @@ class OwnFigure:
 
     @property
     def ratio(self) -> float:
-        """Simulated by measured; NaN where next to nothing is measured."""
+        """Simulated over measured value; NaN where the measured value is close to 0."""
         return self._by_measured(self.simulated)
 
     @property
     def known_ratio(self) -> float:
-        """The known camera's by measured, likewise."""
+        """The known camera's over the measured value; NaN where the measured value is close to 0."""
         return self._by_measured(self.known)
 
     def _by_measured(self, value: float) -> float:
@@ -39,17 +39,17 @@ class OwnFigure:
 
 OWN_FIGURES = Table(
     "characteristics",
-    "one row per figure of one's own camera",
+    "one row per figure of the user's camera",
     (
         Column("figure", "figure", "figure", "name of the figure, as makers name it"),
         Column("where", "where", "where", "surface, or direction and lag"),
         Column("unit", "unit", "unit", "mm, px or 1"),
-        Column("measured", "measured", "measured", "of the captures, with its 95 % interval where told", interval=True),
-        Column("simulated", "simulated", "simulated", "of frames simulated from the camera file, analysed alike"),
-        Column("ratio", "ratio", "ratio", "simulated by measured"),
-        Column("known", "known camera", "known", "of the nearest known camera, simulated before the same surfaces"),
-        Column("known_ratio", "its ratio", "known_ratio", "known camera's by measured", brief=False),
-        Column("meaning", "", "meaning", "what the figure says"),
+        Column("measured", "measured", "measured", "value in the captures, with 95 % interval if known", interval=True),
+        Column("simulated", "simulated", "simulated", "value in frames that are simulated from the camera file"),
+        Column("ratio", "ratio", "ratio", "simulated over measured value"),
+        Column("known", "known camera", "known", "value of the nearest known camera, simulated with the same surfaces"),
+        Column("known_ratio", "its ratio", "known_ratio", "known camera's over measured value", brief=False),
+        Column("meaning", "", "meaning", "meaning of the figure"),
     ),
     formats=("csv",),
     left=3,
@@ -57,9 +57,9 @@ OWN_FIGURES = Table(
 
 OWN_CURVES = Table(
     "curves",
-    "one row per point of a diagram of one's own camera",
+    "one row per point of a diagram of the user's camera",
     (
-        Column("diagram", note="what y is, and against what"),
+        Column("diagram", note="what y is, and what it is plotted against"),
         Column("source", note="measured, simulated or known camera"),
         Column("series", note="capture, or direction"),
         Column("x", note="m, degrees, amplitude, pixels, cycles per pixel or number of the frame, by the diagram"),
@@ -72,15 +72,15 @@ FLAT_SURFACES = Table(
     "one row per flat surface of a certificate",
     (
         Column("surface", "surface", note="capture, distance and angle of incidence"),
-        Column("temporal_mm", "temporal noise (mm)", note="of single pixels", interval=True),
-        Column("frame_rms_mm", "plane-fit rms, one frame (mm)", note="of points about their own plane"),
-        Column("average_rms_mm", "average (mm)", note="the same of the average of all frames"),
-        Column("form95_mm", "dispersion, 95 % (mm)", note="width that so many of a frame's points need"),
-        Column("form997_mm", "flatness, 99.7 % (mm)", note="likewise"),
+        Column("temporal_mm", "temporal noise (mm)", note="temporal noise of single pixels", interval=True),
+        Column("frame_rms_mm", "plane-fit rms, one frame (mm)", note="rms distance of points from their own plane"),
+        Column("average_rms_mm", "average (mm)", note="the same for the average of all frames"),
+        Column("form95_mm", "dispersion, 95 % (mm)", note="width of the layer that holds 95 % of a frame's points"),
+        Column("form997_mm", "flatness, 99.7 % (mm)", note="width of the layer that holds 99.7 %"),
         Column("fill_rate", "fill rate", note="share of pixels and frames with a return"),
-        Column("lod95_1_mm", "LoD95, 1 frame (mm)", note="level of detection of one pixel's z"),
-        Column("lod95_10_mm", "10 frames (mm)", note="likewise"),
-        Column("lod95_50_mm", "50 frames (mm)", note="likewise"),
+        Column("lod95_1_mm", "LoD95, 1 frame (mm)", note="level of detection of one pixel's z, 1 frame"),
+        Column("lod95_10_mm", "10 frames (mm)", note="the same for the average of 10 frames"),
+        Column("lod95_50_mm", "50 frames (mm)", note="the same for the average of 50 frames"),
     ),
     formats=(),
 )
@@ -90,8 +90,8 @@ CERTIFIED = Table(
     (
         Column("quantity", "quantity", note="what was measured"),
         Column("conditions", "conditions", note="capture, distance and angle, or frames"),
-        Column("value", "value", note="with its unit"),
-        Column("manner", "how", note="definition, and the standard in whose manner it is"),
+        Column("value", "value", note="the value with its unit"),
+        Column("manner", "how", note="definition, and the standard that it follows"),
     ),
     formats=(),
     left=4,

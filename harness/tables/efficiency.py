@@ -1,4 +1,4 @@
-"""Tables of efficiency: every detector beside the ideal observer, and the ideal observer on every damage."""
+"""Tables of efficiency: every detector compared with the ideal observer, and the ideal observer on every damage."""
 
 from __future__ import annotations
 
@@ -7,28 +7,30 @@ from dataclasses import dataclass, replace
 
 from harness.evaluation.intervals import UNKNOWN
 from harness.evaluation.study.efficiency import Efficiency, Level
-from harness.tables.limits import CALLS, a50_of, a90_of
+from harness.tables.limits import CALLS, SET_UP, a50_of, a90_of
 from harness.tables.schema import Column, Estimate, Table
 from harness.tables.text import unbroken
 
-INDEX = "d' of the ideal observer at the damage"
+INDEX = "d' of the ideal observer for the damage"
+INDEX_50, INDEX_90 = (f"{INDEX} that the detector finds {share} % of the time" for share in (50, 90))
+IDEAL_A90 = "diameter that the ideal observer finds 90 % of the time"
 
 
 def _ideal_size(level: Level) -> Estimate:
-    """Return the ideal observer's size; without its interval where it misses nothing."""
+    """Return the ideal observer's size, without an interval if it misses nothing."""
     ends = UNKNOWN if level.at_most else level.ideal_mm_interval
     return Estimate(level.ideal_mm, ends.low, ends.high, at_most=level.at_most)
 
 
 EFFICIENCY = Table(
     "efficiency",
-    "one row per set-up and number of frames of a study: its detector beside the ideal observer",
+    "one row per set-up and number of frames of a study: its detector compared with the ideal observer",
     (
-        Column("set_up", "set-up", "limit.record.label", "name of the set-up, with its frames", unbroken),
+        Column("set_up", "set-up", "limit.record.label", SET_UP.note, unbroken),
         Column("variant", "", "limit.record.variant", "name of the set-up"),
-        Column("frames", "", "limit.record.frames", "frames averaged"),
+        Column("frames", "", "limit.record.frames", "number of averaged frames"),
         Column("detector", "detector", "limit.record.detector", "name of the detector"),
-        Column("detector_version", "", "limit.record.detector_version", "its version"),
+        Column("detector_version", "", "limit.record.detector_version", "version of the detector"),
         Column(
             "ideal_a50_mm",
             "ideal a50 (mm)",
@@ -36,20 +38,20 @@ EFFICIENCY = Table(
             "diameter that the ideal observer finds 50 % of the time, with its 95 % interval over boards",
             interval=True,
         ),
-        Column("ideal_is_at_most", "", "half.at_most", "it misses nothing: its sizes are at most the smallest"),
-        Column("a50_mm", "a50 (mm)", lambda one: a50_of(one.limit), "the detector's", interval=True),
-        Column("ideal_a90_mm", "ideal a90 (mm)", lambda one: _ideal_size(one.most), "likewise, 90 %", interval=True),
-        Column("a90_mm", "a90 (mm)", lambda one: a90_of(one.limit), "the detector's", interval=True),
-        Column("ideal_index_50", "", "half.ideal_index", f"{INDEX} at which it finds 50 %"),
-        Column("index_50", "d' at 50 %", ("half.index", "half.index_interval"), "at which the detector finds 50 %"),
+        Column("ideal_is_at_most", "", "half.at_most", "whether it misses nothing, so that its sizes are upper bounds"),
+        Column("a50_mm", "a50 (mm)", lambda one: a50_of(one.limit), "the detector's a50", interval=True),
+        Column("ideal_a90_mm", "ideal a90 (mm)", lambda one: _ideal_size(one.most), IDEAL_A90, interval=True),
+        Column("a90_mm", "a90 (mm)", lambda one: a90_of(one.limit), "the detector's a90", interval=True),
+        Column("ideal_index_50", "", "half.ideal_index", f"{INDEX} that it finds 50 % of the time"),
+        Column("index_50", "d' at 50 %", ("half.index", "half.index_interval"), INDEX_50),
         Column(
             "efficiency_50_share",
             "efficiency at 50 %",
             ("half.efficiency", "half.interval"),
             "(ideal_index_50 / index_50) squared, interval over boards",
         ),
-        Column("ideal_index_90", "", "most.ideal_index", f"{INDEX} at which it finds 90 %"),
-        Column("index_90", "d' at 90 %", ("most.index", "most.index_interval"), "at which the detector finds 90 %"),
+        Column("ideal_index_90", "", "most.ideal_index", f"{INDEX} that it finds 90 % of the time"),
+        Column("index_90", "d' at 90 %", ("most.index", "most.index_interval"), INDEX_90),
         Column(
             "efficiency_90_share",
             "efficiency at 90 %",
@@ -57,18 +59,18 @@ EFFICIENCY = Table(
             "(ideal_index_90 / index_90) squared, interval over boards",
         ),
         replace(CALLS[0], value=("limit.false_calls.rate_per_m2", "limit.false_calls.interval_per_m2")),
-        Column("units", "", "ideal.units", "units whose noise the ideal observer knows"),
+        Column("units", "", "ideal.units", "number of units whose noise the ideal observer knows"),
         Column("kurtosis", "", "ideal.kurtosis", "excess kurtosis of that noise; 0: Gaussian"),
-        Column("notes", "", "why", "why there is no efficiency"),
+        Column("notes", "", "why", "reason if there is no efficiency"),
     ),
-    title="efficiency: detectors beside the ideal observer",
+    title="efficiency: detectors compared with the ideal observer",
     left=2,
 )
 
 
 @dataclass(frozen=True)
 class DamageRow:
-    """One damage of a set-up, by its place in the arrays of ``of``."""
+    """One damage of a set-up, by its index in the arrays of ``of``."""
 
     of: Efficiency
     number: int
@@ -80,17 +82,17 @@ class DamageRow:
 
 DAMAGES = Table(
     "ideal",
-    "one row per damage of a set-up at a number of frames: the ideal observer on it, and the detector's hits",
+    "one row per damage, set-up and number of frames: the ideal observer's probability, and the detector's hits",
     (
-        Column("set_up", "", "of.limit.record.label", "name of the set-up, with its frames"),
+        Column("set_up", "", "of.limit.record.label", SET_UP.note),
         Column("board", "", "board", "number of the damaged board"),
-        Column("hole", "", "hole", "its damage"),
+        Column("hole", "", "hole", "number of the damage on the board"),
         Column("diameter_mm", "", "size_mm", "true diameter"),
         Column("index", "", "index", INDEX),
-        Column("threshold", "", "threshold", "of the ideal observer's statistic, deviations; empty where d' is 0"),
+        Column("threshold", "", "threshold", "threshold of its statistic, in standard deviations; empty where d' is 0"),
         Column("pod", "", "pod", "the ideal observer's probability of detection"),
-        Column("hits", "", "hits", "hits of the detector by depth"),
-        Column("inspections", "", "inspections", "draws of the noise in which the damage was inspected"),
+        Column("hits", "", "hits", "number of the detector's hits by depth"),
+        Column("inspections", "", "inspections", "number of inspections of the damage, with different noise"),
     ),
 )
 EFFICIENCY_TABLES = (EFFICIENCY, DAMAGES)

@@ -1,4 +1,4 @@
-"""Tables of a unit's flat field: its captures, and the figures that say how far it can be trusted."""
+"""Tables of a unit's flat field: its captures, and figures that show how reliable it is."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ FLAT_CAPTURES = Table(
     "one row per capture of the flat surface",
     (
         Column("capture", "capture", "name", "name of the capture"),
-        Column("frames", "frames", "frames", "frames that were averaged"),
+        Column("frames", "frames", "frames", "number of averaged frames"),
         Column("distance_m", "distance (m)", "distance_m", "median distance along the optical axis"),
         Column("tilt_deg", "tilt (°)", "tilt_deg", "angle between the optical axis and the surface's normal"),
-        Column("pixels", "pixels", "pixels", "pixels that count"),
-        Column("noise_mm", "noise (mm)", lambda one: one.noise_m / MM, "deviation of the average by the frames' noise"),
+        Column("pixels", "pixels", "pixels", "number of pixels used"),
+        Column("noise_mm", "noise (mm)", lambda one: one.noise_m / MM, "deviation of the average by temporal noise"),
         Column(
             "residual_mm",
             "residual (mm)",
             lambda one: one.residual_rms_m / MM,
-            "root mean square of range less the smooth fit: pattern, shape and noise",
+            "root mean square of range minus a smooth fit: pattern, shape and noise",
         ),
     ),
     formats=("csv",),
@@ -34,8 +34,8 @@ FLAT_FIGURES = Table(
     (
         Column("figure", "figure", note="name of the figure"),
         Column("unit", "unit", note="mm, or 1 for shares and correlations"),
-        Column("value", "value", note="its value, empty where the captures do not tell"),
-        Column("meaning", "meaning", note="what it says", brief=False),
+        Column("value", "value", note="value; empty if the captures do not determine it"),
+        Column("meaning", "meaning", note="meaning of the figure", brief=False),
     ),
     formats=("csv",),
     left=2,
@@ -48,10 +48,10 @@ def figures_of(found: Any) -> Iterator[dict[str, Any]]:
     def row(figure: str, value: float | None, meaning: str, unit: str = "mm") -> dict[str, Any]:
         return {"figure": figure, "value": value, "unit": unit, "meaning": meaning}
 
-    yield row("pattern", found.field.rms_m / MM, "rms of the unit's fixed pattern, the map's noise taken off")
-    yield row("noise of the map", found.noise_m / MM, "rms of its stated standard deviation")
-    shape = "the surface's shape" if found.separated else "the surface's shape, or what of the pattern is not stable"
-    yield row("between captures", found.surface_m / MM, f"deviation beyond noise between captures: {shape}")
+    yield row("pattern", found.field.rms_m / MM, "rms of the unit's fixed pattern, without the map's noise")
+    yield row("noise of the map", found.noise_m / MM, "rms of the map's standard deviation")
+    shape = "the surface's shape" if found.separated else "the surface's shape, or a part of the pattern that changes"
+    yield row("between captures", found.surface_m / MM, f"deviation between captures beyond their noise: {shape}")
     for part, what in ((found.in_time, "first and last captures"), (found.in_range, "near and far captures")):
         excess, correlation = (None, None) if part is None else (part.excess_m / MM, part.correlation)
         yield row(f"change, {what}", excess, f"rms of the difference of the maps of {what} beyond their noise")

@@ -1,4 +1,4 @@
-"""The table of detection limits, and limits in words: the answer, a sentence for each set-up, notes beside them.
+"""The table of detection limits, and limits in words: the answer, a sentence for each set-up, and notes.
 
 A curve says nothing about sizes that were not inspected: a size beyond the largest is written ``> 15.9``."""
 
@@ -22,7 +22,7 @@ MOST_ANSWERS = 3
 ONE_UNIT = "One unit of the camera"
 NOT_DEMONSTRATED = "not demonstrated"
 BEYOND = "lies beyond the largest size inspected"
-"""Words of a statement's note on an extrapolated bound; pages have words of their own for it."""
+"""Words in a statement's note on an extrapolated bound, which pages put differently."""
 
 
 def is_within_sizes(limit: SetUpLimit, bound: Bound | None = None) -> bool:
@@ -57,8 +57,9 @@ def size_estimate(limit: SetUpLimit, of: str) -> Estimate:
 a50_of, a90_of = (partial(size_estimate, of=of) for of in ("a50", "a90"))
 FOUND_50, FOUND_90 = (f"size found {share} % of the time" for share in (50, 90))
 BRIEF: dict[str, Any] = {"interval": True, "brief": lambda estimate: estimate.text().partition(" ")[0]}
-OF = "what these sizes are: the diameter (of long damage its width or length), or the depth where only that differs"
-EFFECT = "variance of a90 with boards as units over that with damages as units"
+OF = "kind of these sizes: diameter (for long damage, width or length), or depth where only the depth differs"
+MET = "whether that bound is demonstrated, beyond the inspected sizes or not demonstrated"
+EFFECT = "variance of a90 with boards as sampling units over that with damages as sampling units"
 SET_UP = Column("set_up", "set-up", "record.label", "name of the set-up, with its frames", text.unbroken, brief=str)
 CALLS = (
     Column(
@@ -68,18 +69,18 @@ CALLS = (
         "false calls on undamaged boards, with the exact 95 % Poisson interval",
         lambda rate: "none inspected" if np.isnan(rate.value) else rate.text(),
     ),
-    Column("false_calls", "", "false_calls.calls", "false calls counted"),
-    Column("hole_free_m2", "", lambda one: float(one.record.unflawed.area_m2.sum()), "undamaged face inspected"),
+    Column("false_calls", "", "false_calls.calls", "number of false calls on them"),
+    Column("hole_free_m2", "", lambda one: float(one.record.unflawed.area_m2.sum()), "undamaged area inspected"),
 )
 
 
 def quoted(limit: SetUpLimit) -> Bound:
-    """Return the limit to quote: a new unit's where there are several, else a90/95 of the one unit."""
+    """Return the limit to quote: that of a new unit if there are several units, else a90/95 of the single unit."""
     return limit.a90_95 if limit.over_units is None else limit.over_units.new_unit
 
 
 def _one_unit(limit: SetUpLimit) -> Estimate:
-    """a90/95 as a study of one unit alone would state it: of several units the median, with the least and the most."""
+    """Return the a90/95 of a study of one unit; of several units, the median with the lowest and the highest."""
     bounds = limit.a90_95.value if limit.over_units is None else limit.over_units.a90_95_mm
     middle, low, high = (float(of(bounds)) for of in (np.median, np.min, np.max))
     ends = (low, high) if limit.over_units is not None else (np.nan, np.nan)
@@ -92,7 +93,7 @@ def _verdict(limit: SetUpLimit, bound: Bound) -> str:
 
 
 def _kinds(limit: SetUpLimit) -> tuple[int, int] | None:
-    """Hits by depth and by missing returns, where they were counted apart."""
+    """Return the hits by depth and by missing returns; None where they were not counted separately."""
     seen = limit.record.inspected
     if seen.by_depth is None or seen.by_no_return is None:
         return None
@@ -107,46 +108,46 @@ def _found(limit: SetUpLimit) -> str:
 
 LIMITS = Table(
     "limits",
-    "one row per set-up and number of frames of a study: its detection limit and what it rests on",
+    "one row per set-up and number of frames of a study: its detection limit, and the data behind it",
     (
         SET_UP,
         Column("variant", "", "record.variant", "name of the set-up"),
-        Column("frames", "", "record.frames", "frames averaged"),
-        Column("<axis>", "", "record.axes", "value on each axis of the experiment, by its dotted path", spread=True),
+        Column("frames", "", "record.frames", "number of averaged frames"),
+        Column("<axis>", "", "record.axes", "one column per axis, named by its dotted path: its value", spread=True),
         Column(
             "a90_95_mm",
             "a90/95 (mm)",
             lambda one: bound_estimate(one, one.a90_95),
-            "upper bound of a90 at 95 % confidence, the limit to quote; empty where not demonstrated",
+            "upper bound of a90 at 95 % confidence, which is the limit to quote; empty where not demonstrated",
             bound_text,
             tone=lambda one: "key" if is_within_sizes(one) else "bad",
         ),
-        Column("a90_95_verdict", "", lambda one: _verdict(one, one.a90_95), "demonstrated, beyond the sizes, or not"),
-        Column("a90_95_method", "", "a90_95.method", "how the bound was taken"),
+        Column("a90_95_verdict", "", lambda one: _verdict(one, one.a90_95), MET),
+        Column("a90_95_method", "", "a90_95.method", "method by which the bound was computed"),
         Column(
             "over_boards_mm",
             "over boards (mm)",
             lambda one: bound_estimate(one, one.over_boards),
-            "a90/95 that allows for damages of one board faring alike",
+            "a90/95 that allows for correlated results of damages on one board",
             bound_text,
             tone=lambda one: "" if is_within_sizes(one, one.over_boards) else "bad",
         ),
-        Column("over_boards_verdict", "", lambda one: _verdict(one, one.over_boards), "likewise"),
+        Column("over_boards_verdict", "", lambda one: _verdict(one, one.over_boards), MET),
         Column(
             "new_unit_mm",
             "new unit (mm)",
             lambda one: bound_estimate(one, quoted(one)) if one.over_units else None,
-            "of several units: upper bound at 95 % confidence of the a90 of a unit drawn anew",
+            "with several units: upper bound at 95 % confidence of the a90 of a new unit",
             lambda bound: text.UNKNOWN_TEXT if bound is None else bound_text(bound),
         ),
-        Column("new_unit_verdict", "", lambda one: _verdict(one, quoted(one)) if one.over_units else None, "likewise"),
-        Column("one_unit_mm", "one unit (mm)", _one_unit, "a90/95 of one unit alone: median, least, most", **BRIEF),
+        Column("new_unit_verdict", "", lambda one: _verdict(one, quoted(one)) if one.over_units else None, MET),
+        Column("one_unit_mm", "one unit (mm)", _one_unit, "a90/95 of single units: median, lowest, highest", **BRIEF),
         Column("unit_spread", "", "over_units.spread", "standard deviation of ln a90 between units, noise included"),
-        Column("units", "", "record.units", "units of the camera"),
+        Column("units", "", "record.units", "number of units of the camera"),
         Column("a90_mm", "a90 (mm)", a90_of, f"{FOUND_90}, with its 95 % interval over boards", **BRIEF),
-        Column("a50_mm", "a50 (mm)", a50_of, f"{FOUND_50}, likewise", **BRIEF),
+        Column("a50_mm", "a50 (mm)", a50_of, f"{FOUND_50}, with its 95 % interval over boards", **BRIEF),
         Column("limit_of", "", "record.inspected.limit_of", OF),
-        Column("is_at_most", "", "is_at_most", "everything was found: a50 and a90 are at most this"),
+        Column("is_at_most", "", "is_at_most", "whether everything was found, so that a50 and a90 are upper bounds"),
         Column("smallest_mm", "", lambda one: _ends_mm(one)[0], "smallest size inspected"),
         Column("largest_mm", "", lambda one: _ends_mm(one)[1], "largest size inspected"),
         *CALLS,
@@ -154,61 +155,61 @@ LIMITS = Table(
             "beside_per_m2",
             "beside/m²",
             ("beside.rate_per_m2", "beside.interval_per_m2"),
-            "findings on damaged boards that count for no damage, with the exact 95 % Poisson interval",
+            "findings on damaged boards that match no damage, with the exact 95 % Poisson interval",
             CALLS[0].text,
             brief=lambda rate: text.UNKNOWN_TEXT if np.isnan(rate.value) else f"{rate.value:.2g}",
         ),
-        Column("beside_calls", "", "beside.calls", "such findings counted"),
+        Column("beside_calls", "", "beside.calls", "number of such findings"),
         Column("", "found", _found, brief=False),
-        Column("hits", "", "hits", "damages found"),
-        Column("inspections", "", "inspections", "damages inspected, repeats counted"),
+        Column("hits", "", "hits", "number of hits"),
+        Column("inspections", "", "inspections", "number of inspections: damages times repeats"),
         Column(
             "size_error_mm",
             "size error (mm)",
             "size_error_mm",
-            "median error of the measured size of hits (the diameter by the model, of long damage its width or length)",
+            "median error of the measured size of hits (the model's diameter; for long damage, width or length)",
             brief=False,
         ),
-        Column("sized", "", "sized", "hits whose size was measured"),
+        Column("sized", "", "sized", "number of hits whose size was measured"),
         Column(
             "seconds_detect",
             "ms a cloud",
             "seconds_detect",
-            "median time of detection and measurement on a damaged board",
+            "median time to detect and measure on a damaged board",
             lambda seconds: text.UNKNOWN_TEXT if np.isnan(seconds) else f"{1e3 * seconds:.0f}",
             brief=False,
         ),
         Column("hits_by_depth", "", lambda one: (_kinds(one) or (None, None))[0], "hits by depth"),
         Column("hits_by_no_return", "", lambda one: (_kinds(one) or (None, None))[1], "hits by missing returns"),
-        Column("targets", "targets", "targets", "damages, each counted once", brief=False),
-        Column("boards", "boards", "boards", "damaged boards"),
+        Column("targets", "targets", "targets", "number of damages", brief=False),
+        Column("boards", "boards", "boards", "number of damaged boards"),
         Column("design_effect", "design effect", "design_effect", EFFECT, text.mm, brief=False),
-        Column("threshold", "", "record.threshold", "in the detector's units"),
-        Column("threshold_mm", "", "record.threshold_mm", "the same times the mean scale"),
-        Column("calibration_runs", "", "record.calibration_runs", "undamaged runs that set it; 0: given"),
+        Column("threshold", "", "record.threshold", "threshold in the detector's units"),
+        Column("threshold_mm", "", "record.threshold_mm", "threshold times the mean scale"),
+        Column("calibration_runs", "", "record.calibration_runs", "number of calibration runs; 0: threshold was given"),
         Column("detector", "", "record.detector", "name of the detector"),
-        Column("detector_version", "", "record.detector_version", "its version"),
-        Column("failed", "", "record.failed", "trials that failed"),
-        Column("notes", "", lambda one: "; ".join(notes_of(one)), "what to know beside the limit"),
+        Column("detector_version", "", "record.detector_version", "version of the detector"),
+        Column("failed", "", "record.failed", "number of trials that failed"),
+        Column("notes", "", lambda one: "; ".join(notes_of(one)), "remarks on the limit"),
     ),
-    title="detection limits: found 50 and 90 % of the time, and 90 % with 95 % confidence",
+    title="detection limits: sizes found 50 and 90 % of the time, and 90 % with 95 % confidence",
 )
 
 SCORES = Table(
     "scores",
-    "one row per category of a data set: anomaly maps by the measures of their own field, on the inspected pixels",
+    "one row per category of a data set: quality of anomaly maps on the inspected pixels",
     (
         Column("category", "category", note="name of the category"),
-        Column("au_pro", "AU-PRO", note="area under the mean overlap, up to 30 % false pixels, over 0.3"),
-        Column("pixel_auroc", "AUROC of pixels", note="area under the curve of damaged and other pixels"),
-        Column("board_auroc", "AUROC of boards", note="likewise of boards, by their highest pixels"),
+        Column("au_pro", "AU-PRO", note="area under the per-region overlap up to 30 % false pixels, over 0.3"),
+        Column("pixel_auroc", "AUROC of pixels", note="area under the ROC curve of pixels"),
+        Column("board_auroc", "AUROC of boards", note="area under the ROC curve of boards, by their highest pixels"),
     ),
     title="anomaly maps",
 )
 
 
 def limits_grid(limits: Sequence[SetUpLimit], *, terminal: bool = False) -> Grid:
-    """Return the table; columns on units only where there are several: with one, its first words say so."""
+    """Return the table. It has columns on units if there are several; with a single unit, its title says so."""
     if any(limit.over_units for limit in limits):
         return LIMITS.grid(limits, terminal=terminal, heads={"a90/95 (mm)": "all units (mm)", "over boards (mm)": ""})
     grid = LIMITS.grid(limits, terminal=terminal, heads={"new unit (mm)": "", "one unit (mm)": ""})
@@ -221,13 +222,13 @@ def _ends_mm(*limits: SetUpLimit) -> tuple[float, float]:
 
 
 def study_answer(limits: Sequence[SetUpLimit]) -> str:
-    """Return a sentence for each set-up, or the span of the limits of many; with one unit it says so first."""
+    """Return a sentence for each set-up, or the range of limits of many. With a single unit, it begins by saying so."""
     if not limits:
         return "No set-up was inspected, so there is no answer."
-    said = _answer(limits)
+    answer = _answer(limits)
     if any(limit.over_units for limit in limits):
-        return said
-    return f"{ONE_UNIT}: {said[0].lower() if said.startswith(('Of ', 'None ')) else said[0]}{said[1:]}"
+        return answer
+    return f"{ONE_UNIT}: {answer[0].lower() if answer.startswith(('Of ', 'None ')) else answer[0]}{answer[1:]}"
 
 
 def _answer(limits: Sequence[SetUpLimit]) -> str:
@@ -235,8 +236,8 @@ def _answer(limits: Sequence[SetUpLimit]) -> str:
         return " ".join(limit_sentence(limit, again=number > 0) for number, limit in enumerate(limits))
     shown = sorted((one for one in limits if is_within_sizes(one, quoted(one))), key=lambda one: quoted(one).value)
     if not shown:
-        said = f"None of {len(limits)} set-ups demonstrates a limit (a90/95) within the sizes inspected"
-        return f"{said}{_sizes(*limits)}."
+        sentence = f"None of {len(limits)} set-ups demonstrates a limit (a90/95) within the sizes inspected"
+        return f"{sentence}{_sizes(*limits)}."
     kinds = sorted({one.record.inspected.limit_of for one in shown}, reverse=True)
     spans = []
     for kind in kinds:  # a depth is not compared with a diameter
@@ -259,7 +260,7 @@ def limit_sentence(limit: SetUpLimit, *, again: bool = False) -> str:
         reason = _reason(quote)
         if reason.startswith("a constant probability"):
             reason = f"the hits do not grow clearly with {limit.record.inspected.limit_of}"
-        # without its statistics, which stand in the notes
+        # the notes give the statistics in brackets
         found = f"a90/95 is {NOT_DEMONSTRATED}: {re.sub(r' [(][^()]*[<>=][^()]*[)]', '', reason)}"
     elif not is_within_sizes(limit, quote):
         found = f"no limit (a90/95) within the sizes inspected{_sizes(limit)}"
@@ -272,7 +273,7 @@ def limit_sentence(limit: SetUpLimit, *, again: bool = False) -> str:
     calls, rate = limit.false_calls, ""
     if calls is not None:
         ends = (calls.rate_per_m2, calls.interval_per_m2.low, calls.interval_per_m2.high)
-        if limit.over_units is not None:  # a board is a unit: calls of one are not independent
+        if limit.over_units is not None:  # each board has its own unit: false calls on one board are not independent
             over = limit.false_calls_interval_per_m2
             ends = (ends[0], float(np.fmin(ends[1], over.low)), float(np.fmax(ends[2], over.high)))
         at, low, high = (f"{end:.2g}" if end < 99.5 else f"{end:.0f}" for end in ends)
@@ -283,33 +284,33 @@ def limit_sentence(limit: SetUpLimit, *, again: bool = False) -> str:
 
 def notes_of(limit: SetUpLimit) -> list[str]:
     """Return why there is no limit, or why it is cautious or doubtful."""
-    said = [] if limit.a90_95.demonstrated else [_reason(limit.a90_95)]
+    notes = [] if limit.a90_95.demonstrated else [_reason(limit.a90_95)]
     stated = limit.statement
     if stated is None:
-        said += [limit.a90_95.method] if limit.a90_95.demonstrated else []
+        notes += [limit.a90_95.method] if limit.a90_95.demonstrated else []
     else:
         if limit.a90_95.demonstrated and not is_within_sizes(limit):
-            said.append(f"a90/95 {BEYOND}, {limit.largest_mm:.3g} mm, and no inspection bears it out")
-        said += [note.partition(": see --")[0] for note in stated.notes if BEYOND not in note]
+            notes.append(f"a90/95 {BEYOND}, {limit.largest_mm:.3g} mm, and no inspection bears it out")
+        notes += [note.partition(": see --")[0] for note in stated.notes if BEYOND not in note]
     if limit.a50_mm <= 0:
-        said.append("the curve hardly rises with size: it would put sizes found below 0, which are not stated")
+        notes.append("the curve hardly rises with size: it would put sizes found below 0, which are not stated")
     if limit.boards_matter and limit.over_units is None:
         effect = f"design effect {limit.design_effect:.1f}"
-        said.append(f"damages of one board fare alike ({effect}): the limit over boards is the one to quote")
+        notes.append(f"damages of one board fare alike ({effect}): the limit over boards is the one to quote")
     only = limit.hits - (_kinds(limit) or (limit.hits,))[0]
     if only:
-        said.append(f"{only} of {limit.hits} hits by missing returns alone: nothing came back to measure")
+        notes.append(f"{only} of {limit.hits} hits by missing returns alone: nothing came back to measure")
     if limit.record.failed:
-        said.append(f"{limit.record.failed} trials failed and are missing")
-    return said
+        notes.append(f"{limit.record.failed} trials failed and are missing")
+    return notes
 
 
 def limit_notes(limits: Sequence[SetUpLimit]) -> list[str]:
-    """Return notes beside the limits: the conditions that all share, then a line for each set-up."""
+    """Return notes on the limits: first those that all set-ups share, then a line for each set-up."""
     notes = [(limit.record.label, notes_of(limit)) for limit in limits]
-    shared = [one for one in notes[0][1] if all(one in said for _, said in notes)] if len(notes) > 1 else []
-    own = [("every set-up", shared), *((name, [one for one in said if one not in shared]) for name, said in notes)]
-    return [f"{name}: {'; '.join(said)}" for name, said in own if said]
+    shared = [one for one in notes[0][1] if all(one in these for _, these in notes)] if len(notes) > 1 else []
+    own = [("every set-up", shared), *((name, [one for one in these if one not in shared]) for name, these in notes)]
+    return [f"{name}: {'; '.join(these)}" for name, these in own if these]
 
 
 def _reason(bound: Bound) -> str:

@@ -1,4 +1,4 @@
-"""Files that programs leave in a folder of results: `harness.clean` and `results/README.md` know them from here."""
+"""Declares the files that programs write into a folder of results, for `harness.clean` and `results/README.md`."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ FolderKind = Literal["results", "capture"]
 
 @dataclass(frozen=True)
 class Output:
-    """A file, or with * and ? in its ``name`` several; ``note``: what it is; ``place``: a folder of results, or that of
-    a real capture inside; ``of``: which experiments write it, empty for all."""
+    """A file; * and ? in its ``name`` stand for several. ``note``: its content. ``place``: a folder of results, or the
+    folder of a real capture in it. ``of``: the kind of experiment or program that writes it; empty: every sweep."""
 
     name: str
     note: str
@@ -26,22 +26,22 @@ REPORT = Output("report.html", "the report, one file, readable offline")
 EXPERIMENT = Output("experiment.yaml", "the experiment with every default written out")
 PROVENANCE = Output("provenance.json", "command, commit, versions, seed, machine, failures")
 STUDY = Output("study.json", "every inspection of every set-up: what `harness.compare` reads", of="study")
-LEARNED = Output("learning-*.npz", "what a detector has learned from hole-free boards of their own: arrays by name")
+LEARNED = Output("learning-*.npz", "what a detector has learned from separate hole-free boards: arrays by name")
 MAPS = Output("map-*.html", "a map that turns in the browser", of="views")
 CAPTURES = Output("summary.csv", "one row per point: threshold, frames, findings", of="capture")
 COMPARISON = Output("compare.json", "the comparison with another study, for programs", of="check")
-COMPARISON_PAGE = Output("compare.html", "the same as a page", of="check")
-EFFICIENCY_PAGE = Output("efficiency.html", "detectors beside the ideal observer", of="efficiency")
-COVERAGE_PAGE = Output("coverage.html", "a part that turns, coloured by the damage that is found", of="coverage")
+COMPARISON_PAGE = Output("compare.html", "the comparison as a page", of="check")
+EFFICIENCY_PAGE = Output("efficiency.html", "detectors compared with the ideal observer", of="efficiency")
+COVERAGE_PAGE = Output("coverage.html", "the part in 3-D, coloured by the size of damage that is found", of="coverage")
 ATLAS_PAGE = Output("atlas.html", "the atlas of limits: choose damage, size and distance", of="atlas")
 ATLAS_PICTURE = Output("atlas.png", "the atlas as a picture", of="atlas")
 FINDINGS = Output("findings.csv", "one row per finding", "capture", "capture")
-FINDINGS_DATA = Output("findings.json", "the same with both measures, target, settings, origin", "capture", "capture")
+FINDINGS_DATA = Output("findings.json", "findings, both measures, target, settings, origin", "capture", "capture")
 ANNOTATED = Output("annotated.png", "the findings drawn on the depth image", "capture", "capture")
-TARGETS = Output("targets.png", "targets that were found, and the chosen one", "capture", "capture")
-BLIND = Output("blind.png", "where nothing came back", "capture", "capture")
+TARGETS = Output("targets.png", "the targets that were found, with the chosen target", "capture", "capture")
+BLIND = Output("blind.png", "the pixels from which nothing came back", "capture", "capture")
 GAUGE_ROWS = Output("gauge.csv", "hits and misses of a gauge board's holes", "capture", "capture")
-CLOUD = Output("cloud.ply", "the points, damage in magenta", "capture", "capture")
+CLOUD = Output("cloud.ply", "the cloud, with findings in magenta", "capture", "capture")
 FILES = (
     REPORT, EXPERIMENT, PROVENANCE, STUDY, LEARNED, MAPS, CAPTURES, COMPARISON, COMPARISON_PAGE, EFFICIENCY_PAGE,
     COVERAGE_PAGE, ATLAS_PAGE, ATLAS_PICTURE, FINDINGS, FINDINGS_DATA, ANNOTATED, TARGETS, BLIND, GAUGE_ROWS, CLOUD,
@@ -74,5 +74,5 @@ def outputs() -> Iterator[Output]:
 
 
 def is_output(name: str, place: FolderKind) -> bool:
-    """Return whether a file of this name is what a program writes at this place."""
+    """Return whether a program writes a file of this name at this place."""
     return any(one.place == place and fnmatchcase(name, one.name) for one in outputs())

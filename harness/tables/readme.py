@@ -1,4 +1,4 @@
-"""The text of `results/README.md`: ``python -m harness.tables.readme > results/README.md`` writes it anew."""
+"""The text of `results/README.md`; ``python -m harness.tables.readme > results/README.md`` writes it."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ HEAD = f"""# Results
 
 Written by `python -m harness.tables.readme` from the declarations in `harness/tables`; a test keeps it current.
 
-Sweeps write into `results/<experiment>/<digest>/`; the digest names everything that decides a number.
+Sweeps write into `results/<experiment>/<digest>/`; the digest covers all settings that can change a result.
 `results/<experiment>/{LATEST}` is a link to the newest run that has a report (a text file with its name where the
-system makes no links). `python -m harness.ls results` lists all runs, the settings that tell them apart and the
-detection limits that they found; `python -m harness.clean results` removes them. `{JOURNAL}/` holds finished trials,
-from which the same command resumes. `baselines/` holds what `harness.check` compares with. Noise-free renders are kept
-in `results/.cache/renders/`. All but the baselines can be deleted at any time."""
+system has no links). `python -m harness.ls results` lists all runs, the settings in which they differ, and their
+detection limits; `python -m harness.clean results` removes them. `{JOURNAL}/` holds finished trials, so that the same
+command resumes an interrupted sweep. `harness.check` compares with `baselines/`. Noise-free renders are kept in
+`results/.cache/renders/`. Everything but the baselines can be deleted at any time."""
 TABLES = """
 # Tables
 
-Parquet holds every digit, units and notes of columns in its schema, and where the numbers come from (key `tofpod`:
-commit, versions, seed). CSV holds six digits. Units are the endings of names; an empty cell is unknown, or not
-demonstrated. `x_low`, `x_high` are the ends of the 95 % interval of `x`. Tables without rows are not written; an
-experiment with axes has a further column for each, named by its dotted path."""
+Parquet files hold all digits. Their schema holds each column's unit and description, and their origin (key `tofpod`:
+commit, versions, seed). CSV files hold six digits. The ending of a column's name is its unit. An empty cell means that
+the value is unknown or not demonstrated. `x_low` and `x_high` are the ends of the 95 % interval of `x`. Tables without
+rows are not written. An experiment with axes has another column for each axis, named by its dotted path."""
 GROUPS = {
     "": "Every sweep",
-    "study": "A study of detection limits, too",
-    "views": "An experiment with several views, too",
-    "capture": "An experiment on real captures (in `point-000/`, ..., but for `summary.csv`)",
-    "check": "`harness.check`, too",
-    "efficiency": "`harness.efficiency`, too",
-    "coverage": "`harness.coverage`",
+    "study": "Also in a study of detection limits",
+    "views": "Also in an experiment with several views",
+    "capture": "In an experiment on real captures (in `point-000/`, ..., but for `summary.csv`)",
+    "check": "Also written by `harness.check`",
+    "efficiency": "Also written by `harness.efficiency`",
+    "coverage": "Written by `harness.coverage`",
 }
 
 
@@ -53,7 +53,7 @@ def _lines() -> Iterator[str]:
     yield TABLES
     of_trials = [table for table in STORED if table not in STUDY_ONLY]
     yield from _tables("Trials", of_trials)
-    yield from _tables("Summaries of an experiment that is no study", SUMMARISED)
+    yield from _tables("Summaries of an experiment that is not a study", SUMMARISED)
     yield from _tables("Detection limits of a study", STUDY_TABLES)
     yield from _tables("Efficiency of a study's detectors", EFFICIENCY_TABLES)
     yield from _tables("Coverage of a part (`harness.coverage`)", COVERAGE_TABLES)

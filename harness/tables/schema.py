@@ -230,8 +230,8 @@ def write_table(folder: Path, table: Table, frame: pd.DataFrame, about: Mapping[
         fields = []
         for one in block.schema:
             column = noted.get(one.name)
-            said = {} if column is None else {"unit": column.unit, "note": column.note}
-            fields.append(one.with_metadata({key: value for key, value in said.items() if value}))
+            facts = {} if column is None else {"unit": column.unit, "note": column.note}
+            fields.append(one.with_metadata({key: value for key, value in facts.items() if value}))
         metadata = dict(block.schema.metadata or {})
         if about is not None:
             metadata[b"tofpod"] = json.dumps(about, sort_keys=True).encode()

@@ -1,4 +1,4 @@
-"""Tables of a study beside its limits: thresholds, hits by chance, signals, operating points, axes, known sizes."""
+"""Tables of a study besides its limits: thresholds, hits by chance, operating points, axes, limits of depth."""
 
 from __future__ import annotations
 
@@ -30,34 +30,34 @@ from harness.tables.text import Grid
 from harness.vocabulary.path_names import camera_title, differing, names_of, on_one_line, unit_of, value_text
 
 BLOB_PX = 5.0
-"""Distance on the sensor up to which two highest scores are those of one blob: the window of a camera's filter."""
+"""Distance on the sensor up to which two highest scores belong to one blob: the width of a camera's filter."""
 HIGH_THRESHOLD = 10.0
 """Deviations: the highest of a hole-free board is 4 with Gaussian noise, 5 to 6 with a fixed pattern."""
 OFF_BOARD = "off the board"
 SHOWN_ROWS = 60
-BOUND = "its upper bound at 95 % confidence; empty where not demonstrated"
+BOUND = "upper bound of a90 at 95 % confidence; empty where not demonstrated"
 
 SET_UP_OF = Column("set_up", "set-up", "limit.record.label", SET_UP.note, text.unbroken)
 UNFLAWED = ("chance.of_sites", "chance.sites_interval")
 CHANCE = Table(
     "chance",
-    "one row per set-up and number of frames: how often a damage would be hit by a finding of something else",
+    "one row per set-up and number of frames: how often a finding of something else would count as a hit",
     (
         SET_UP_OF,
         Column("shuffled_share", "shuffled positions", "chance.probability", "places near another board's finding"),
-        Column("unflawed_share", "unflawed places (95 %)", UNFLAWED, "unflawed places that were found"),
-        Column("places", "places", "chance.sites", "unflawed places"),
-        Column("expected_share", "from the rate", "chance.expected", "hits, were false calls spread evenly"),
+        Column("unflawed_share", "unflawed places (95 %)", UNFLAWED, "share of undamaged places with a finding"),
+        Column("places", "places", "chance.sites", "number of undamaged places"),
+        Column("expected_share", "from the rate", "chance.expected", "share if false calls were spread evenly"),
     ),
 )
-GIVEN, UNSET = "undamaged runs that set it; 0: given", "none: given"
+GIVEN, UNSET = "number of calibration runs; 0: threshold was given", "none: given"
 THRESHOLDS = Table(
     "thresholds",
-    "one row per set-up and number of frames: its threshold and the false calls that it lets through on other boards",
+    "one row per set-up and number of frames: its threshold, and the false calls at that threshold on other boards",
     (
         SET_UP,
-        Column("threshold", "threshold", "record.threshold", "in the detector's units"),
-        Column("threshold_mm", "in mm", "record.threshold_mm", "times the mean scale"),
+        Column("threshold", "threshold", "record.threshold", "threshold in the detector's units"),
+        Column("threshold_mm", "in mm", "record.threshold_mm", "threshold times the mean scale"),
         Column("calibration_runs", "calibration runs", "record.calibration_runs", GIVEN, lambda n: str(n or UNSET)),
         replace(CALLS[0], label="per m² (95 %)"),
         replace(CALLS[1], label="false calls on other boards"),
@@ -68,7 +68,7 @@ THRESHOLDS = Table(
 
 @dataclass(frozen=True)
 class SetBy:
-    """The hole-free run that set a threshold; ``same_pixels``: runs, itself too, that are loudest on its pixels."""
+    """The hole-free run that set a threshold. ``same_pixels``: runs with their highest score on the same pixels."""
 
     limit: SetUpLimit
     board: int
@@ -98,13 +98,13 @@ def set_by(limits: Sequence[SetUpLimit]) -> list[SetBy]:
 
 
 def threshold_warnings(limits: Sequence[SetUpLimit]) -> list[str]:
-    """Return sentences on calibrated thresholds too high for noise, or set by the same pixels on half of the boards."""
+    """Return warnings of calibrated thresholds that are too high for noise, or that one place on the sensor sets."""
     rows = set_by(limits)
-    said, crowded = [], [one for one in rows if (one.same_pixels or 0) > max(one.runs / 2, 1)]
+    warnings, crowded = [], [one for one in rows if (one.same_pixels or 0) > max(one.runs / 2, 1)]
     if crowded:
         counts = sorted({one.same_pixels or 0 for one in crowded})
         where = crowded[0].limit.record.label if len(crowded) == 1 else f"{len(crowded)} of {len(limits)} set-ups"
-        said.append(
+        warnings.append(
             f"{where}: {' to '.join(map(str, counts[:1] + counts[1:][-1:]))} of {crowded[0].runs} calibration boards "
             "have their highest score on the same pixels of the sensor: one place of this unit's fixed pattern sets "
             "the threshold (study.units draws several units)"
@@ -113,17 +113,17 @@ def threshold_warnings(limits: Sequence[SetUpLimit]) -> list[str]:
         threshold = one.limit.record.threshold
         if threshold > HIGH_THRESHOLD:
             where = one.place if one.place == OFF_BOARD else f"at x, y = {one.place} mm"
-            said.append(
+            warnings.append(
                 f"{one.limit.record.label}: the threshold is {threshold:.3g} deviations, above {HIGH_THRESHOLD:g}: "
                 f"something other than noise sets it (calibration board {one.board}, {where}), and the limit with it"
             )
-    return said
+    return warnings
 
 
 def threshold_note(record: StudyRecord) -> str:
     """Return how the thresholds were set."""
-    if told := record.provenance.get("thresholds"):
-        return str(told)
+    if stated := record.provenance.get("thresholds"):
+        return str(stated)
     if record.false_calls_per_m2 is None:
         return "Thresholds were given, not calibrated: the rates beside them are what came of it."
     wanted = record.false_calls_per_m2
@@ -139,27 +139,27 @@ OPERATING = Table(
     "one row per set-up and number of frames: areas under the curves over all thresholds",
     (
         SET_UP_OF,
-        Column("damages", "damages", "roc.damages", "damages inspected"),
-        Column("places", "places", "roc.unflawed", "unflawed places"),
-        Column("roc_area", "ROC's area", "roc.area", "over sites"),
-        Column("pro_area", "AU-PRO", "pixels.pro", "per-region overlap of pixels"),
+        Column("damages", "damages", "roc.damages", "number of inspected damages"),
+        Column("places", "places", "roc.unflawed", "number of undamaged places"),
+        Column("roc_area", "ROC's area", "roc.area", "area under the ROC curve of damages and undamaged places"),
+        Column("pro_area", "AU-PRO", "pixels.pro", "area under the per-region overlap of pixels"),
     ),
 )
 
 
 def operating_notes(results: Sequence[SetUpResult]) -> list[str]:
-    """Return what AU-PRO is, and for which set-ups it could not be computed."""
-    said = (
+    """Return the definition of AU-PRO, and the set-ups for which it could not be computed."""
+    text = (
         "AU-PRO: mean over damages of the share of pixels above, against undamaged pixels above, up to a share of "
         f"{PRO_LIMIT:g} and divided by it, as MVTec AD does."
     )
     without = [one for one in results if one.pixels is not None and one.pixels.why]
-    return [said, *(f"{name_of(one.limit)}: no AU-PRO: {one.pixels.why}." for one in without if one.pixels)]
+    return [text, *(f"{name_of(one.limit)}: no AU-PRO: {one.pixels.why}." for one in without if one.pixels)]
 
 
 @dataclass(frozen=True, eq=False)
 class AxisGroup:
-    """One axis: its ``values``, ascending where they are numbers, and its ``lines`` by what tells them apart."""
+    """One axis: its ``values``, ascending if they are numbers, and its ``lines``, by their values on other axes."""
 
     path: str
     name: str
@@ -172,7 +172,7 @@ class AxisGroup:
         return all(line.numeric for line in self.lines.values())
 
     def told(self, value: Any) -> str:
-        """Return one of the values in words, without what a mapping has in common with the others."""
+        """Return a value in words; of a mapping, only the keys in which the values differ."""
         return axis_value(self.path, differing(value, self.values))
 
     @property
@@ -183,7 +183,7 @@ class AxisGroup:
 
 
 def axis_groups(lines: Sequence[AxisLine]) -> list[AxisGroup]:
-    """Return the lines axis by axis; a line is called by those of its other axes that differ among lines."""
+    """Return the lines of each axis; a line's label gives the values of the other axes that differ among lines."""
     names = names_of(dict.fromkeys(path for line in lines for path in (line.axis, *line.held)))
     groups = []
     for path in dict.fromkeys(line.axis for line in lines):
@@ -193,9 +193,9 @@ def axis_groups(lines: Sequence[AxisLine]) -> list[AxisGroup]:
         varied = [other for other, values in taken.items() if len(set(map(on_one_line, values))) > 1]
 
         def held(line: AxisLine, other: str, values: Sequence[Any]) -> str:
-            """``kinect_v2`` says what it is, ``albedo=0.2`` has to."""
-            said = axis_value(other, differing(line.held[other], values))
-            return said if other == FRAMES or isinstance(line.held[other], str) else f"{names[other]}={said}"
+            """Return a label: a name such as ``kinect_v2`` explains itself, a number needs its key (``albedo=0.2``)."""
+            words = axis_value(other, differing(line.held[other], values))
+            return words if other == FRAMES or isinstance(line.held[other], str) else f"{names[other]}={words}"
 
         labels = [
             ", ".join(held(line, other, taken[other]) for other in varied if other in line.held) for line in of_axis
@@ -216,7 +216,7 @@ def axis_value(path: str, value: Any) -> str:
 
 
 class AxisRow(NamedTuple):
-    """One value of one line of an axis; ``step``: the change of a90 from the value before."""
+    """One value of one line of an axis. ``step``: the change of a90 from the previous value."""
 
     group: AxisGroup
     line: str
@@ -248,20 +248,20 @@ def _step_text(row: AxisRow) -> str:
 
 AXES = Table(
     "axes",
-    "one row per axis, line of set-ups that differ in it alone, and value: the limits and the change of a90",
+    "one row per axis, line (set-ups that differ only on this axis) and value: the limits and the change of a90",
     (
         Column("axis", "", "group.path", "dotted path of the axis"),
-        Column("line", "set-ups", "line", "what the line's other axes are at"),
+        Column("line", "set-ups", "line", "values of the line's set-ups on the other axes"),
         Column("value", "", lambda one: on_one_line(one.value), "value on the axis"),
         Column("", "value", lambda one: one.group.told(one.value)),
         replace(SET_UP_OF, label=""),
         Column("a50_mm", "a50 (mm)", lambda one: a50_of(one.limit), f"{FOUND_50}, with interval", interval=True),
-        Column("a90_mm", "a90 (mm)", lambda one: a90_of(one.limit), f"{FOUND_90}, likewise", interval=True),
+        Column("a90_mm", "a90 (mm)", lambda one: a90_of(one.limit), f"{FOUND_90}, with interval", interval=True),
         Column("a90_95_mm", "a90/95 (mm)", lambda one: bound_estimate(one.limit, one.limit.a90_95), BOUND, bound_text),
         Column("", "a90 over that above", _step_text),
-        Column("ratio", "", ("step.ratio", "step.interval"), "a90 over that of the value before, with its interval"),
-        Column("beyond_chance", "", "step.beyond_chance", "the interval leaves out 1"),
-        Column("paired", "", "step.paired", "both were judged on the same boards"),
+        Column("ratio", "", ("step.ratio", "step.interval"), "a90 over that of the previous value, with interval"),
+        Column("beyond_chance", "", "step.beyond_chance", "whether that interval excludes 1"),
+        Column("paired", "", "step.paired", "whether both set-ups inspected the same boards"),
     ),
 )
 
@@ -273,7 +273,7 @@ def axis_grid(group: AxisGroup) -> Grid:
 
 
 def axis_note(group: AxisGroup) -> str:
-    """Return how the changes are to be read."""
+    """Return an explanation of the changes and their intervals."""
     steps = [step for line in group.lines.values() for step in line.steps]
     paired = "the same boards, resampled together" if all(step.paired for step in steps) else "not all of them the same"
     beyond = sum(step.beyond_chance for step in steps)
@@ -305,11 +305,11 @@ def depths_at(results: Sequence[SetUpResult]) -> list[DepthAt]:
 
 DEPTH_LIMITS = Table(
     "depth_limits",
-    "one row per set-up and number of frames with a surface, and diameter: the depth found 90 % of the time",
+    "one row per set-up, number of frames and diameter: the depth found 90 % of the time, where limits depend on both",
     (
         SET_UP_OF,
         Column("diameter_mm", "diameter (mm)", "diameter_mm", "diameter of the damage"),
-        Column("depth_mm", "depth (mm)", "depth", "found 90 % of the time; inf: none is", interval=True),
+        Column("depth_mm", "depth (mm)", "depth", "depth found 90 % of the time; inf: no depth is", interval=True),
     ),
 )
 STUDY_TABLES = (LIMITS, THRESHOLDS, CHANCE, OPERATING, AXES, DEPTH_LIMITS)

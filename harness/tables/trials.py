@@ -1,6 +1,6 @@
-"""Tables of trials: what each trial measured, and the summaries of experiments that are no study.
+"""Tables of trials: the measurements of each trial, and summaries of experiments that are not studies.
 
-Columns are declared by name and note alone; their values come from `harness.engine.trial` and `harness.evaluation`."""
+Columns declare only a name and a note; their values come from `harness.engine.trial` and `harness.evaluation`."""
 
 from __future__ import annotations
 
@@ -35,47 +35,47 @@ def _word(name: str | None) -> str:
     return name or "as declared"
 
 
-COMMON = _columns(variant="name of the set-up", frames="frames averaged", repeat="draw of noise, and of study.units")
-BOARD = _columns(board="number of the board, in a study")
-POINT = _columns(point="digest of the set-up with its frames")
-ROLE = _columns(role="damaged, hole_free or calibration")
+COMMON = _columns(variant="name of the set-up", frames="number of averaged frames", repeat="draw of the noise and unit")
+BOARD = _columns(board="number of the board in a study")
+POINT = _columns(point="digest of the set-up with its number of frames")
+ROLE = _columns(role="role of the board: damaged, hole_free or calibration")
 TRUTH = _columns(
     kind="kind of damage",
-    true_diameter_mm="diameter",
-    true_depth_mm="depth of removed material",
-    seen_depth_mm="depth of what is seen; behind a through-hole one sees farther",
-    true_x_mm="place on the board",
-    true_y_mm="likewise",
-    true_offset_mm="distance from the largest hole",
+    true_diameter_mm="true diameter",
+    true_depth_mm="true depth of removed material",
+    seen_depth_mm="depth of the surface that is visible in it; behind a through-hole, the backing",
+    true_x_mm="x of its centre on the board",
+    true_y_mm="y of its centre on the board",
+    true_offset_mm="distance of its centre from that of the largest hole",
 )
 SHAPE = _columns(
-    size_of="what true_diameter_mm is: the diameter, or of long damage its width or length",
-    true_length_mm="length; empty for holes and ball dents",
-    true_width_mm="width, likewise",
-    true_angle_deg="angle of the length from the board's x",
+    size_of="what true_diameter_mm holds: diameter or, for long damage, width or length",
+    true_length_mm="true length; empty for holes and ball dents",
+    true_width_mm="true width; empty for holes and ball dents",
+    true_angle_deg="angle from the board's x to its length",
 )
 SIZES = _columns(
-    extent_diameter_mm="diameter by the thesis' measure",
-    extent_offset_mm="distance from the largest cluster's centre by the thesis' measure",
-    extent_error_mm="distance from the true centre by the thesis' measure",
-    model_diameter_mm="diameter of the model of a blurred hole",
-    model_diameter_se_mm="its standard error as the fit states it",
-    model_depth_mm="depth of the model",
-    model_depth_se_mm="its standard error as the fit states it",
-    model_offset_mm="distance from the largest cluster's centre by the model",
-    model_error_mm="distance from the true centre by the model",
+    extent_diameter_mm="measured diameter (the thesis' measure)",
+    extent_offset_mm="distance of its centre from the largest cluster's (the thesis' measure)",
+    extent_error_mm="distance of its centre from the true centre (the thesis' measure)",
+    model_diameter_mm="measured diameter (the fitted model of a blurred hole)",
+    model_diameter_se_mm="standard error of that diameter, as estimated by the fit",
+    model_depth_mm="measured depth (the model)",
+    model_depth_se_mm="standard error of that depth, as estimated by the fit",
+    model_offset_mm="distance of its centre from the largest cluster's (the model)",
+    model_error_mm="distance of its centre from the true centre (the model)",
     length_mm="length of the rectangle that has the second moments of the residual, less the blur",
-    width_mm="its width",
-    angle_deg="angle of its length from the board's x, -90 to 90",
-    model_note="what the fit says of itself",
+    width_mm="width of that rectangle",
+    angle_deg="angle from the board's x to that rectangle's length, -90 to 90",
+    model_note="remark of the fit on its own result",
 )
 STATISTICS = {
-    "measured": "trials with a finite diameter",
+    "measured": "number of trials with a finite diameter",
     "diameter_mean_mm": "mean diameter",
-    "diameter_std_mm": "its standard deviation",
+    "diameter_std_mm": "standard deviation of the diameter",
     "offset_mean_mm": "mean distance from the largest hole",
-    "offset_std_mm": "its standard deviation",
-    "offset_bias_mm": "mean less the true distance",
+    "offset_std_mm": "standard deviation of that distance",
+    "offset_bias_mm": "mean distance minus true distance",
 }
 BY = (("extent", "the thesis' measure"), ("model", "the model"))
 ERRORS = {
@@ -84,7 +84,7 @@ ERRORS = {
     "extent_place": "position, extent (mm)",
     "model_place": "position, model (mm)",
 }
-COVERED = "share of fits within 1.96 of their own standard errors of the truth"
+COVERED = "share of fits that lie within 1.96 of their own standard errors of the truth"
 MARKS: dict[str, tuple[str, Tone]] = {
     "borne out": ("✓", "good"),
     "not borne out": ("✗", "bad"),
@@ -95,19 +95,19 @@ LAGS = tuple(f"correlation_{way}{lag}" for way in "uv" for lag in (1, 2, 3))
 
 TRIALS = Table(
     "trials",
-    "one row per trial on a damaged board and hole",
+    "one row per trial on a damaged board and damage",
     (
-        *(*POINT, *COMMON, *BOARD, *_columns(hole="number of the hole"), *TRUTH, *SHAPE),
+        *(*POINT, *COMMON, *BOARD, *_columns(hole="number of the damage"), *TRUTH, *SHAPE),
         *_columns(
-            detected="whether a finding counts for it",
+            detected="whether it was hit: a finding matches it",
             threshold="threshold in use, in the detector's units",
             invalid_fraction="share of its pixels without a range",
             median_residual_mm="median distance of its pixels behind the surface",
-            state="found, wrong depth, invalid or invisible: what its pixels tell, whatever the detector says",
-            score="score of the finding",
-            points="points of the finding",
-            signal="of a study: highest score within the hit radius",
-            no_return="of a study: whether a finding without return counts for it",
+            state="state of its pixels, whatever the detector finds: found, wrong depth, invalid or invisible",
+            score="score of the finding that matches it",
+            points="number of points of that finding",
+            signal="in a study: highest score within the hit radius",
+            no_return="in a study: whether a finding of pixels without return matches it",
         ),
         *SIZES,
     ),
@@ -121,25 +121,25 @@ RUNS = Table(
     (
         *(*POINT, *COMMON, *BOARD, *ROLE),
         *_columns(
-            threshold="threshold in use; empty in runs that set it",
-            quiet_threshold="of hole-free runs: score above which nothing is found",
-            scale_mm="one unit of score",
-            surface_noise_mm="robust deviation from the fitted surface on undamaged face",
-            frames_used="frames in the average",
-            left_out="frames left out as disturbed",
-            detections="findings",
-            false_calls="findings that count for no damage",
-            inspected_m2="of a study: face that was judged",
-            no_return_calls="of a study: false calls without return",
-            loudest_x_mm="of calibration: place of the highest score",
-            loudest_y_mm="likewise",
-            loudest_u_px="its column on the sensor",
-            loudest_v_px="its row on the sensor",
-            views_used="of maps: views merged",
-            views_left_out="of maps: views left out after a failed registration",
-            seconds_map="of maps: time of making the map",
-            seconds_frames="time of simulating and averaging",
-            seconds_detect="time of detection and measurement",
+            threshold="threshold in use; empty in calibration runs",
+            quiet_threshold="hole-free boards: score above which nothing is found",
+            scale_mm="residual that makes one unit of score",
+            surface_noise_mm="robust deviation from the fitted surface on the undamaged face",
+            frames_used="number of frames in the average",
+            left_out="number of frames left out as disturbed",
+            detections="number of findings",
+            false_calls="number of findings that match no damage",
+            inspected_m2="in a study: judged area of the face",
+            no_return_calls="in a study: false calls made of pixels without return",
+            loudest_x_mm="calibration: x of the highest score on the board",
+            loudest_y_mm="calibration: y of the highest score on the board",
+            loudest_u_px="calibration: column of the highest score on the sensor",
+            loudest_v_px="calibration: row of the highest score on the sensor",
+            views_used="maps: number of merged views",
+            views_left_out="maps: number of views left out because their registration failed",
+            seconds_map="maps: time to make the map",
+            seconds_frames="time to simulate and average the frames",
+            seconds_detect="time to detect and measure",
         ),
     ),
     ("variant", "role", "frames", "board", "repeat"),
@@ -154,9 +154,9 @@ PROBES = Table(
         *_columns(
             pixel="number of the pixel, in sensor order",
             mean_error_mm="mean error of z",
-            temporal_std_mm="standard deviation over repeats",
-            displacement_std_mm="deviation of whole clouds, which is taken out of the other two",
-            repeats="repeats",
+            temporal_std_mm="standard deviation of z over repeats",
+            displacement_std_mm="standard deviation of the displacement of whole clouds, which the others exclude",
+            repeats="number of repeats",
         ),
     ),
     ("variant", "frames", "pixel"),
@@ -164,48 +164,48 @@ PROBES = Table(
 )
 NOISE = Table(
     "noise",
-    "one row per hole-free trial of a single view: what the camera makes of an undamaged board",
+    "one row per hole-free trial of a single view: noise and pixels on an undamaged board",
     (
         *COMMON,
         *_columns(
             valid_share="share of the board's pixels with a range",
-            pitch_u_mm="median distance on the board between pixels of a row",
-            pitch_v_mm="likewise of a column",
+            pitch_u_mm="median distance on the board between neighbouring pixels of a row",
+            pitch_v_mm="median distance on the board between neighbouring pixels of a column",
             single_frame_mm="standard deviation of one frame's temporal noise of z",
-            **{name: "correlation of that noise with itself so many columns (u) or rows (v) on" for name in LAGS},
+            **{name: "correlation of that noise between pixels so many columns (u) or rows (v) apart" for name in LAGS},
         ),
     ),
     ("variant", "frames", "repeat"),
 )
 REGISTRATIONS = Table(
     "registrations",
-    "one row per registration of a view, under the first set-up that shares it",
+    "one row per registration of a view; registrations that set-ups share are under the first of them",
     (
         *(*COMMON, *BOARD, *ROLE),
         *_columns(
             view="number of the view; the reference is 0",
             method="method of registration",
             tre_mm="target registration error, root mean square over the board",
-            tre_in_plane_mm="its part in the board's plane",
-            tre_across_mm="its part across the plane",
-            predicted_in_plane_mm="what the method itself predicts; empty without an estimate",
-            predicted_across_mm="likewise",
-            guess_tre_mm="error of the starting guess",
+            tre_in_plane_mm="part of that error in the board's plane",
+            tre_across_mm="part of that error perpendicular to the plane",
+            predicted_in_plane_mm="error in the plane that the method predicts; empty if it predicts none",
+            predicted_across_mm="error perpendicular to the plane that the method predicts",
+            guess_tre_mm="error of the nominal pose from which it started",
             residual_mm="root mean square residual",
             overlap="share of points with a partner",
-            pairs="pairs of points",
-            marks="marks trusted",
-            iterations="iterations",
+            pairs="number of pairs of points",
+            marks="number of marks that were relied on",
+            iterations="number of iterations",
             converged="whether it converged",
-            seconds="time",
-            failure="reason of a failure; empty for none",
+            seconds="time in seconds",
+            failure="why it failed; empty if it did not",
         ),
     ),
     ("variant", "role", "frames", "repeat", "view"),
 )
 SITES = Table(
     "sites",
-    "one row per place of left-out damage on a hole-free board, and repeat",
+    "one row per repeat and place on a hole-free board where its damage was left out",
     (
         *(*COMMON, *BOARD, *ROLE, *_columns(hole="number of the place"), *TRUTH[1:3], *TRUTH[4:6]),
         *_columns(detected="whether a finding lies there by chance", signal="highest score within the hit radius"),
@@ -218,14 +218,14 @@ FINDINGS = Table(
     "one row per finding on a study's boards",
     (
         *(*COMMON, *BOARD, *ROLE),
-        *_columns(x_mm="place on the board", y_mm="likewise", score="score", hole="damage it counts for; empty: none"),
+        *_columns(x_mm="x on the board", y_mm="y on the board", score="score", hole="damage that it hits; empty: none"),
     ),
     ("variant", "frames", "role", "board", "repeat"),
     ("parquet",),
 )
 OPERATING = Table(
     "operating",
-    "one row per trial of a study and threshold other than the one in use, on a grid",
+    "one row per trial of a study and threshold of a grid, besides the threshold in use",
     (*(*COMMON, *BOARD, *ROLE), *_columns(threshold="threshold", findings="findings above it", hits="hits among them")),
     ("variant", "frames", "role", "board", "repeat"),
     ("parquet",),
@@ -233,10 +233,10 @@ OPERATING = Table(
 )
 PIXELS = Table(
     "pixels",
-    "one row per trial on a study's damaged boards, damage and threshold of a finer grid",
+    "one row per trial on a study's damaged boards, damage, and threshold on a finer grid",
     (
         *(*COMMON, *BOARD, *ROLE),
-        *_columns(hole="damage; empty: intact face", pixels="pixels judged", threshold="threshold", above="above it"),
+        *_columns(hole="damage; empty: intact face", pixels="judged pixels", threshold="threshold", above="above it"),
     ),
     ("variant", "frames", "board", "repeat"),
     ("parquet",),
@@ -265,37 +265,37 @@ def _found(row: Mapping[str, Any]) -> Cell:
 
     names = hole_list(row["found"]) if row["holes"] <= MOST_NAMES else ""
     undecided = hole_list(row["undecided"]) if row["holes"] <= MOST_NAMES else str(len(row["undecided"]))
-    said = "; ".join(part for part in (names, f"undecided {undecided}" if row["undecided"] else "") if part)
-    return Cell(f"{len(row['found'])} of {row['holes']}\n{said}".strip(), share=len(row["found"]) / row["holes"])
+    words = "; ".join(part for part in (names, f"undecided {undecided}" if row["undecided"] else "") if part)
+    return Cell(f"{len(row['found'])} of {row['holes']}\n{words}".strip(), share=len(row["found"]) / row["holes"])
 
 
 MOST_NAMES = 15
-"""Holes up to which a cell lists them by name; beyond it their number and the limit say more."""
+"""Most holes that a cell lists by name; of more it gives the number."""
 CALLS_OF = Column(
     "", "false calls", lambda row: f"{row['false_calls']:.0f} in {row['runs']:.0f}" if row["runs"] > 0 else "–"
 )
 SUMMARY = Table(
     "summary",
-    "one row per set-up, number of frames and hole, with 95 % intervals; means are over the trials that detected it",
+    "one row per set-up, number of frames and damage, with 95 % intervals; means are over the trials that detected it",
     (
         *COMMON[:2],
-        Column("hole", "hole", note="number of the hole"),
+        Column("hole", "hole", note="number of the damage"),
         *(replace(one, label={"true_diameter_mm": "true (mm)"}.get(one.name, "")) for one in TRUTH),
-        *_columns(n="trials", detected="trials that detected it"),
-        Column("rate", note="their share, with Wilson's interval", interval=True),
-        *_columns(status="found, missed or undecided: the interval lies above, below or about 0.5"),
+        *_columns(n="number of trials", detected="number of trials that detected it"),
+        Column("rate", note="share of trials that detected it, with Wilson's interval", interval=True),
+        *_columns(status="found, missed or undecided: the interval lies above, lies below or contains 0.5"),
         _mean("extent_diameter", "extent (mm)"),
         _mean("model_diameter", "model (mm)"),
         *(Column(f"{of}_{name}", note=f"{note} ({by})") for of, by in BY for name, note in STATISTICS.items()),
-        *(Column(f"{of}_bias_mm", note=f"mean diameter less the true ({by})", interval=True) for of, by in BY),
-        *(Column(f"{of}_error_mean_mm", f"centre off, {of} (mm)", note="mean distance from it") for of, _ in BY),
-        Column("model_diameter_se_mean_mm", "its stated error (mm)", note="mean standard error as the fits state it"),
+        *(Column(f"{of}_bias_mm", note=f"mean diameter minus true diameter ({by})", interval=True) for of, by in BY),
+        *(Column(f"{of}_error_mean_mm", f"centre off, {of} (mm)", note=f"mean error of place ({by})") for of, by in BY),
+        Column("model_diameter_se_mean_mm", "its stated error (mm)", note="mean standard error that fits state"),
         Column("model_diameter_covered", "truth within 1.96 of it", None, COVERED, _percent),
-        Column("model_depth_mean_mm", "depth (mm)", note="mean depth of the model"),
+        Column("model_depth_mean_mm", "depth (mm)", note="mean depth (the model)"),
         *_columns(
-            model_depth_std_mm="its standard deviation",
-            model_depth_se_mean_mm="mean standard error as the fits state it",
-            model_depth_bias_mm="mean depth less the depth seen",
+            model_depth_std_mm="standard deviation of that depth",
+            model_depth_se_mean_mm="mean standard error that fits state for it",
+            model_depth_bias_mm="mean depth minus seen_depth_mm",
             median_residual_mm="mean of the trials' median residuals",
             invalid_fraction="mean share of pixels without a range",
             results_version="version of the results",
@@ -306,18 +306,18 @@ SUMMARY = Table(
 )
 NOISE_BY_FRAMES = Table(
     "noise_by_frames",
-    "one row per set-up and number of frames: parts of the error over the sample pixels",
+    "one row per set-up and number of frames: components of the error of z over the sample pixels",
     (
         COMMON[0],
-        Column("frames", "frames", note="frames averaged"),
-        *_columns(pixels="pixels", repeats="repeats"),
-        Column("temporal_rms_mm", "temporal noise (mm)", None, "root mean square of the deviation over repeats", _fine),
-        Column("guide_mm", "1/√N guide (mm)", None, "the shortest average's noise falling as 1/sqrt(N)", _fine),
+        Column("frames", "frames", note="number of averaged frames"),
+        *_columns(pixels="number of sample pixels", repeats="number of repeats"),
+        Column("temporal_rms_mm", "temporal noise (mm)", None, "root mean square deviation over repeats", _fine),
+        Column("guide_mm", "1/√N guide (mm)", None, "the shortest average's noise, scaled by 1/sqrt(N)", _fine),
         Column("offset_mm", "offset (mm)", None, "mean error", lambda mm: f"{mm:+.3f}"),
         Column("pattern_mm", "pattern (mm)", None, "standard deviation over pixels of the mean error", _fine),
-        Column("systematic_mm", "systematic (mm)", None, "offset and pattern together", _fine),
-        Column("total_rms_mm", "total (mm)", None, "temporal and systematic together", _fine),
-        Column("displacement_mm", "whole cloud displaced (mm)", None, "deviation of whole clouds", _fine),
+        Column("systematic_mm", "systematic (mm)", None, "offset and pattern combined", _fine),
+        Column("total_rms_mm", "total (mm)", None, "temporal and systematic error combined", _fine),
+        Column("displacement_mm", "whole cloud displaced (mm)", None, "deviation of displacements of clouds", _fine),
     ),
 )
 FALSE_CALLS = Table(
@@ -325,16 +325,16 @@ FALSE_CALLS = Table(
     "one row per set-up, number of frames and role of the board",
     (
         Column("variant", "set-up", None, "name of the set-up", in_words),
-        Column("frames", "frames", note="frames averaged"),
+        Column("frames", "frames", note="number of averaged frames"),
         Column("role", "board", note=ROLE[0].note, text=lambda role: role.replace("_", "-")),
         CALLS_OF,
-        *_columns(runs="runs judged at a threshold", false_calls="false calls"),
-        Column("per_run", "per run (95 %)", note="false calls a run, with Garwood's interval", interval=True),
+        *_columns(runs="number of runs with a threshold", false_calls="number of false calls in them"),
+        Column("per_run", "per run (95 %)", note="false calls per run, with Garwood's interval", interval=True),
         Column("threshold", "threshold (k)", note="mean threshold"),
         Column("threshold_mm", "threshold (mm)", note="mean of threshold times scale"),
         Column("surface_noise_mm", "surface noise (mm)", None, "mean deviation from the fitted surface", _fine),
-        Column("quiet_runs", "hole-free runs", note="hole-free runs"),
-        Column("quiet_highest", "highest quiet k", note="highest of their quiet thresholds"),
+        Column("quiet_runs", "hole-free runs", note="number of hole-free runs"),
+        Column("quiet_highest", "highest quiet k", note="highest of their quiet_threshold"),
     ),
 )
 SET_UPS = Table(
@@ -342,17 +342,18 @@ SET_UPS = Table(
     "one row per set-up and number of frames: holes found, errors of size and place, noise, threshold",
     (
         Column("variant", "set-up", None, "name of the set-up", in_words),
-        Column("registration", "registration", note="of maps: method of registration", text=_word),
-        Column("merge", "merge", note="of maps: how views are merged", text=_word),
-        Column("views", "views", note="of maps: number of views"),
-        Column("frames", "frames", note="frames averaged"),
-        *_columns(holes="holes", repeats="repeats", found="holes found", undecided="holes undecided"),
+        Column("registration", "registration", note="maps: method of registration", text=_word),
+        Column("merge", "merge", note="maps: how views are merged", text=_word),
+        Column("views", "views", note="maps: number of views"),
+        Column("frames", "frames", note="number of averaged frames"),
+        *_columns(holes="number of holes", repeats="number of repeats"),
+        *_columns(found="numbers of the holes found", undecided="numbers of the undecided holes"),
         Column("", "found", _found),
-        Column("limit_mm", "from (mm)", note="smallest diameter from which on all are found"),
-        Column("half_mm", "50 % size (mm)", note="50 % size, with its interval", interval=True, brief=False),
+        Column("limit_mm", "from (mm)", note="smallest diameter from which on all holes are found"),
+        Column("half_mm", "50 % size (mm)", note="size found half of the time", interval=True, brief=False),
         *(_error(of, label) for of, label in ERRORS.items()),
         *(
-            Column(f"{of}_{name}", note=f"{note} of errors over found holes: {label.removesuffix(' (mm)')}")
+            Column(f"{of}_{name}", note=f"{note} of the errors of found holes: {label.removesuffix(' (mm)')}")
             for of, label in ERRORS.items()
             for name, note in (("bias_mm", "mean"), ("std_mm", "standard deviation"), ("n", "number"))
         ),
@@ -369,40 +370,40 @@ SET_UPS = Table(
         Column("threshold_mm", "threshold (mm)", note="mean of threshold times scale"),
         CALLS_OF,
         *_columns(
-            false_calls="false calls on the damaged board",
-            runs="runs on it",
-            place="of maps: values on the other axes",
-            is_variation="whether it varies another set-up",
-            reference="that set-up",
-            surface_std_mm="of maps: standard deviation over runs of the surface's deviation",
+            false_calls="number of false calls on the damaged board",
+            runs="number of runs on the damaged board",
+            place="maps: values on the other axes",
+            is_variation="whether it is a variation of another set-up",
+            reference="the set-up that it varies",
+            surface_std_mm="maps: standard deviation over runs of the surface's deviation",
         ),
-        Column("views_left_out", "views left out", note="of maps: mean number of views left out"),
-        Column("seconds_map", "time (s)", note="of maps: median time of making the map"),
+        Column("views_left_out", "views left out", note="maps: mean number of views left out"),
+        Column("seconds_map", "time (s)", note="maps: median time to make the map"),
     ),
-    title="holes found, and the smallest diameter from which on all are",
+    title="holes found, and the smallest diameter from which on all holes are found",
 )
 REGISTRATION_ERRORS = Table(
     "registration_errors",
     "one row per method of registration, number of frames and number of views",
     (
         Column("method", "method", note="method of registration"),
-        Column("frames", "frames", note="frames averaged"),
-        Column("views", "views", note="views of the map"),
-        Column("n", "number", note="registrations"),
-        Column("failed", "failed", note="registrations that failed"),
-        Column("guess_mm", "before (mm)", note="median error of the starting guess"),
+        Column("frames", "frames", note="number of averaged frames"),
+        Column("views", "views", note="number of views of the map"),
+        Column("n", "number", note="number of registrations"),
+        Column("failed", "failed", note="number of registrations that failed"),
+        Column("guess_mm", "before (mm)", note="median error of the nominal pose"),
         *(
             column
             for part, label in (("in_plane", "in plane"), ("across", "across"))
             for column in (
-                Column(f"{part}_median_mm", f"{label}: median", note="median error"),
-                Column(f"{part}_rms_mm", "rms", note="root mean square error"),
-                Column(f"{part}_predicted_mm", "predicted", note="error that the covariances predict"),
-                Column(f"{part}_ratio", "ratio", note="actual over predicted error (1: honest)", interval=True),
+                Column(f"{part}_median_mm", f"{label}: median", note=f"median error {label}"),
+                Column(f"{part}_rms_mm", "rms", note=f"root mean square error {label}"),
+                Column(f"{part}_predicted_mm", "predicted", note=f"error {label} that the covariances predict"),
+                Column(f"{part}_ratio", "ratio", note=f"actual over predicted error {label}", interval=True),
             )
         ),
         Column("seconds", "time (s)", note="median time"),
-        Column("reasons", "why it failed", note="commonest reasons", text=lambda reasons: "; ".join(reasons) or "–"),
+        Column("reasons", "why it failed", note="most common reasons", text=lambda reasons: "; ".join(reasons) or "–"),
     ),
 )
 CLAIMS = Table(
@@ -418,8 +419,8 @@ CLAIMS = Table(
             text=lambda verdict: f"{MARKS[verdict][0]} {verdict}",
             tone=lambda row: MARKS[row["verdict"]][1],
         ),
-        Column("evidence", "evidence", note="numbers behind the verdict"),
-        Column("rule", "criterion", note="criterion fixed beforehand"),
+        Column("evidence", "evidence", note="the numbers that support the verdict"),
+        Column("rule", "criterion", note="the criterion, which was fixed in advance"),
     ),
     formats=("csv",),
     left=5,
@@ -427,28 +428,28 @@ CLAIMS = Table(
 )
 POSTERIOR = Table(
     "posterior",
-    "one row per set-up and per value of an axis: how well it agrees with the thesis' outcome (of 20 set-ups and more)",
+    "one row per set-up and per value of an axis: how well it agrees with the thesis' result (from 20 set-ups on)",
     (
-        Column("axis", note="the fact that the thesis does not state; `set-up` for all of them together"),
-        Column("value", "set-up", None, "its value; of a set-up its name", in_words),
-        Column("prior_share", note="probability beforehand"),
-        Column("likelihood", "likelihood", note="probability of exactly the thesis' holes with 1 and 50 frames; mean"),
-        Column("posterior_share", "posterior", note="probability afterwards"),
+        Column("axis", note="fact that the thesis does not state; `set-up`: the combination of all"),
+        Column("value", "set-up", None, "value of that fact, or name of the set-up", in_words),
+        Column("prior_share", note="prior probability"),
+        Column("likelihood", "likelihood", note="probability of the thesis' exact result with 1 and 50 frames; mean"),
+        Column("posterior_share", "posterior", note="posterior probability"),
     ),
     formats=("csv",),
     left=2,
 )
 EFFECTS = Table(
     "effects",
-    "one row per effect, condition and number of frames, of an experiment with `switches`: what the effect costs",
+    "one row per effect, condition and number of frames of an experiment with `switches`: the effect's loss",
     (
         Column("place", "place", note="values of the other axes"),
-        Column("frames", "frames", note="frames averaged"),
-        Column("effect", "effect", note="switch that goes on; `all` together at last"),
-        Column("against", "against", note="what else is on: nothing, or all other effects"),
-        Column("loss_mm", "loss (mm)", note="change of the 50 % size when it goes on"),
-        *_columns(loss_low_mm="lower end of its 95 % bootstrap interval", loss_high_mm="upper end"),
-        Column("on_ladder", note="whether both sizes lie on the ladder of sizes; the loss is a bound otherwise"),
+        Column("frames", "frames", note="number of averaged frames"),
+        Column("effect", "effect", note="effect that is switched on; `all`: all effects together"),
+        Column("against", "against", note="the other effects that are on: none or all"),
+        Column("loss_mm", "loss (mm)", note="change of the 50 % size when the effect is switched on"),
+        *_columns(loss_low_mm="lower end of its 95 % bootstrap interval", loss_high_mm="upper end of that interval"),
+        Column("on_ladder", note="whether both sizes lie within the range of sizes; otherwise the loss is a bound"),
     ),
 )
 STORED = (TRIALS, RUNS, PROBES, NOISE, REGISTRATIONS, SITES, FINDINGS, OPERATING, PIXELS)
@@ -464,9 +465,9 @@ def _empty() -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class ResultTables:
-    """Tables of trials as declared above, ``holes`` being `TRIALS`; a table that an experiment lacks is empty.
-    ``variants``: per set-up, then per variation: variant, reason, settings, is_variation, reference, switches, and the
-    axes. ``axes``: path, name, unit of what tells set-ups apart, in their order."""
+    """Tables of trials as declared above; ``holes`` is `TRIALS`, and a table that an experiment lacks is empty.
+    ``variants`` has a row per set-up, then per variation: variant, reason, settings, is_variation, reference, switches,
+    and the axes. ``axes`` has path, name and unit of every axis on which set-ups differ, in their order."""
 
     holes: pd.DataFrame
     runs: pd.DataFrame
@@ -488,26 +489,26 @@ class ResultTables:
 # ---------------------------------------------------------------- real captures
 
 FINDINGS_VERSION = 3
-"""Raised when a column's or a key's meaning changes; in the CSV it is the last column."""
+"""Increased when the meaning of a column or key changes; the last column of the CSV states it."""
 FINDINGS_OF_CAPTURE = Table(
     outputs.FINDINGS.name.removesuffix(".csv"),
     outputs.FINDINGS.note,
     (
-        Column("id", "", "id", "number, strongest first"),
-        Column("kind", "", "kind", "hole (behind the surface), bump (before it) or no return"),
-        Column("u_px", "", "u_px", "column of its middle"),
-        Column("v_px", "", "v_px", "row of its middle"),
-        Column("x_mm", "", "x_mm", "centre in the camera's frame, to the right"),
-        Column("y_mm", "", "y_mm", "likewise, down"),
-        Column("z_mm", "", "z_mm", "likewise, away"),
-        Column("diameter_mm", "", "diameter_mm", "diameter, of the model where it fits"),
-        Column("depth_mm", "", "depth_mm", "depth, negative of a bump"),
-        Column("volume_mm3", "", "volume_mm3", "volume behind the surface"),
-        Column("points", "", "points", "points of the cluster"),
+        Column("id", "", "id", "number, in order of decreasing score"),
+        Column("kind", "", "kind", "hole (behind the surface), bump (in front of it) or no return"),
+        Column("u_px", "", "u_px", "column of its centre in the image"),
+        Column("v_px", "", "v_px", "row of its centre in the image"),
+        Column("x_mm", "", "x_mm", "x of its centre in the camera's frame (to the right)"),
+        Column("y_mm", "", "y_mm", "y of its centre in the camera's frame (down)"),
+        Column("z_mm", "", "z_mm", "z of its centre in the camera's frame (away from the camera)"),
+        Column("diameter_mm", "", "diameter_mm", "diameter; that of the model where the model fits"),
+        Column("depth_mm", "", "depth_mm", "depth; negative for a bump"),
+        Column("volume_mm3", "", "volume_mm3", "volume between the surface and the points behind it"),
+        Column("points", "", "points", "number of points of the cluster"),
         Column("score", "", "score", "the detector's score"),
-        Column("length_mm", "", "length_mm", "of the rectangle with the second moments of the residual, less the blur"),
-        Column("width_mm", "", "width_mm", "its width"),
-        Column("angle_deg", "", "angle_deg", "of its length, from x towards y (down), -90 to 90"),
+        Column("length_mm", "", "length_mm", "length of the rectangle with the second moments, less the blur"),
+        Column("width_mm", "", "width_mm", "width of that rectangle"),
+        Column("angle_deg", "", "angle_deg", "angle of its length from x towards y (down), -90 to 90"),
         Column("findings_version", "", lambda finding: FINDINGS_VERSION, "version of the table's meaning"),
     ),
     formats=("csv",),
@@ -520,12 +521,12 @@ POINTS_OF_CAPTURES = Table(
     (
         Column("point", note="folder of its findings"),
         Column("variant", note="name of the set-up"),
-        Column("what", note="the set-up with its frames"),
-        Column("frames_used", note="frames in the average"),
-        Column("frames_left_out", note="frames left out as disturbed"),
+        Column("what", note="the set-up with its number of frames"),
+        Column("frames_used", note="number of frames in the average"),
+        Column("frames_left_out", note="number of frames left out as disturbed"),
         Column("threshold_k", note="threshold in the detector's units"),
-        Column("threshold_mm", note="the same in mm"),
-        Column("findings", note="findings"),
+        Column("threshold_mm", note="threshold in mm"),
+        Column("findings", note="number of findings"),
         Column("results_version", "", lambda row: RESULTS_VERSION, "version of the results"),
     ),
     formats=("csv",),

@@ -1,7 +1,7 @@
-"""The claims on one view (C1 to C6, C9) and on cameras (C11): one rule each, the same for every run.
+"""Rules for the claims on one view (C1 to C6, C9) and on cameras (C11), the same for every run.
 
-A verdict needs certainty in either direction: where an interval leaves room for both, it is "undecided". No rule is a
-parameter of the experiment, and none is chosen to make a claim come out."""
+A verdict needs certainty in either direction: if an interval allows both, it is "undecided". No experiment can change a
+rule, and no rule was chosen to make a claim come out."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
 
 Answer = Literal["borne out", "not borne out", "undecided"]
 FEW = 1
-"""The smaller of the numbers of frames that the thesis' claims speak of; `harness.evaluation.maps.MANY` the greater."""
+"""The smaller number of frames in the thesis' claims; `harness.evaluation.maps.MANY` is the larger."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """A claim, what the data say about it, the numbers behind that, and the criterion fixed beforehand."""
+    """A claim with its verdict, the numbers that support it, and the criterion, which was fixed in advance."""
 
     claim: str
     text: str
@@ -46,16 +46,15 @@ class Verdict:
 
 @lru_cache
 def declared() -> dict[str, dict[str, str]]:
-    """Claims and their criteria by name, as claims.yaml declares them."""
+    """Return the claims and their criteria by name, from claims.yaml."""
     claims: dict[str, dict[str, str]] = read_yaml(Path(__file__).with_name("claims.yaml")).data
     return claims
 
 
 def verdict_of(claim: str, answer: Answer, evidence: str) -> Verdict:
-    """The verdict on a claim of claims.yaml."""
-    said = declared()[claim]
-    # a criterion names constants of this module
-    return Verdict(claim, said["says"], answer, evidence, said["criterion"].format_map(globals()))
+    """Return the verdict on a claim of claims.yaml, with this module's constants filled into its criterion."""
+    declaration = declared()[claim]
+    return Verdict(claim, declaration["says"], answer, evidence, declaration["criterion"].format_map(globals()))
 
 
 def decide(parts: Iterable[bool | None]) -> Answer:
@@ -69,23 +68,23 @@ def decide(parts: Iterable[bool | None]) -> Answer:
 THESIS_HOLES = tuple(str(number) for number in range(1, 12))
 FOUND_WITH_MANY, FOUND_WITH_FEW = frozenset(THESIS_HOLES[3:]), frozenset(THESIS_HOLES[4:])
 RULER_MM = 25.4 / 16
-"""One graduation of a ruler in 1/16 in: what the thesis' reference positions were read with."""
+"""One graduation of the ruler (1/16 in) with which the thesis read its reference positions."""
 SLOPE_MARGIN = 0.05
-"""Exponents within -0.5 +- this count as 1/sqrt(N): over 50 frames it is a factor of 1.22 in noise."""
+"""Exponents within this of -0.5 count as 1/sqrt(N); over 50 frames the margin is a factor of 1.22 in noise."""
 UNCHANGED = 0.9
-"""The systematic error counts as lowered when it falls below this share; the white noise falls to 0.14 meanwhile."""
+"""The systematic error counts as lowered if it falls below this share, while white noise falls to 0.14."""
 FEWEST_UNITS = 3
-"""Units of a camera, all of which must agree before a claim that hangs on its fixed pattern is decided."""
+"""Fewest units of a camera, which must all agree, to decide a claim that depends on its fixed pattern."""
 FEWEST_PAIRS = 5
-"""Pairs of views from which on registrations are compared."""
+"""Fewest pairs of views to compare registrations."""
 FEWEST_RANKED = 4
-"""Holes below which even a perfect order has a chance above 1 in 20."""
+"""Fewest holes to rank: with less, even a perfect order has a probability above 1 in 20 by chance."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """The tables of one variant that rules judge by, and its averaged clouds. ``units``: summary rows of this variant
-    and of the variations that change the camera's unit alone."""
+    """The tables of one variant that rules use, and its averaged clouds. ``units``: summary rows of this variant and of
+    the variations that change only the camera's unit."""
 
     variant: str
     summary: pd.DataFrame
@@ -118,24 +117,24 @@ def _c3(case: Case) -> tuple[Answer, str]:
     if rows.empty:
         return "undecided", "No hole is found with 50 frames."
     parts: list[bool | None] = []
-    said = []
+    ratios = []
     for _, row in rows.iterrows():
         bias, std = float(row["extent_bias_mm"]), float(row["extent_diameter_std_mm"])
         interval = standardised_bias(bias, std, int(row["extent_measured"]))
         ratio = bias / std if std > 0 else interval.low
         within, outside = interval.within(-1, 1), interval.above(1) or interval.below(-1)
         parts.append(True if within else False if outside else None)
-        said.append(f"hole {row['hole']} {f'{ratio:+.1f} ({span(interval, 1)})' if interval.known else '–'}")
-    return decide(parts), f"(mean - true)/std by the thesis' measure: {', '.join(said)}. {_between_units(case, rows)}"
+        ratios.append(f"hole {row['hole']} {f'{ratio:+.1f} ({span(interval, 1)})' if interval.known else '–'}")
+    return decide(parts), f"(mean - true)/std by the thesis' measure: {', '.join(ratios)}. {_between_units(case, rows)}"
 
 
 def _between_units(case: Case, rows: pd.DataFrame) -> str:
-    """Tell by how many deviations between units of the camera the mean size is off; ``rows``: the holes found."""
+    """Return the error of the mean size in deviations between units of the camera; ``rows``: the holes found."""
     means = case.units[case.units["frames"] == MANY].pivot(
         index="variant", columns="hole", values="extent_diameter_mean_mm"
     )
     if len(means) < FEWEST_UNITS:
-        return "Between units: not judged, as all repeats share one unit's pattern."
+        return "Between units: not judged, because all repeats share one unit's fixed pattern."
     true = rows.set_index("hole")["true_diameter_mm"]
     off = ((means.mean() - true) / means.std())[true.index]
     return f"Between {len(means)} units: {', '.join(f'hole {hole} {ratio:+.1f}' for hole, ratio in off.items())}."
@@ -184,7 +183,7 @@ def _c6(case: Case) -> tuple[Answer, str]:
     clouds = [cloud for cloud in case.examples if cloud.frames == MANY]
     shapes = [shape for cloud in clouds for shape in hole_shapes(cloud)]
     if not shapes:
-        why = "no hole has enough valid pixels inside its outline" if clouds else "no cloud of 50 frames was kept"
+        why = "no hole has enough valid pixels inside its outline" if clouds else "no cloud of 50 frames was stored"
         return "undecided", f"Not judged: {why}."
     looks = {look: [s.hole for s in shapes if s.looks == look] for look in ("bowl", "cylinder", "neither")}
     bowls, cylinders = len(looks["bowl"]), len(looks["cylinder"])
@@ -196,7 +195,7 @@ def _c6(case: Case) -> tuple[Answer, str]:
     evidence = (
         f"Of {len(shapes)} holes judged, like a bowl: {hole_list(looks['bowl'])}; like a cylinder: "
         f"{hole_list(looks['cylinder'])}; neither clearly: {hole_list(looks['neither'])}. Median misfit of the bowl "
-        f"{ratio:.2f} of the cylinder's. Control: the true geometry at the same pixels is nearer to a bowl in "
+        f"{ratio:.2f} of the cylinder's. Control: the true geometry at the same pixels is closer to a bowl in "
         f"{control} of {len(shapes)} holes."
     )
     return answer, evidence
@@ -211,7 +210,7 @@ def _c9(case: Case) -> tuple[Answer, str]:
     falls = True if slope.within(low, high) else (False if slope.below(low) or slope.above(high) else None)
     stays = ratio.over(UNCHANGED)
     evidence = (
-        f"Temporal noise goes as N to the power {law.slope:.3f} ({span(slope, 3)}); the systematic error with "
+        f"Temporal noise varies as N to the power {law.slope:.3f} ({span(slope, 3)}); the systematic error with "
         f"{law.many_frames} frames is {law.systematic_ratio:.2f} times that with {law.few_frames} ({span(ratio)}); "
         f"{law.pixels} pixels."
     )
@@ -228,7 +227,7 @@ RULES: dict[str, Callable[[Case], tuple[Answer, str]]] = {
 def score_claims(
     tables: ResultTables, variant: str = MAIN, examples: Sequence[Any] = (), summary: pd.DataFrame | None = None
 ) -> list[Verdict]:
-    """A verdict for each of `RULES` on one variant. ``summary`` saves making `summarise_holes` again."""
+    """Return a verdict for each of `RULES` on one variant. ``summary``: that of `summarise_holes`, if at hand."""
     summary = summarise_holes(tables.holes) if summary is None else summary
     alone = tables.variants["settings"].map(lambda text: list(json.loads(text or "{}")) == [CAMERA_UNIT])
     units = summary[summary["variant"].isin({variant, *tables.variants["variant"][alone]})]
@@ -239,7 +238,7 @@ def score_claims(
 
 
 def falling_rank(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Spearman's rho and the one-sided p of "y falls as x grows" by permutation, exact to 8 pairs; constant: 0, 1."""
+    """Return Spearman's rho and one-sided permutation p of "y falls as x grows" (exact to 8 pairs); constant: 0, 1."""
     ranks, other = rankdata(x), rankdata(y)
     if np.ptp(ranks) == 0 or np.ptp(other) == 0:
         return 0.0, 1.0
@@ -259,8 +258,8 @@ def _orders(count: int) -> np.ndarray:
 
 
 def scatter_ratio(holes: pd.DataFrame, first: str, second: str) -> tuple[float, Interval]:
-    """Median over holes of var(first) / var(second) over repeats that have both, with its interval by bootstrap over
-    repeats; infinite where no hole's second column varies. ``holes``: one row per repeat and hole."""
+    """Return the median over holes of var(first) / var(second) over repeats that have both, with its bootstrap interval
+    over repeats; infinite if no hole's second column varies. ``holes``: one row per repeat and hole."""
     top, bottom = (holes.pivot(index="repeat", columns="hole", values=c).to_numpy(float) for c in (first, second))
     both = np.isfinite(top) & np.isfinite(bottom)
 
@@ -274,7 +273,8 @@ def scatter_ratio(holes: pd.DataFrame, first: str, second: str) -> tuple[float, 
 
 
 def _found(case: Case, frames: int, expected: frozenset[str], unexpected: frozenset[str]) -> tuple[Answer, str]:
-    """Judge whether the expected ones of the thesis' holes are found and the unexpected ones missed; with counts."""
+    """Judge whether the expected holes of the thesis are found and the unexpected ones missed; return the counts
+    too."""
     status = found_holes(case.summary, case.variant, frames)
     if set(status) != set(THESIS_HOLES):
         why = f"no trial has {frames} frames" if not status else "the target is not the thesis' row of eleven holes"
@@ -301,8 +301,8 @@ OTHERS = ("kinect_v2", "realsense_l515")
 
 
 def claim_c11(summary: pd.DataFrame, axes: Sequence[str]) -> Verdict | None:
-    """The verdict from summary rows of all set-ups and variations; None where none of the ``axes`` holds the three
-    cameras. At a place a camera's counts are those of all its units, and of all variations of it there."""
+    """Return the verdict from summary rows of all set-ups and variations; None if none of the ``axes`` holds the three
+    cameras. At each place, a camera's range of counts covers all its units and variations."""
     if CAMERA not in axes or not {BEST, *OTHERS} <= set(summary[CAMERA]):
         return None
     rows = summary[(summary["frames"] == MANY) & summary[CAMERA].isin((BEST, *OTHERS))]
@@ -322,7 +322,7 @@ def claim_c11(summary: pd.DataFrame, axes: Sequence[str]) -> Verdict | None:
     ]
     evidence = [f"Holes found with {MANY} frames by {BEST} / {' / '.join(OTHERS)}: {'; '.join(counts)}."]
     if units < FEWEST_UNITS:
-        evidence.insert(0, f"Only {units} of each camera's units: no verdict on others.")
+        evidence.insert(0, f"Only {units} of each camera's units: no verdict on other units.")
     answers: list[bool | None] = []
     for camera in OTHERS:
         standings: dict[str, list[str]] = {word: [] for word in ("ahead", "level", "behind", "open")}
@@ -335,13 +335,13 @@ def claim_c11(summary: pd.DataFrame, axes: Sequence[str]) -> Verdict | None:
         judged = any(standings.values())
         answer = False if standings["behind"] else None if standings["open"] else bool(standings["ahead"])
         answers.append(answer if judged else None)
-        said = "; ".join(f"{word} at {', '.join(where)}" for word, where in standings.items() if where)
-        evidence += [f"Against {camera}: {said}."] if judged else []
+        text = "; ".join(f"{word} at {', '.join(where)}" for word, where in standings.items() if where)
+        evidence += [f"Against {camera}: {text}."] if judged else []
     return verdict_of("C11", decide(answers) if units >= FEWEST_UNITS else "undecided", " ".join(evidence))
 
 
 def _bounds(rows: pd.DataFrame) -> tuple[int, int]:
-    """Fewest and most holes that any unit or variation of a camera finds at a place."""
+    """Return the fewest and most holes that any unit or variation of a camera finds at a place."""
     sure = (rows["status"] == "found").groupby(rows["variant"]).sum()
     possible = (rows["status"] != "missed").groupby(rows["variant"]).sum()
     return int(sure.min()), int(possible.max())

@@ -1,8 +1,8 @@
-"""The set-ups of an experiment that are compatible with what the thesis found: a likelihood and a posterior for each.
+"""The likelihood and posterior probability of each set-up of an experiment, given the thesis' result.
 
-The outcome is one cloud of one frame, in which holes 5 to 11 were found, and one of 50, with holes 4 to 11. Each hole's
-chance is (hits + 1/2) / (repeats + 1), so that few repeats neither prove nor exclude anything; holes count as
-independent given the set-up. All set-ups have the same prior probability."""
+The result is a cloud of 1 frame in which holes 5 to 11 were found, and a cloud of 50 frames with holes 4 to 11. A hole
+is found with probability (hits + 1/2) / (repeats + 1), so that few repeats neither prove nor exclude anything. Holes
+count as independent given the set-up. All set-ups have the same prior probability."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
     import pandas as pd
 
 FEWEST_SET_UPS = 20
-"""Set-ups from which on a posterior is told."""
+"""Fewest set-ups for which a posterior is computed."""
 DOUBTED = 0.5
-"""A value is left out where the outcome makes it less probable than this share of what it was beforehand."""
+"""A value is doubted if its posterior probability is less than this share of its prior probability."""
 SET_UP = "set-up"
 KIND = "source.target.hole_kind"
 SPEAKS_OF = {"source.target.blind_depth_mm": "blind", "source.target.backing_distance_mm": "through"}
-"""Facts that only one kind of hole has: where both kinds are tried, shares are those among set-ups of that kind."""
+"""Facts that only one kind of hole has: if both kinds are tried, shares are those among set-ups of that kind."""
 
 
 def posterior_of(summary: pd.DataFrame, axes: Sequence[str]) -> pd.DataFrame | None:
     """Return rows of `harness.tables.trials.POSTERIOR`: every set-up, likeliest first, then every value of each axis.
-    None where another target, too few set-ups, several cameras, or not both numbers of frames were tried. Shares of a
+    Return None for another target, too few set-ups, several cameras, or without both numbers of frames. Shares of a
     fact that only one kind of hole has are those among set-ups of this kind."""
     import pandas as pd
 
@@ -44,7 +44,7 @@ def posterior_of(summary: pd.DataFrame, axes: Sequence[str]) -> pd.DataFrame | N
     logs = pd.Series(np.log(np.where(expected, chance, 1 - chance)), rows.index).groupby(rows["variant"]).sum()
     share = np.exp(logs - logs.max())
     share, prior = share / share.sum(), 1 / len(share)
-    told = [
+    found = [
         {"axis": SET_UP, "value": name, "prior_share": prior, "likelihood": np.exp(logs[name]), "posterior_share": of}
         for name, of in share.sort_values(ascending=False, kind="stable").items()
     ]
@@ -57,22 +57,22 @@ def posterior_of(summary: pd.DataFrame, axes: Sequence[str]) -> pd.DataFrame | N
             own = {"axis": name, "value": value_text(path, value), "prior_share": len(there) / len(among)}
             mean = float(np.exp(logs[there.index]).mean())
             part = float(share[there.index].sum() / share[among.index].sum())
-            told.append({**own, "likelihood": mean, "posterior_share": part})
-    return pd.DataFrame(told)
+            found.append({**own, "likelihood": mean, "posterior_share": part})
+    return pd.DataFrame(found)
 
 
 def borne_out_if(posterior: pd.DataFrame) -> str:
-    """State in one sentence which facts the thesis' outcome requires: of each axis the values that are not `DOUBTED`,
-    and how probable the outcome is in the likeliest set-up; without facts of a kind of hole that is doubted."""
+    """Return a sentence on the facts that the thesis' result requires (of each axis the values that are not `DOUBTED`,
+    without facts of a kind of hole that is doubted) and its probability in the likeliest set-up."""
     best, doubted = posterior.iloc[0], posterior["posterior_share"] < DOUBTED * posterior["prior_share"]
-    asked = []
+    required = []
     for name, rows in posterior[posterior["axis"] != SET_UP].groupby("axis", sort=False):
         kept = rows["value"][~doubted[rows.index]]
         without = any(str(name).endswith(f" of {kind} holes") for kind in posterior["value"][doubted])
-        asked += [f"{name} is {' or '.join(kept)}"] if len(kept) < len(rows) and not without else []
-    said = "; ".join(asked) if asked else "nothing in particular holds: every value of every axis remains possible"
+        required += [f"{name} is {' or '.join(kept)}"] if len(kept) < len(rows) and not without else []
+    facts = "; ".join(required) or "nothing in particular holds: every value of every axis remains possible"
     return (
-        f"The thesis' outcome is borne out if {said} (of {int((posterior['axis'] == SET_UP).sum())} set-ups; values "
+        f"The thesis' outcome is borne out if {facts} (of {int((posterior['axis'] == SET_UP).sum())} set-ups; values "
         f"that the outcome makes less than half as probable are left out). In the likeliest set-up, "
         f"{in_words(best['value'])}, the exact outcome has a probability of {best['likelihood']:.2g}."
     )

@@ -1,7 +1,8 @@
-"""The claims on several views (C7, C8, C10) and the thesis' proposal (H1), each for one place of an experiment.
+"""Rules for the claims on several views (C7, C8, C10) and the thesis' proposal (H1), each for one place of an
+experiment.
 
-Repeats vary the noise and the error of the nominal poses; the poses, the board and the camera's unit stay the same. So
-C7 is judged over pairs of views, and C8 and C10, which have one pair, over units of the camera."""
+Repeats vary the noise and the errors of the nominal poses, but not the poses, the board or the camera's unit. So C7 is
+judged over pairs of views, and C8 and C10, which have one pair, over units of the camera."""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 Standing = Literal["ahead", "behind", "level", "open"]
 
 SLAM = ("odometry", "volume")
-"""Registration and merge of the map that stands in for a SLAM system: no marks, no closing of loops."""
+"""Registration and merge of the map that represents a SLAM system: without marks or loop closure."""
 NOISE_REDUCING = "fusion"
 MARKED = ("joint", "marks")
 RESPECTS = ("holes", "size", "noise")
@@ -32,32 +33,32 @@ OVER_UNITS = ("C8", "C10")
 def _c7(case: maps.MapCase) -> tuple[Answer, str]:
     alone = case.single()
     if alone is None:
-        return "undecided", "Not judged: no single view stands beside the registrations."
+        return "undecided", "Not judged: the experiment has no single view to compare with."
     rows = case.registrations(alone.frames)
     most = max(one.views for one in case.set_ups)
     pairs = {method: maps.of_map(rows, method, most) for method in dict.fromkeys(rows["method"])}
     if not {"icp", "cpd"} <= set(pairs):
-        return "undecided", "Not judged: ICP and CPD were not both tried."
+        return "undecided", "Not judged: the experiment does not try both ICP and CPD."
     runs = case.runs(alone)
     noise_mm = float(runs["surface_noise_mm"][runs["role"] == "damaged"].median())
     planes = [_is_in_one_plane(pairs[method], noise_mm) for method in ("icp", "cpd")]
     ratio, low, high, n = maps.paired_ratio(pairs["icp"], pairs["cpd"], "tre_in_plane_mm")
     better = None if n < FEWEST_PAIRS else True if high < 1 else (False if low >= 1 else None)
-    said = []
+    errors = []
     for method, part in pairs.items():
         good = maps.trusted(part)
         plane, across = (float(good[f"tre_{way}_mm"].median()) for way in ("in_plane", "across"))
-        said.append(f"{method} {plane:.2f} and {across:.2f} mm, {len(part) - len(good)} of {len(part)}")
+        errors.append(f"{method} {plane:.2f} and {across:.2f} mm, {len(part) - len(good)} of {len(part)}")
     evidence = (
         f"With {maps.frames_text(alone.frames)}, median error in the plane, across it, and registrations that failed: "
-        f"{'; '.join(said)}. A single cloud's surface has {noise_mm:.2f} mm of noise. In the plane CPD has {ratio:.2f} "
-        f"times the error of ICP ({maps.span(intervals.Interval(low, high))}, {many(n, 'pair')} of views)."
+        f"{'; '.join(errors)}. The noise of a single cloud's surface is {noise_mm:.2f} mm. In the plane, CPD has "
+        f"{ratio:.2f} times the error of ICP ({maps.span(intervals.Interval(low, high))}, {many(n, 'pair')} of views)."
     )
     return decide([*planes, better]), evidence
 
 
 def _is_in_one_plane(rows: pd.DataFrame, noise_mm: float) -> bool | None:
-    """Return whether a method's error across the board is at most the noise of a surface."""
+    """Return whether a method's error perpendicular to the board is at most the noise of a surface."""
     if intervals.wilson(len(rows) - len(maps.trusted(rows)), len(rows))[0] > 0.5:
         return False
     across = maps.per_pair(rows, "tre_across_mm").to_numpy(float)
@@ -71,16 +72,16 @@ def _is_in_one_plane(rows: pd.DataFrame, noise_mm: float) -> bool | None:
 def _c8(case: maps.MapCase) -> tuple[Answer, str]:
     found = maps.against_one(case, maps.THESIS_REGISTRATION, maps.THESIS_MERGE)
     if found is None:
-        why = "one and two views, registered by CPD and merged on the grid, were not both finished"
+        why = "the experiment has not finished both one view and two views, registered by CPD and merged on the grid"
         return "undecided", f"Not judged: {why}."
     small = True if not found.small.n and found.lost else found.small.interval.over(0)
     parts = [
-        f"With {maps.frames_text(found.frames)}, two views less one, |size error| of holes from 3/8 in on "
-        f"{maps.change_text(found.large)}, of smaller ones {maps.change_text(found.small)}.",
+        f"With {maps.frames_text(found.frames)}, two views minus one: |size error| of holes of 3/8 in and larger "
+        f"{maps.change_text(found.large)}, of smaller holes {maps.change_text(found.small)}.",
         f"Threshold {maps.change_text(found.threshold)}, surface noise {maps.ratio_text(found.noise)}.",
     ]
-    parts += [f"Found by one view only: {hole_list(found.lost)}."] if found.lost else []
-    parts += [f"Found by two views only: {hole_list(found.gained)}."] if found.gained else []
+    parts += [f"Found only by one view: {hole_list(found.lost)}."] if found.lost else []
+    parts += [f"Found only by two views: {hole_list(found.gained)}."] if found.gained else []
     return decide([found.large.is_below, small, found.threshold.interval.over(0)]), " ".join(parts)
 
 
@@ -95,7 +96,7 @@ def _c10(case: maps.MapCase) -> tuple[Answer, str]:
         missing = ", no ".join(name for name, found in there.items() if not found)
         return "undecided", f"Not judged: the experiment has no {missing}."
     three = (slam, alone, two)
-    # Holes that each map measures often enough.
+    # holes that all three maps measure often enough
     counts = [case.holes(each).groupby("hole", sort=False)["extent_diameter_mm"].count() for each in three]
     common = [str(hole) for hole in counts[0].index if all(count.get(hole, 0) >= maps.FEWEST_BOTH for count in counts)]
 
@@ -104,13 +105,13 @@ def _c10(case: maps.MapCase) -> tuple[Answer, str]:
         return runs["surface_noise_mm"][runs["role"] == "damaged"].dropna().to_numpy(float)
 
     def errors(mapped: maps.Map, measured: str, true: str) -> np.ndarray:
-        """(repeats, h), NaN where not measured; without the hole from which positions count."""
+        """Return errors (repeats, h), NaN if not measured, without the hole from which positions are measured."""
         rows = case.holes(mapped)
         rows = rows[rows["hole"].isin(common) & (rows[true] > 0)]
         rows = rows.assign(_error=rows[measured] - rows[true])
         return rows.pivot(index="repeat", columns="hole", values="_error").to_numpy(float)
 
-    parts, said = [], []
+    parts, texts = [], []
     for what, values, size, gap in (
         ("surface noise", [noise(each) for each in three], lambda v: float(v.mean()), intervals.mean_difference),
         ("size error", [errors(each, "extent_diameter_mm", "true_diameter_mm") for each in three], _rms, rms_gap),
@@ -121,20 +122,20 @@ def _c10(case: maps.MapCase) -> tuple[Answer, str]:
             parts += [interval.over(0) for interval in gaps]
             sizes = [size(each) for each in values]
             more = " and ".join(map(maps.span, gaps))
-            said.append(f"{what} {sizes[0]:.2f} mm against {sizes[1]:.2f} and {sizes[2]:.2f} (more by {more})")
+            texts.append(f"{what} {sizes[0]:.2f} mm against {sizes[1]:.2f} and {sizes[2]:.2f} (more by {more})")
     if not common:
         (_, most), *others = (_bounds(case, each) for each in three)
         parts.append(True if most == 0 and all(least > 0 for least, _ in others) else None)
-        said.append("no hole is measured by all three")
+        texts.append("no hole is measured by all three")
     evidence = (
         f"{slam.views} views of {many(slam.frames, 'frame')} against one and two of {many(alone.frames, 'frame')}: "
-        f"{'; '.join(said)}. Found: {', '.join(_found_text(case, each) for each in three)}."
+        f"{'; '.join(texts)}. Found: {', '.join(_found_text(case, each) for each in three)}."
     )
     return decide(parts), evidence
 
 
 def rms_gap(first: np.ndarray, second: np.ndarray) -> intervals.Interval:
-    """95 % interval of rms(first) - rms(second) over (repeats, h), NaN left out, by bootstrap; unknown below two."""
+    """Return the 95 % bootstrap interval of rms(first) - rms(second), both (repeats, h) with NaN; unknown below two."""
     if min(len(first), len(second)) < 2 or not (np.isfinite(first).any() and np.isfinite(second).any()):
         return intervals.UNKNOWN
     rng = np.random.default_rng(0)
@@ -157,7 +158,7 @@ def _rms(errors: np.ndarray) -> float:
 def _h1(case: maps.MapCase) -> tuple[Answer, str]:
     duels = duels_of(case)
     if not duels:
-        return "undecided", "Not judged: no fused map stands beside a single view."
+        return "undecided", "Not judged: the experiment has no fused map and single view to compare."
     answers = [False if "behind" in each else True if "ahead" in each else None for each, _ in duels]
     evidence = " ".join(text for _, text in duels)
     if len(duels) == 1:
@@ -166,8 +167,8 @@ def _h1(case: maps.MapCase) -> tuple[Answer, str]:
 
 
 def duels_of(case: maps.MapCase) -> list[tuple[tuple[Standing, ...], str]]:
-    """H1's map against one view with as many frames as each of its views, and against one with as many exposures in
-    total, where the experiment has them: the standing in each respect, and numbers."""
+    """Compare H1's map with one view of as many frames as each of its views, and with one view of as many exposures in
+    total, if the experiment has them. Return the standing in each respect, and the numbers as text."""
     fused = [one for one in case.set_ups if one.merge == NOISE_REDUCING and one.views > 1 and case.frames(one.variant)]
     registration = next((name for name in MARKED if any(one.registration == name for one in fused)), None)
     fused = sorted((one for one in fused if one.registration == registration), key=lambda one: -one.views)
@@ -201,17 +202,17 @@ def _duel(case: maps.MapCase, mapped: maps.Map, rival: maps.Map, registration: s
         "ahead" if low > rival_high else "behind" if high < rival_low else "level" if sure else "open",
         *("ahead" if one.is_below else "behind" if one.interval.over(0) else "open" for one in (sizes, noise)),
     )
-    said = ", ".join(f"{respect} {standing}" for respect, standing in zip(RESPECTS, standings, strict=True))
+    each = ", ".join(f"{respect} {standing}" for respect, standing in zip(RESPECTS, standings, strict=True))
     text = (
         f"{mapped.views} views ({registration}, fusion) of {many(mapped.frames, 'frame')} against one of "
-        f"{many(rival.frames, 'frame')}: {said}. Found {_found_text(case, mapped)} against {_found_text(case, rival)}; "
+        f"{many(rival.frames, 'frame')}: {each}. Found {_found_text(case, mapped)} against {_found_text(case, rival)}; "
         f"|size error| {maps.change_text(sizes)}; surface noise {maps.ratio_text(noise)}."
     )
     return standings, text
 
 
 def _bounds(case: maps.MapCase, mapped: maps.Map) -> tuple[int, int]:
-    """Fewest and most holes that a map finds."""
+    """Return the fewest and most holes that a map finds."""
     states = list(case.status(mapped).values())
     found = states.count("found")
     return found, found + states.count("undecided")
@@ -227,7 +228,7 @@ VIEW_CLAIMS: dict[str, Callable[[maps.MapCase], tuple[Answer, str]]] = {"C7": _c
 
 
 def score_views(cases: Sequence[maps.MapCase]) -> list[Verdict]:
-    """A verdict for each of `VIEW_CLAIMS`; of several places one for each, the evidence saying where."""
+    """Return a verdict for each of `VIEW_CLAIMS` and place; with several places, the evidence names the place."""
     verdicts: list[Verdict] = []
     for claim, rule in VIEW_CLAIMS.items():
         judged = [(case, verdict_of(claim, *rule(case))) for case in cases]
@@ -242,11 +243,11 @@ def score_views(cases: Sequence[maps.MapCase]) -> list[Verdict]:
 
 
 def _over_units(verdicts: Sequence[Verdict]) -> Verdict:
-    """One verdict from those on units of the camera: that of all of them where they agree and are enough."""
+    """Combine verdicts on units of the camera into one: theirs if they agree and are enough, else "undecided"."""
     evidence = " ".join(one.evidence for one in verdicts)
     answers = [one.verdict for one in verdicts]
     if len(verdicts) < FEWEST_UNITS and set(answers) != {"undecided"}:
         on = f"{many(len(verdicts), 'unit')} of the camera"
-        evidence = f"Judged on {on} only, which says nothing about others; there: {', '.join(answers)}. {evidence}"
+        evidence = f"Judged on {on} only, so nothing follows for others; there: {', '.join(answers)}. {evidence}"
     agreed = len(verdicts) >= FEWEST_UNITS and len(set(answers)) == 1
     return replace(verdicts[0], verdict=answers[0] if agreed else "undecided", evidence=evidence)

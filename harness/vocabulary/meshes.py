@@ -1,4 +1,4 @@
-"""Meshes of parts from files: read within bounds, in metres, their front turned to the camera."""
+"""Reads meshes of parts from files: with a bound on their size, in metres, and with their front facing the camera."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from harness.vocabulary.files import bounded_bytes, limited_memory
 
 MOST_BYTES, FILES = 1 << 29, ".stl, .ply, .obj or .glb"
 FrontAxis = Annotated[
-    Literal["+x", "-x", "+y", "-y", "+z", "-z"], Field(description="the file's axis that points to the camera")
+    Literal["+x", "-x", "+y", "-y", "+z", "-z"], Field(description="the file's axis that points at the camera")
 ]
 FileUnit = Literal["mm", "cm", "m", "in"]
 UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}

@@ -48,9 +48,9 @@ def camera_title(name: str) -> str:
     """Return the title of a camera of tofpod without commas; of any other name or path its words."""
     if re.fullmatch(r"\w+", name):
         file = resources.files("scenes") / "cameras" / f"{name}.yaml"
-        told = re.search(r"^title: (.+)$", file.read_text(encoding="utf-8"), re.MULTILINE) if file.is_file() else None
-        if told:
-            return told[1].replace(",", "")
+        found = re.search(r"^title: (.+)$", file.read_text(encoding="utf-8"), re.MULTILINE) if file.is_file() else None
+        if found:
+            return found[1].replace(",", "")
     return name.rpartition("/")[2].removesuffix(".yaml").replace("_", " ")
 
 

@@ -85,8 +85,8 @@ class PlugIns:
     def broken(self, offer: Offer, why: str, command: str = "") -> UserError:
         """Return the mistake of a plug-in that does not fit its group. ``command`` would show more."""
         fix = f"repair or uninstall the package {offer.package}" + (f"; `{command}` shows more" if command else "")
-        said = f"{self.noun} {offer.name!r} ({offer.target}, of the package {offer.origin}) cannot be loaded: {why}"
-        return UserError(said, fix=fix)
+        what = f"{self.noun} {offer.name!r} ({offer.target}, of the package {offer.origin}) cannot be loaded: {why}"
+        return UserError(what, fix=fix)
 
 
 @lru_cache(maxsize=8)

@@ -72,8 +72,8 @@ def check_version(
     first = known if oldest is None else oldest
     legal, fix = f"version {known}" if first == known else f"versions {first} to {known}", again
     if isinstance(found, bool) or not isinstance(found, int) or found < 0:
-        said = "states no version" if found is None else f"states the version {str(found)[:40]!r}, which is none"
-        message = f"{said} of {what}"
+        fault = "states no version" if found is None else f"states the version {str(found)[:40]!r}, which is none"
+        message = f"{fault} of {what}"
     elif found > known:
         message = f"was written by a newer tofpod: it is {what} of version {found}"
         fix = "upgrade tofpod, or use the version that wrote it"

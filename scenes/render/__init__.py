@@ -1,1 +1,1 @@
-"""Light transport with Mitsuba 3: from a target before a camera to the noise-free view that the sensor sees."""
+"""Light transport with Mitsuba 3: computes the noise-free view of a target that a camera's sensor receives."""

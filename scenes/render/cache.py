@@ -1,4 +1,4 @@
-"""Renders stored by content, in files with a checksum; listing, locking and trimming of their folder."""
+"""Stores renders by content, in files with a checksum; lists, locks and trims their folder."""
 
 from __future__ import annotations
 
@@ -29,26 +29,26 @@ from scenes.target.mesh import build_target
 
 CODE = ("scenes.render.view", "scenes.target.mesh")
 PACKAGES = ("mitsuba", "drjit", "trimesh", "manifold3d", "numba", "numpy", "scipy")
-"""Modules, with all that they import, and packages that decide a render's numbers; a GPU moves them by 1e-6."""
-VIEW_VERSION = 2  # in every file; one of another version counts as absent
-MOST_BYTES = 2 << 30  # a sensor of a million pixels at a hundred frequencies gives 1.7 GB
+"""Modules (with all that they import) and packages that determine a render's results; a GPU changes them by 1e-6."""
+VIEW_VERSION = 2  # stored in every file; a file of another version counts as absent
+MOST_BYTES = 2 << 30  # a sensor of a million pixels at a hundred frequencies needs 1.7 GB
 CHECKSUM_BYTES = 16
 ARRAYS = tuple(f.name for f in fields(NoiseFreeView) if f.type == "np.ndarray")
 RENDER_NAME = re.compile(r"[0-9a-f]{16}\.npz")
-LEFTOVER_NAME = re.compile(r"\.[0-9a-f]{16}\.\w+\.part\.npz")  # of a render that is being written, by `files`
-LEFTOVER_AFTER_S = 86_400.0  # a render is written in less than a second
-RENDERING, LOCK = ".rendering", ".lock"  # of which a render locks a byte; which a sweep holds while it runs
+LEFTOVER_NAME = re.compile(r"\.[0-9a-f]{16}\.\w+\.part\.npz")  # names of renders being written, by `files`
+LEFTOVER_AFTER_S = 86_400.0  # writing a render takes less than a second
+RENDERING, LOCK = ".rendering", ".lock"  # each render locks a byte of the first; a running sweep holds the second
 
 
 def render_key(target: TargetConfig, optics: Optics, config: RenderConfig) -> str:
-    """Return the digest of all inputs of a render: target, the camera's optics (not its engine), work and code."""
+    """Return the digest of all inputs of a render: target, the camera's optics (not its engine), effort and code."""
     content = {"target": target.to_data(), "optics": optics.content(), "render": config.to_data()}
     return digest({"code": source_digest(CODE, PACKAGES), **content})
 
 
 def cached_view(target: TargetConfig, optics: Optics, config: RenderConfig, folder: Path) -> tuple[NoiseFreeView, bool]:
-    """Return the view of a declared target, and whether it came from the cache; a view that another process renders is
-    waited for. Raises UserError as `build_target` and `render_view` do, and where the folder cannot be written."""
+    """Return the view of a declared target, and whether it came from the cache. If another process renders it, wait for
+    that. Raises UserError as `build_target` and `render_view` do, and if the folder cannot be written."""
     key = render_key(target, optics, config)
     path = folder / f"{key}.npz"
     found = read_view(path)
@@ -65,7 +65,7 @@ def cached_view(target: TargetConfig, optics: Optics, config: RenderConfig, fold
 
 
 def write_view(path: Path, view: NoiseFreeView) -> None:
-    """Store a view as .npz, not compressed, atomically, with a checksum of the whole at its end."""
+    """Write a view as .npz, uncompressed and atomically, followed by a checksum of the whole file."""
     kept = {f.name: getattr(view, f.name) for f in fields(view) if f.name not in ARRAYS}
     facts = json.dumps({**kept, "version": VIEW_VERSION, "region": asdict(view.region)})
     buffer = io.BytesIO()
@@ -78,13 +78,13 @@ def write_view(path: Path, view: NoiseFreeView) -> None:
 
 
 def read_view(path: Path) -> NoiseFreeView | None:
-    """Return a stored view, or None where the file is absent, truncated, damaged or of another version. Nothing is
-    parsed before the checksum holds, and nothing is unpickled; memory is bounded by the file's size. Reading a view
-    updates its file's time, by which `trim_cache` knows the last use."""
+    """Return a stored view; None if the file is absent, truncated, damaged or of another version. Nothing is parsed
+    before the checksum has been verified, and nothing is unpickled; the file's size bounds the memory. Reading a view
+    updates its file's time, from which `trim_cache` knows the last use."""
     try:
         found = os.stat(path)
         if not stat.S_ISREG(found.st_mode) or found.st_size > MOST_BYTES:
-            return None  # reading a pipe would wait for ever
+            return None  # reading a pipe would wait forever
         content = memoryview(path.read_bytes())
         body, checksum = content[:-CHECKSUM_BYTES], content[-CHECKSUM_BYTES:]
         if hashlib.blake2b(body, digest_size=CHECKSUM_BYTES).digest() != checksum:
@@ -98,14 +98,14 @@ def read_view(path: Path) -> NoiseFreeView | None:
         view = NoiseFreeView(**{**facts, **lists, **arrays, "region": Region(**facts["region"])})
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
         return None
-    with contextlib.suppress(OSError):  # a cache that may only be read serves as well
+    with contextlib.suppress(OSError):  # a read-only cache works too
         os.utime(path)
     return view
 
 
 @dataclass(frozen=True)
 class StoredFile:
-    """A file of the cache. ``used_s``: when it was last read or written, seconds since 1970 by the file system."""
+    """A file of the cache. ``used_s``: when it was last read or written, in seconds since 1970 (file system's time)."""
 
     path: Path
     size_bytes: int
@@ -113,18 +113,18 @@ class StoredFile:
 
 
 def stored_renders(folder: Path) -> list[StoredFile]:
-    """Return all renders of a folder, the longest unused first; links and other files are skipped."""
+    """Return all renders of a folder, the longest unused first, without links and other files."""
     return sorted(_files(folder, RENDER_NAME), key=lambda file: (file.used_s, file.path.name))
 
 
 def leftovers(folder: Path, older_than_s: float = LEFTOVER_AFTER_S) -> list[StoredFile]:
-    """Return temporary files of renders that were never finished, not touched for so long."""
+    """Return the temporary files of renders that were never finished, if untouched for ``older_than_s``."""
     before_s = time.time() - older_than_s
     return sorted((f for f in _files(folder, LEFTOVER_NAME) if f.used_s < before_s), key=lambda f: f.path)
 
 
 def removed(files: Iterable[StoredFile]) -> list[StoredFile]:
-    """Remove files; returns those that are gone. A file that cannot be removed, or is gone already, is skipped."""
+    """Remove files and return those that are gone. Files that cannot be removed, or are gone already, are skipped."""
     gone = []
     for file in files:
         with contextlib.suppress(OSError):
@@ -134,7 +134,7 @@ def removed(files: Iterable[StoredFile]) -> list[StoredFile]:
 
 
 def longest_unused(renders: Iterable[StoredFile], limit_bytes: int, keep: Collection[Path]) -> list[StoredFile]:
-    """Choose the longest unused renders, never those of ``keep`` (by name), until the rest fits ``limit_bytes``."""
+    """Return the longest unused renders to remove so that the rest fits ``limit_bytes``; none of ``keep`` (names)."""
     kept, renders = {path.name for path in keep}, sorted(renders, key=lambda file: (file.used_s, file.path.name))
     excess, going = sum(file.size_bytes for file in renders) - limit_bytes, []
     for file in renders:
@@ -145,8 +145,8 @@ def longest_unused(renders: Iterable[StoredFile], limit_bytes: int, keep: Collec
 
 
 def trim_cache(folder: Path, limit_bytes: int, keep: Collection[Path] = ()) -> int:
-    """Remove the longest unused renders until the rest fits into ``limit_bytes``, never those of ``keep``, and old
-    leftovers of killed processes; nothing while another process uses the folder. Returns how many are left."""
+    """Remove the longest unused renders until the rest fits ``limit_bytes``, but none of ``keep``, and old leftovers of
+    killed processes; remove nothing while another process uses the folder. Return how many are left."""
     with contextlib.suppress(UserError), alone(folder):
         removed([*longest_unused(stored_renders(folder), limit_bytes, keep), *leftovers(folder)])
     return len(stored_renders(folder))
@@ -154,7 +154,7 @@ def trim_cache(folder: Path, limit_bytes: int, keep: Collection[Path] = ()) -> i
 
 @contextlib.contextmanager
 def in_use(folder: Path) -> Iterator[None]:
-    """Prevent the removal of renders of this folder while any sweep runs, where system and folder allow locks."""
+    """Prevent the removal of renders from this folder while a sweep runs, if system and folder allow locks."""
     with contextlib.ExitStack() as held:
         with contextlib.suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
@@ -164,7 +164,7 @@ def in_use(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def alone(folder: Path) -> Iterator[None]:
-    """Keep sweeps off this folder meanwhile. Raises UserError where one does, or the folder cannot be written."""
+    """Keep sweeps from using this folder. Raises UserError if one does, or if the folder cannot be written."""
     with contextlib.ExitStack() as held:
         try:
             file = held.enter_context(opened_lock(folder / LOCK))
@@ -177,7 +177,7 @@ def alone(folder: Path) -> Iterator[None]:
 
 
 def _files(folder: Path, names: re.Pattern[str]) -> Iterator[StoredFile]:
-    """Yield regular files of a folder by their names; one that vanishes meanwhile is passed over."""
+    """Yield the regular files of a folder by name; files that vanish in the meantime are skipped."""
     for path in folder.iterdir() if folder.is_dir() else ():
         if names.fullmatch(path.name):
             with contextlib.suppress(OSError):

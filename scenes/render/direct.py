@@ -1,4 +1,4 @@
-"""The direct part of a view: emitter to surface to pixel, deterministic, fine where a footprint meets an edge."""
+"""The direct part of a view: light from emitter to surface to pixel, deterministic, with fine sampling at edges."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from scipy import ndimage
 from scenes.optics import COARSE, FINE, Quadrilaterals, wave_numbers
 from scenes.render.scene import LitScene
 
-FINEST = 2048  # sub-rays where that leaves an error in a hole: a dark wall beside a strip of what lies behind
-RAYS_AT_ONCE = 1 << 22  # sub-rays cast at once: 4 million take 0.6 GB
+FINEST = 2048  # sub-rays where fewer leave an error in a hole: a dark wall beside a strip of what lies behind it
+RAYS_AT_ONCE = 1 << 22  # sub-rays cast at once: 4 million need 0.6 GB
 KINK_M, BENT_M = 2e-5, 2e-6
-"""A pixel whose corners leave the plane at its centre by more than the first has an edge in it, such as that of a strip
-of tape; up to the second its light follows from that plane, without casting sub-rays."""
-UNSURE_M = 1e-4  # pixels whose direct light may be wrong by more are divided once more
-UNEVEN = 0.2  # relative spread of direct light in a footprint from which on a shadow's edge is taken to be in it
+"""If a pixel's corners lie farther than the first off the plane at its centre, there is an edge in it, such as that of
+a strip of tape. Up to the second, its light follows from that plane without casting sub-rays."""
+UNSURE_M = 1e-4  # pixels whose direct light may be wrong by more are sampled once more, finely
+UNEVEN = 0.2  # relative spread of direct light in a footprint that indicates the edge of a shadow
 FAST: Any = {"cache": True, "fastmath": {"contract", "reassoc", "nsz"}, "nogil": True}
-"""Options of compilation; sums are float64, whose order moves a range by 1e-14 m."""
-COMB_TOLERANCE = 1e-9  # unevenness, by the highest frequency, up to which a comb is summed by a recurrence
+"""Options for compilation. Sums are in float64; their order changes a range by 1e-14 m."""
+COMB_TOLERANCE = 1e-9  # largest deviation from even spacing, relative to the highest frequency, for the recurrence
 Frequencies = tuple[float, ...]
 
 
 def comb_step(frequencies_hz: tuple[float, ...]) -> float | None:
-    """Return the spacing in Hz of four or more evenly spaced frequencies; None for other lists."""
+    """Return the spacing in Hz of four or more evenly spaced frequencies (a comb); None for other lists."""
     if len(frequencies_hz) < 4:
         return None
     steps = np.diff(frequencies_hz)
@@ -34,8 +34,8 @@ def comb_step(frequencies_hz: tuple[float, ...]) -> float | None:
 
 
 def phasor_sums(amplitude: np.ndarray, path_m: np.ndarray, frequencies_hz: tuple[float, ...]) -> np.ndarray:
-    """Return the mean over sub-rays of a exp(i 2 pi f L / c): (f, n) complex128 from amplitudes and paths (n, m). A
-    comb is summed by multiplying with the phasor of its spacing: rounding grows to 1e-14 over 100 lines."""
+    """Return the mean over sub-rays of a exp(i 2 pi f L / c), (f, n) complex128, from amplitudes and paths (n, m). For
+    a comb, each phasor is the previous one times that of the spacing; rounding grows to 1e-14 over 100 lines."""
     waves = wave_numbers(frequencies_hz)
     out = np.empty((len(waves), len(path_m)), np.complex128)
     amplitude, path_m = np.ascontiguousarray(amplitude), np.ascontiguousarray(path_m)
@@ -96,7 +96,7 @@ class Hits(NamedTuple):
 
 class OffFace(NamedTuple):
     """Sub-rays that met something other than the undamaged face. ``pixel`` (p,): flat indices of pixels that have any,
-    ``counts`` (p,): how many, ``share`` (p,): of the footprint; ``slopes`` (sum of counts, 2) float32, by pixel."""
+    ``counts`` (p,): their number, ``share`` (p,): of the footprint; ``slopes`` (sum of counts, 2) float32, by pixel."""
 
     pixel: np.ndarray
     counts: np.ndarray
@@ -104,15 +104,15 @@ class OffFace(NamedTuple):
     slopes: np.ndarray
 
     def chosen(self, here: np.ndarray) -> OffFace:
-        """Return those of the pixels picked by a mask (p,)."""
+        """Return those of the pixels selected by a mask (p,)."""
         return OffFace(self.pixel[here], self.counts[here], self.share[here], self.slopes[np.repeat(here, self.counts)])
 
 
 class DirectLight(NamedTuple):
-    """The direct part on a region, (h, w): phasor (f, h, w), intensity, the central ray's range, surface and texture
-    place, the share of the footprint on that surface, and which pixels were finely divided. ``face`` (f + 1, h, w):
-    mean over a pixel's sub-rays on the undamaged face of albedo x exp(i 2 pi f range / c), frequency 0 last;
-    ``face_range_m``: their mean range, 0 where there are none. ``off_face``: the other sub-rays that met something."""
+    """The direct part on a region (h, w): phasor (f, h, w); intensity; range, surface and texture coordinates of the
+    central ray; share of the footprint on that surface; which pixels were finely sampled. ``face`` (f + 1, h, w): mean
+    over a pixel's sub-rays on the undamaged face of albedo x exp(i 2 pi f range / c), frequency 0 last.
+    ``face_range_m``: their mean range, 0 without any. ``off_face``: the other sub-rays that met something."""
 
     phasor: np.ndarray
     intensity: np.ndarray
@@ -148,9 +148,9 @@ def cast(lit: LitScene, slopes: np.ndarray) -> Hits:
 def _even_moments(  # type: ignore[no-untyped-def]
     slopes, centre, normal, emitter, albedo, texture, uv_of, to_light, to_face
 ):
-    """Sum a pixel's light over sub-rays ``slopes`` (n, m, 2) on the plane of its ``centre`` and ``normal`` (n, 3) into
-    moments (4, n) of order 0 to 3: of amplitude (1 at the centre, times the albedo) about the centre's path, and of the
-    albedo about its range. ``albedo`` (n,), negative where ``texture`` gives it."""
+    """Sum a pixel's light over sub-rays ``slopes`` (n, m, 2) on the plane of its ``centre`` and ``normal`` (n, 3). The
+    moments (4, n) have orders 0 to 3: of amplitude (1 at the centre, times the albedo) about the centre's path, and of
+    the albedo about its range. ``albedo`` (n,): negative where ``texture`` gives it."""
     rows, columns = texture.shape
     n, m, _ = slopes.shape
     for i in range(n):
@@ -195,7 +195,7 @@ def _of_moments(moments: np.ndarray, about_m: np.ndarray, frequencies_hz: tuple[
 
 
 class _Sums:
-    """Direct light of a region's pixels, flat, while it is made: fields as of `DirectLight`."""
+    """Sums of direct light of a region's pixels, flat; fields as in `DirectLight`."""
 
     def __init__(
         self, lit: LitScene, slopes: np.ndarray, footprint: Quadrilaterals, frequencies_hz: Frequencies
@@ -209,7 +209,7 @@ class _Sums:
         self.off_face: list[OffFace] = []
 
     def add_plane(self, here: np.ndarray) -> None:
-        """Add the light of pixels that see one plane, from what their centres met."""
+        """Add the light of pixels that see a single plane, from the hits of their centres."""
         lit, central, frequencies = self.lit, self.central, self.frequencies_hz
         rays, range_m = self.footprint.coarse(self.rows[here], self.cols[here]), central.range_m[here].astype(float)
         ray = np.column_stack([self.slopes[here], np.ones(len(here))])
@@ -228,7 +228,7 @@ class _Sums:
         self._keep_off_face(here[~on], np.ones((int((~on).sum()), rays.shape[1]), bool), rays[~on])
 
     def add_rays(self, here: np.ndarray, rays: np.ndarray, again: np.ndarray | None = None) -> np.ndarray:
-        """Add the light of sub-rays (n, m, 2) of pixels; returns those of ``again`` (h w,) to be divided once more."""
+        """Add the light of sub-rays (n, m, 2) of pixels. Return those of ``again`` (h w,) that need finer sampling."""
         m = rays.shape[1]
         hits = cast(self.lit, rays.reshape(-1, 2))
         range_m, path_m, amplitude, albedo, surface = (each.reshape(-1, m) for each in hits[:5])
@@ -264,10 +264,10 @@ def direct_light(
     closely: np.ndarray | None = None,
     roughly: np.ndarray | None = None,
 ) -> DirectLight:
-    """Return direct light on every pixel of a region with central rays ``slopes`` (h, w, 2). Where rays to a pixel's
-    centre and corners meet one plane, evenly lit, its light follows from that. Elsewhere sub-rays are cast: few on a
-    bent surface, many where a footprint meets an edge or a shadow's edge and in the pixels ``closely`` (h, w), and
-    there once more where that leaves an error; few at the edges in the pixels ``roughly``."""
+    """Return the direct light of every pixel of a region with central rays ``slopes`` (h, w, 2). If the rays to a
+    pixel's centre and corners meet one evenly lit plane, its light follows from these. Other pixels are sampled by
+    sub-rays: a few on a curved surface, many where the footprint meets an edge or the edge of a shadow and in the
+    pixels ``closely`` (h, w), where more follow if that leaves an error; a few at edges in the pixels ``roughly``."""
     shape, sums = slopes.shape[:2], _Sums(lit, slopes, footprint, frequencies_hz)
     central, rows, cols = sums.central, sums.rows, sums.cols
     bend_m, edge = _corners(lit, footprint.corner, slopes, central)
@@ -304,8 +304,8 @@ def _chunks(pixels: np.ndarray, per_pixel: int) -> list[np.ndarray]:
 
 
 def _corners(lit: LitScene, corner: np.ndarray, slopes: np.ndarray, central: Hits) -> tuple[np.ndarray, np.ndarray]:
-    """Return (h, w) each: by how much rays through a pixel's corners, with slopes ``corner`` (h + 1, w + 1, 2), leave
-    the plane that its centre met, and whether they say that an edge or a shadow's is in the pixel."""
+    """Return, (h, w) each, how far rays through a pixel's corners (slopes ``corner``, (h + 1, w + 1, 2)) hit off the
+    plane at its centre, and whether they show an edge or the edge of a shadow in the pixel."""
     (h, w), hits = slopes.shape[:2], cast(lit, corner.reshape(-1, 2))
     rays = np.concatenate([slopes, np.ones((h, w, 1))], axis=-1)
     normal = central.normal.reshape(h, w, 3).astype(float)
@@ -327,8 +327,8 @@ def _corners(lit: LitScene, corner: np.ndarray, slopes: np.ndarray, central: Hit
 
 
 def _error_m(amplitude: np.ndarray, path_m: np.ndarray) -> np.ndarray:
-    """Return (n,) the error of range that m sub-rays (n, m) of a pixel leave, about: an edge is misplaced by one
-    sub-ray or two of m. 3 spread / (2 m sqrt(lit share)) was seen on holes of 1/16 to 1 in before a backing."""
+    """Return the approximate error of range (n,) that m sub-rays (n, m) of a pixel leave: an edge is misplaced by one
+    or two of m sub-rays. Holes of 1/16 to 1 in before a backing showed 3 spread / (2 m sqrt(lit share))."""
     light = np.maximum(amplitude.sum(axis=1), 1e-30)
     mean = (amplitude * path_m).sum(axis=1) / light
     spread = np.sqrt((amplitude * (path_m - mean[:, None]) ** 2).sum(axis=1) / light)

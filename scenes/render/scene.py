@@ -1,4 +1,4 @@
-"""Mitsuba: its start, a target as its scene in the camera's frame, and the queries of light transport."""
+"""Mitsuba: loads it, builds a target's scene in the camera's frame, and answers the queries of light transport."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ FIX = "pip install karellen-llvm-core (Linux x86-64), or set DRJIT_LIBLLVM_PATH 
 
 
 def load_mitsuba() -> Any:
-    """Return the mitsuba module with a variant set. Raises UserError, with the package to install, where none works."""
-    # Dr.Jit looks for LLVM when it is imported, so the path comes first; without a GPU only does it matter.
+    """Return the mitsuba module with a variant set. Raises UserError, with the package to install, if none works."""
+    # Dr.Jit looks for LLVM when it is imported, so set the path first; it only matters without a GPU.
     missing = _point_to_llvm()
     import mitsuba as mi
 
@@ -34,7 +34,7 @@ def load_mitsuba() -> Any:
     if _works(mi, "llvm_ad_mono"):
         return mi
     if "open3d" in sys.modules:
-        # Both wheels bring a libc++.so.1; the first that is loaded serves both, and Open3D's is too old for LLVM.
+        # Both wheels contain a libc++.so.1; the first loaded serves both, and Open3D's is too old for LLVM.
         message = "Mitsuba cannot run: Open3D was imported before it, and Open3D's C++ library replaces LLVM's"
         fix = "call scenes.render.scene.load_mitsuba() before importing open3d, or render in a process of its own"
         raise UserError(message, fix=fix)
@@ -42,7 +42,7 @@ def load_mitsuba() -> Any:
 
 
 def _works(mi: Any, name: str) -> bool:
-    """Tell whether the variant finds a ray's hit: a GPU whose driver lacks OptiX computes, but casts no rays."""
+    """Tell whether the variant finds a ray's hit. A GPU whose driver lacks OptiX computes, but casts no rays."""
     if name not in mi.variants() or (name.startswith("cuda") and not _has_nvidia_driver()):
         return False
     with warnings.catch_warnings():
@@ -52,18 +52,18 @@ def _works(mi: Any, name: str) -> bool:
             scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle"}})
             return bool(scene.ray_test(mi.Ray3f(mi.Point3f(0.1, 0.2, 1.0), mi.Vector3f(0.0, 0.0, -1.0)))[0])
         except Exception:
-            # Dr.Jit reports a missing backend by exceptions of several types; any of them means "not this one".
+            # Dr.Jit reports a missing backend by various exceptions; any of them means that this variant does not work
             return False
 
 
 def _has_nvidia_driver() -> bool:
-    """Tell whether there is a driver: without it Dr.Jit prints warnings that a user would take for a fault."""
+    """Tell whether there is an NVIDIA driver. Without it, Dr.Jit prints warnings that look like errors to a user."""
     return Path("/proc/driver/nvidia/version").exists() or Path("/dev/nvidiactl").exists() or sys.platform == "win32"
 
 
 def _point_to_llvm() -> UserError | None:
-    """Set DRJIT_LIBLLVM_PATH, where it is not set, to the LLVM of the wheel karellen-llvm-core: Dr.Jit's own search may
-    pick one that aborts the process. Returns the mistake to raise where no LLVM can be used."""
+    """Set DRJIT_LIBLLVM_PATH, if it is not set, to the LLVM of the wheel karellen-llvm-core; Dr.Jit's own search may
+    choose one that aborts the process. Return the UserError to raise if no LLVM can be used."""
     named = os.environ.get("DRJIT_LIBLLVM_PATH")
     if named:
         message, legal = f"DRJIT_LIBLLVM_PATH names {named}, which does not exist", "the path of LLVM 17 or newer"
@@ -76,12 +76,12 @@ def _point_to_llvm() -> UserError | None:
     return UserError("no LLVM was found that Dr.Jit can use", legal=LEGAL, fix=FIX)
 
 
-LIFT_M = 1e-5  # from a surface to where a ray starts: float32 places hits within 1e-6 m; Mitsuba's lift is 0.15 mm
+LIFT_M = 1e-5  # of a ray's start from a surface: float32 places hits within 1e-6 m; Mitsuba's default is 0.15 mm
 
 
 class Met(NamedTuple):
-    """Hits of rays, Dr.Jit arrays: whether there is one, its distance and place, the unit normal towards the ray's
-    origin, the surface's index, the triangle's, and the direction back along the ray."""
+    """Hits of rays, as Dr.Jit arrays: whether there is a hit, its distance and position, the unit normal towards the
+    ray's origin, the indices of surface and triangle, and the direction back along the ray."""
 
     valid: Any
     distance: Any
@@ -95,11 +95,11 @@ class Met(NamedTuple):
 @dataclass(frozen=True)
 class LitScene:
     """A target's parts as one Mitsuba mesh, and the emitter: a point with uniform intensity in a soft-edged cone.
-    Mitsuba supplies the rays' hits alone: one shape without materials needs no virtual calls, so that all scenes share
-    their compiled kernels. By triangle stand ``surface_of`` (index into ``parts``), ``normal_of`` and ``on_face``; by
-    surface ``albedos`` and, where any is glossy, ``gloss``: share and exponent of the lobes. The part ``textured`` has
-    ``texture`` at ``uv_of`` (2, 4), affine in place; -1, None and zeros where all are plain. ``uv_factors``: the same
-    as data, as constants would compile the kernels anew for each board."""
+    Mitsuba only finds the hits of rays: one shape without materials needs no virtual calls, so that all scenes share
+    their compiled kernels. ``surface_of`` (index into ``parts``), ``normal_of`` and ``on_face`` are by triangle;
+    ``albedos`` and, if any surface is glossy, ``gloss`` (share and exponent of the lobes) by surface. The part
+    ``textured`` has ``texture`` at ``uv_of`` (2, 4), an affine function of position; -1, None and zeros if there is
+    none. ``uv_factors``: the same as data, because constants would compile the kernels anew for each board."""
 
     mi: Any
     scene: Any
@@ -118,7 +118,7 @@ class LitScene:
     uv_factors: list[Any]
 
     def meet(self, origin: Any, direction: Any) -> Met:
-        """Return where rays along unit directions first meet the scene."""
+        """Return the first hits of rays along unit directions."""
         import drjit as dr
 
         mi = self.mi
@@ -132,13 +132,13 @@ class LitScene:
         return Met(valid, distance, place, normal, surface, triangle, -direction)
 
     def uv(self, place: Any) -> Any:
-        """Return where the texture stands at places of the part that has one."""
+        """Return the texture coordinates of points on the textured part."""
         ux, uy, uz, u0, vx, vy, vz, v0 = self.uv_factors
         x, y, z = place.x, place.y, place.z
         return self.mi.Point2f(ux * x + uy * y + uz * z + u0, vx * x + vy * y + vz * z + v0)
 
     def albedo(self, met: Met) -> Any:
-        """Return the albedo at hits; 0 where a ray met nothing."""
+        """Return the albedo at hits; 0 if a ray met nothing."""
         import drjit as dr
 
         plain = dr.gather(self.mi.Float, self.albedos, met.surface, met.valid)
@@ -148,8 +148,8 @@ class LitScene:
         return dr.select(here, self.texture.eval(self.uv(met.place), here)[0], plain)
 
     def lobe(self, surface: Any, normal: Any, viewer: Any, direction: Any) -> Any:
-        """Return what a surface reflects from ``direction`` to ``viewer``, as a multiple of what a Lambertian one of
-        the same albedo would: 1 - share + share (exponent + 2) / 2 cos^exponent. All directions leave the surface."""
+        """Return the light that a surface reflects from ``direction`` to ``viewer``, over that of a Lambertian one of
+        the same albedo: 1 - share + share (exponent + 2) / 2 cos^exponent. All directions leave the surface."""
         import drjit as dr
 
         if self.gloss is None:
@@ -159,8 +159,8 @@ class LitScene:
         return 1 - share + share * (exponent + 2) / 2 * dr.power(dr.maximum(cosine, 1e-6), exponent)
 
     def arriving(self, met: Met, active: Any) -> tuple[Any, Any]:
-        """Light from the emitter at each hit: (irradiance, distance). The irradiance is cone(direction) cos(incidence)
-        / d^2 times the `lobe`, 1 at 1 m facing, and 0 behind an occluder."""
+        """Return the light from the emitter at each hit: (irradiance, distance). The irradiance is cone(direction)
+        cos(incidence) / d^2 times the `lobe`: 1 on a facing surface at 1 m, 0 behind an occluder."""
         import drjit as dr
 
         mi = self.mi
@@ -173,7 +173,7 @@ class LitScene:
         on_axis = -towards.z
         cone = dr.clip((on_axis - self.cos_cutoff) / (self.cos_full - self.cos_cutoff), 0, 1)
         lit = active & (cosine > 0) & (cone > 0)
-        # what stands between the surface, on the side from which the ray came, and the emitter
+        # occluders between the emitter and the side of the surface from which the ray came
         origin = met.place + LIFT_M * met.normal
         way = emitter - origin
         reach = dr.norm(way)
@@ -187,8 +187,8 @@ class LitScene:
 def lit_scene(
     mi: Any, parts: Sequence[TargetPart], optics: Optics, on_face: Sequence[np.ndarray] | None = None
 ) -> LitScene:
-    """Build the scene from a target's parts, each with its albedo at 850 nm and its gloss, one of them with a texture
-    at most. ``on_face``: for each part which of its triangles (n,) lie on the undamaged face; None means none."""
+    """Build the scene from a target's parts, each with its albedo at 850 nm and its gloss; at most one has a texture.
+    ``on_face``: for each part, which of its triangles (n,) lie on the undamaged face; None means none."""
     import drjit as dr
     import trimesh
 

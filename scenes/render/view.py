@@ -1,7 +1,7 @@
-"""Rendering a view: region, direct light, indirect light and its noise, put together.
+"""Renders a view: determines its region, and combines direct light, indirect light and the noise of the latter.
 
-Indirect light met at least two surfaces; it is gathered by walking paths backwards. The spread between batches of
-low-discrepancy points (Sobol, scrambled anew for each) gives the noise that is left. On the board's undamaged face the
+Indirect light has met at least two surfaces; it is gathered by following paths backwards. The spread between batches of
+low-discrepancy points (Sobol, scrambled anew for each batch) gives its noise. On the board's undamaged face, indirect
 light is smooth, so it is gathered at the nodes of a coarse grid and interpolated."""
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from scenes.target.truth import face_of
 
 BATCHES = 8
 PATHS_A_LANE = 64  # enough that lanes end together, few enough that a small job fills the machine
-NOISE_LINES = 4  # lines of a comb of many that tell what noise does to range: paths are the same for all lines
-PER_VERTEX = 2  # low-discrepancy dimensions at each vertex: a direction
+NOISE_LINES = 4  # lines of a long comb from which noise of range is estimated: paths are the same for all lines
+PER_VERTEX = 2  # low-discrepancy dimensions for each vertex: a direction
 START_DIMENSIONS = 2
 CELLS, PROBES, OFTEN = 16, 2, 0.9
-"""Cells along each side of the square of first directions from the face, probes along each side of a cell, and share
-of paths that begin in cells in which a probe met something; the rest begin anywhere."""
+"""Cells along each side of the square of first directions from the face, probes along each side of a cell, and the
+share of paths that begin in cells where a probe met something; the others begin anywhere."""
 FLOATS_AT_ONCE = 1 << 26  # results held on the device at once: 0.25 GB
-FACE_WITHIN_M = 0.001 * MM  # vertices so near the undamaged face lie on it: Booleans leave them within 1 nm
-MESH_WITHIN_M = 0.05 * MM  # the same of a part from a mesh, whose heights stand on a grid
-ABOVE_FACE_M = 1 * MM  # height of the nodes, so that tape does not bury them
+FACE_WITHIN_M = 0.001 * MM  # vertices this close to the undamaged face lie on it: Booleans place them within 1 nm
+MESH_WITHIN_M = 0.05 * MM  # the same for a part from a mesh, whose heights lie on a grid
+ABOVE_FACE_M = 1 * MM  # height of the nodes above the face, so that tape does not cover them
 
 
 class PathWork(NamedTuple):
-    """Settings of the walk: at which frequencies, with how many reflections beyond the first, and from which seed."""
+    """Settings of the paths: their frequencies, the number of reflections beyond the first, and the seed."""
 
     frequencies_hz: tuple[float, ...]
     bounces: int
@@ -47,11 +47,11 @@ class PathWork(NamedTuple):
 def gather_at_points(
     lit: LitScene, points_m: np.ndarray, normals: np.ndarray, work: PathWork, samples: int, bright: Any = None
 ) -> np.ndarray:
-    """Gather indirect light that arrives at surface points (n, 3) with normals (n, 3), cosine-weighted, per unit
+    """Gather the indirect light that arrives at surface points (n, 3) with normals (n, 3), cosine-weighted, per unit
     albedo, weighted by what a glossy board there sends to the lens. All points share their low-discrepancy numbers, so
-    that noise is smooth from point to point. ``bright`` (4, 4): half of the paths go on from their first hit towards a
-    rectangle, -1..1 in x and y of this frame: a lit board, which they would seldom meet by chance. First directions are
-    drawn from cells of the hemisphere in which a probe met something, and seldom from all."""
+    that noise is smooth from point to point. ``bright`` (4, 4): half of the paths continue from their first hit towards
+    a rectangle, -1..1 in x and y of this frame: a lit board, which they would seldom meet by chance. First directions
+    are drawn mostly from those cells of the hemisphere in which a probe met something."""
     import drjit as dr
 
     mi = lit.mi
@@ -109,8 +109,8 @@ def gather_in_pixels(lit: LitScene, rays: OffFace, work: PathWork, samples: int 
 
 
 def range_noise_m(batches: np.ndarray, total: np.ndarray, frequencies_hz: tuple[float, ...]) -> np.ndarray:
-    """Return one standard deviation of range, (n,), from phasors (B, l, n) of B independent batches at the frequencies
-    of `noise_lines`, added to light ``total`` (f, n). The mean over B batches has their deviation over sqrt(B)."""
+    """Return the standard deviation of range (n,) from phasors (B, l, n) of B independent batches at the frequencies of
+    `noise_lines`, added to light ``total`` (f, n). The mean over B batches has that deviation over sqrt(B)."""
     few = noise_lines(frequencies_hz)
     chosen = tuple(frequencies_hz[k] for k in few)
     per_batch = range_change_m(batches - batches.mean(axis=0), total[few], chosen)
@@ -118,8 +118,8 @@ def range_noise_m(batches: np.ndarray, total: np.ndarray, frequencies_hz: tuple[
 
 
 def range_change_m(change: np.ndarray, total: np.ndarray, frequencies_hz: tuple[float, ...]) -> np.ndarray:
-    """Return the change of range, (..., n), by a small change (..., f, n) of phasors ``total`` (f, n); 0 without light.
-    Phases turn by Im(dH / H) and are fused with the least-squares weights c f_k / (4 pi sum f^2)."""
+    """Return the change of range (..., n) by a small change (..., f, n) of phasors ``total`` (f, n); 0 without light.
+    Phases turn by Im(dH / H) and are combined with the least-squares weights c f_k / (4 pi sum f^2)."""
     f = np.array(frequencies_hz)[:, None]
     weights = SPEED_OF_LIGHT_AIR * f / (4 * np.pi * (f**2).sum())
     by_light = np.divide(weights, total, out=np.zeros(total.shape, complex), where=np.abs(total) > 0)
@@ -127,16 +127,16 @@ def range_change_m(change: np.ndarray, total: np.ndarray, frequencies_hz: tuple[
 
 
 def noise_lines(frequencies_hz: tuple[float, ...]) -> list[int]:
-    """Return the frequencies by which noise is estimated: all, or NOISE_LINES spread over a longer list."""
+    """Return the frequencies at which noise is estimated: all, or NOISE_LINES spread over a longer list."""
     count = len(frequencies_hz)
     return [round(k) for k in np.linspace(0, count - 1, min(count, NOISE_LINES))]
 
 
 @lru_cache(maxsize=8)
 def _sobol(dimensions: int, longest: int, seed: int) -> np.ndarray:
-    """Return low-discrepancy points of all batches, flat in the order batch, point, dimension, float32."""
+    """Return the low-discrepancy points of all batches as flat float32, in the order batch, point, dimension."""
     rng = np.random.default_rng([seed, 0x1D1EC7])
-    from scipy.stats import qmc  # half of the time that a process needs to start; those that render alone need it
+    from scipy.stats import qmc  # this import is half of a process's start; only processes that render need it
 
     points = np.stack([qmc.Sobol(dimensions, seed=rng).random(longest) for _ in range(BATCHES)])
     return np.ascontiguousarray(points, np.float32).ravel()
@@ -145,9 +145,9 @@ def _sobol(dimensions: int, longest: int, seed: int) -> np.ndarray:
 def _towards(
     lit: LitScene, bright: tuple[Any, Any, Any], place: Any, normal: Any, turned: Any, u1: Any, u2: Any
 ) -> Any:
-    """Return a direction from a surface and its weight, drawn by its cosine (``turned``) or, from before the rectangle
-    ``bright``, with a chance of a half towards an even point of it: a mixture of both densities (Veach and Guibas'
-    balance heuristic), so that no weight exceeds 2. ``u1`` and ``u2`` in 0..1."""
+    """Return a direction from a surface and its weight. It is drawn by its cosine (``turned``) or, in front of the
+    rectangle ``bright``, with a probability of a half towards a uniform point of it: a mixture of both densities (Veach
+    and Guibas' balance heuristic), so that no weight exceeds 2. ``u1`` and ``u2``: in 0..1."""
     import drjit as dr
 
     mi = lit.mi
@@ -159,7 +159,7 @@ def _towards(
     chosen = before & (u1 < 0.5)
     aimed = dr.normalize((4 * u1 - 1) * axis_x + (2 * u2 - 1) * axis_y - from_middle)
     direction = dr.select(chosen, aimed, turned)
-    # where it meets the rectangle's plane; its density there, over that by the cosine
+    # its hit on the rectangle's plane; the density there, relative to that of the cosine
     falling = -dr.dot(direction, out)
     way = dr.dot(from_middle, out) / falling
     at = from_middle + way * direction
@@ -171,10 +171,10 @@ def _towards(
 
 
 class _Walk:
-    """Paths from places, backwards. ``start`` (place, u1, u2): point from which the path's length counts, origin,
-    direction and weight of the first ray. ``on_surface``: light that reaches the first hit directly counts (for a start
-    at the lens it is the direct part), and all places share one rotation of the low-discrepancy points (modulo 1).
-    ``longest``: points a batch at most. What differs from board to board is data: a constant would compile anew."""
+    """Paths that are followed backwards from places. ``start`` (place, u1, u2): point from which the path's length
+    counts, origin, direction and weight of the first ray. ``on_surface``: light that reaches the first hit directly
+    counts (for a start at the lens it is the direct part), and all places share one rotation of the low-discrepancy
+    points (modulo 1). ``longest``: most points in a batch. What differs between boards is data, not constants."""
 
     def __init__(self, lit: LitScene, start: Any, work: PathWork, on_surface: bool, bright: Any, longest: int) -> None:
         import drjit as dr
@@ -188,7 +188,7 @@ class _Walk:
 
     def sums(self, lanes: np.ndarray) -> np.ndarray:
         """Return sums over the paths of lanes: (f + 1, n) complex64, intensity last. ``lanes`` (4, n) uint32: each
-        walks ``count`` paths of a place and batch, from number ``first`` on."""
+        follows ``count`` paths of a place and batch, starting at number ``first``."""
         import drjit as dr
 
         mi, lines = self.lit.mi, len(self.work.frequencies_hz)
@@ -213,7 +213,7 @@ class _Walk:
         throughput: Any,
         totals: list[Any],
     ) -> tuple[Any, ...]:
-        """Go on by a vertex, or begin the next path. ``length``: up to ``before``, from which the ray comes."""
+        """Continue at the next vertex, or begin the next path. ``length``: that up to ``before``, the ray's start."""
         import drjit as dr
 
         lit, mi, fresh = self.lit, self.lit.mi, vertex == 0
@@ -237,7 +237,7 @@ class _Walk:
         u1, u2 = self._uniform(sample, dimension), self._uniform(sample, dimension + 1)
         direction = mi.Frame3f(hit.normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2)))
         if self.aim is not None:
-            # the half of the square that the other choice leaves is a square too
+            # the half of the square left by the other choice is a square too
             wide = dr.select(u1 < 0.5, 2 * u1, 2 * u1 - 1)
             spread = mi.Frame3f(hit.normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(wide, u2)))
             aimed, weight = _towards(lit, self.aim, hit.place, hit.normal, spread, u1, u2)
@@ -249,7 +249,7 @@ class _Walk:
         return sample, vertex, hit.place, hit.normal, direction, length, throughput, totals
 
     def _uniform(self, sample: Any, dimension: Any) -> Any:
-        """Return a co-ordinate of the low-discrepancy point of each lane's path, turned by its place's rotation."""
+        """Return a co-ordinate of the low-discrepancy point of each lane's path, shifted by its place's rotation."""
         import drjit as dr
 
         number = self.batch * self.batch_points + self.first + sample
@@ -262,14 +262,14 @@ class _Walk:
 def _gather(
     lit: LitScene, start: Any, work: PathWork, samples: np.ndarray, on_surface: bool, bright: Any = None
 ) -> np.ndarray:
-    """Walk ``samples`` (n,) paths from each place (other arguments: `_Walk`); returns the light (BATCHES, f + 1, n)
-    complex64 of each batch, frequency 0 (intensity) last. Phase counts from the place of gathering on. Units as in
-    `NoiseFreeView`, with the place's albedo where the start was the lens. Cosine-weighted directions cancel cos/pi of a
-    Lambertian surface, so each bounce multiplies by its albedo and, where it is glossy, by `LitScene.lobe`."""
+    """Follow ``samples`` (n,) paths from each place (other arguments: `_Walk`). Return the light (BATCHES, f + 1, n)
+    complex64 of each batch, frequency 0 (intensity) last. Phase counts from where the light is gathered. Units as in
+    `NoiseFreeView`, with the place's albedo if the start was the lens. Cosine-weighted directions cancel cos/pi of a
+    Lambertian surface, so each bounce multiplies by its albedo and, if it is glossy, by `LitScene.lobe`."""
     per_batch = np.maximum(samples // BATCHES, 1)
     walked = _Walk(lit, start, work, on_surface, bright, int(per_batch.max()))
     lines = len(work.frequencies_hz)
-    # lanes for so many paths a batch at each place, and where those of each place and batch begin
+    # lanes for so many paths a batch at each place; the first lane of each place and batch
     per_pair = np.repeat(-(-per_batch // PATHS_A_LANE), BATCHES)
     begins = np.cumsum(per_pair) - per_pair
     pair = np.repeat(np.arange(len(per_pair)), per_pair)
@@ -284,7 +284,7 @@ def _gather(
 
 
 def _added(totals: list[Any], light: Any, length: Any, frequencies_hz: tuple[float, ...]) -> list[Any]:
-    """Add light of a path length to real and imaginary sums by frequency, intensity last; of a comb by recurrence."""
+    """Add the light of a path to real and imaginary sums by frequency, intensity last; for a comb by recurrence."""
     import drjit as dr
 
     out, waves, step_hz = [], wave_numbers(frequencies_hz), comb_step(frequencies_hz)
@@ -303,7 +303,7 @@ def _added(totals: list[Any], light: Any, length: Any, frequencies_hz: tuple[flo
 
 
 def face_triangles(target: Target) -> list[np.ndarray]:
-    """Return for each part which of its triangles (n,) lie on the undamaged face: the board's there, all of tapes."""
+    """Return which triangles (n,) of each part lie on the undamaged face: the board's there, and all of tapes."""
     mesh = target.parts[0].mesh
     board = transform_points(invert(target.T_camera_board), mesh.vertices)
     within_m = MESH_WITHIN_M if target.config.board.shape.kind == "mesh" else FACE_WITHIN_M
@@ -315,21 +315,21 @@ def face_triangles(target: Target) -> list[np.ndarray]:
 def face_light(
     lit: LitScene, target: Target, direct: DirectLight, slopes: np.ndarray, work: PathWork, config: RenderConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return indirect light by way of the face (its holes left out) in the pixels that see any of it, in the order of
-    `numpy.nonzero` of ``direct.face[-1]``: mean (f + 1, n), and batches (B, l, n) at the frequencies `noise_lines`."""
+    """Return the indirect light by way of the face (without its holes) in the pixels that see any of it, in the order
+    of `numpy.nonzero` of ``direct.face[-1]``: mean (f + 1, n); batches (B, l, n) at the frequencies `noise_lines`."""
     seen = direct.face[-1].real > 0
     rays = np.concatenate([slopes[seen], np.ones((int(seen.sum()), 1))], axis=-1)
     rays *= (direct.face_range_m[seen] / np.linalg.norm(rays, axis=-1))[..., None]
     x_seen, y_seen, _ = transform_points(invert(target.T_camera_board), rays).T
     ends, spacing_m = ((each.min(), each.max()) for each in (x_seen, y_seen)), config.face_spacing_mm * MM
     xs, ys = (np.linspace(low, high, max(int(np.ceil((high - low) / spacing_m)) + 1, 3)) for low, high in ends)
-    # points above the face, and its unit normals, in the camera's frame
+    # points above the face and their unit normals, in the camera's frame
     face, T_camera_board = face_of(target.config.board), target.T_camera_board
     x, y = (each.ravel() for each in np.meshgrid(xs, ys))
     normal = face.normal(x, y)
     point = face.point(x, y) + ABOVE_FACE_M * normal
     position, normals = transform_points(T_camera_board, point), rotate_vectors(T_camera_board, normal)
-    # the face's bounds, which light the surfaces before it
+    # the face's bounds, as a source of light for the surfaces before it
     bright, outline = T_camera_board.copy(), target.outline_board_m[:, :2]
     low, high = outline.min(axis=0), outline.max(axis=0)
     bright[:3, 3] = transform_points(T_camera_board, np.append((low + high) / 2, 0.0))
@@ -343,8 +343,8 @@ def face_light(
 
 
 def between_nodes(nodes_x: np.ndarray, nodes_y: np.ndarray, x: np.ndarray, y: np.ndarray) -> sparse.csr_array:
-    """Return bilinear weights (n, len(nodes_y) len(nodes_x)) of evenly spaced nodes, row by row, at n places: (s/D)^2/8
-    off, s the spacing, D the distance of what shines: 2e-3 at 80 mm and 0.7 m."""
+    """Return bilinear weights (n, len(nodes_y) len(nodes_x)) of evenly spaced nodes, row by row, at n places. The error
+    is (s/D)^2/8 for a spacing s and a distance D of the light source: 2e-3 at 80 mm and 0.7 m."""
     columns, parts = len(nodes_x), []
     for nodes, values in ((nodes_x, x), (nodes_y, y)):
         place = (values - nodes[0]) / (nodes[1] - nodes[0])
@@ -357,12 +357,12 @@ def between_nodes(nodes_x: np.ndarray, nodes_y: np.ndarray, x: np.ndarray, y: np
     return sparse.csr_array((weight.ravel(), index.ravel(), starts), shape=(len(x), columns * len(nodes_y)))
 
 
-RIM_PX = 3  # surroundings rendered beyond the board's outline, so that its rim looks as on the whole sensor
-NEAR_PX = 3  # beyond the outline, where edges behind the board are finely divided: a camera's filter mixes these in
+RIM_PX = 3  # rendered surroundings of the board's outline, so that its rim looks as on the whole sensor
+NEAR_PX = 3  # beyond the outline, edges behind the board are finely sampled: the camera's filter mixes these pixels in
 HOLE_RIM_PX = 1
-NARROW = ("through", "blind", "slot", "gouge", "chip")  # may lie between a pixel's corners and its centre
-PILOT_SAMPLES = 128  # paths that tell a pixel's noise, within a third; fewer miss rare bright ones behind a hole
-PILOT_SEED = 1 << 20  # offset that keeps those apart from the ones that count
+NARROW = ("through", "blind", "slot", "gouge", "chip")  # damage that may lie between a pixel's corners and its centre
+PILOT_SAMPLES = 128  # paths that show a pixel's noise within a third; fewer miss rare bright paths behind a hole
+PILOT_SEED = 1 << 20  # offset that separates these from the paths that count
 
 
 def target_region(target: Target, optics: Optics) -> Region:
@@ -380,7 +380,7 @@ def render_view(target: Target, optics: Optics, config: RenderConfig) -> NoiseFr
     lit = lit_scene(mi, target.parts, optics, face_triangles(target))
     slopes = lens.region_slopes(region)
     footprint = footprint_of(lens, region, optics.beam_fwhm_rad)
-    # pixels within the face's outline as the camera sees it; all, where a part of the outline is out of view
+    # pixels within the face's outline as the camera sees it, or all if a part of the outline is out of view
     outline = transform_points(target.T_camera_board, target.outline_board_m)
     inside = np.ones(region.shape, bool)
     if lens.images(outline).all():
@@ -424,8 +424,8 @@ def indirect_light(
     inside: np.ndarray,
     config: RenderConfig,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return indirect phasors (f + 1, h, w) and their noise in metres of range (h, w): of the face from its nodes, of
-    all else by paths through the pixel's sub-rays, as many as their noise asks for ``inside`` (h, w) the outline."""
+    """Return indirect phasors (f + 1, h, w) and their noise in metres of range (h, w). That of the face comes from its
+    nodes, all other from paths through the pixel's sub-rays; ``inside`` (h, w) the outline, noise sets their number."""
     frequencies, shape = optics.frequencies_hz, direct.range_m.shape
     indirect = np.zeros((len(frequencies) + 1, direct.range_m.size), complex)
     variance = np.zeros(direct.range_m.size)
@@ -454,7 +454,7 @@ def indirect_light(
 def _samples_inside(
     lit: LitScene, rays: OffFace, total: np.ndarray, work: PathWork, config: RenderConfig
 ) -> int | np.ndarray:
-    """Return how many paths bring a pixel down to ``hole_noise_mm``, as a few tell, which kept would bias the mean."""
+    """Return how many paths reduce a pixel's noise to ``hole_noise_mm``, from a pilot run, which does not count."""
     if config.hole_samples <= PILOT_SAMPLES:
         return config.hole_samples
     pilot = gather_in_pixels(lit, rays, work._replace(seed=work.seed + PILOT_SEED), PILOT_SAMPLES)
@@ -467,7 +467,7 @@ def _samples_inside(
 
 
 def _at_holes(target: Target, optics: Optics, slopes: np.ndarray) -> np.ndarray:
-    """Find pixels (h, w) bool whose central ray goes through the mouth of `NARROW` damage, or HOLE_RIM_PX beside it."""
+    """Return the pixels (h, w) bool whose central ray passes the mouth of `NARROW` damage, or HOLE_RIM_PX beside it."""
     rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
     found, T_board_camera = np.zeros(slopes.shape[:2], bool), invert(target.T_camera_board)
     for hole, declared in zip(target.truth, target.config.damages, strict=True):

@@ -1,1 +1,1 @@
-"""Camera models: noise-free phasors to noisy frames. Code by kind of camera, numbers in scenes/cameras/*.yaml."""
+"""Camera models: they turn noise-free phasors into noisy frames. Each kind of camera has its package."""

@@ -1,8 +1,8 @@
-"""Fitted numbers of a camera: the gain that gives the published noise, and a lidar's confidence threshold.
+"""Fits numbers of a camera: the gain that gives the published noise, and a lidar's confidence threshold.
 
-Run ``python -m scenes.sensor.calibration NAME`` after a change to the sensor model and write the numbers into the
-camera's file; a test compares the two. The gain gives the published temporal deviation of single pixels, without the
-jitter of whole frames (taken off in squares) and jumps; ambient light is that of `CameraConfig`'s default."""
+After a change of the sensor model, run ``python -m scenes.sensor.calibration NAME`` and write the numbers into the
+camera's file; a test compares both. The gain gives the published temporal deviation of single pixels, without the
+jitter of whole frames (subtracted in squares) and without jumps. Ambient light is the default of `CameraConfig`."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ from scenes.sensor.lidar.facts import ScannedLidar
 from scenes.sensor.source import SimulatedUnit
 
 ONLY_NOISE = CameraConfig(effects=NO_EFFECTS.model_copy(update={"noise": True, "ambient": True}))
-HALF_PX = {"amcw_imager": (24, 40), "scanned_lidar": (32, 32), "empirical": (32, 32)}  # of the plane, down and across
+HALF_PX = {"amcw_imager": (24, 40), "scanned_lidar": (32, 32), "empirical": (32, 32)}  # half the plane's height, width
 RANGE_OF_ELECTRONS = {"amcw_imager": (50.0, 200_000.0), "scanned_lidar": (1e3, 1e5)}
-FRAMES = {"amcw_imager": 200, "scanned_lidar": 100}  # of some 3,000 pixels with common noise: a gain to 0.5 %
+FRAMES = {"amcw_imager": 200, "scanned_lidar": 100}  # with some 3,000 pixels that share their noise: a gain to 0.5 %
 
-PhotonCamera = AmcwCamera | ScannedLidar  # noise follows from a photon budget
+PhotonCamera = AmcwCamera | ScannedLidar  # cameras whose noise follows from a photon budget
 Camera = TypeVar("Camera", bound=AnyCamera)
 
 
 def with_number(camera: Camera, section: str, key: str, value: float) -> Camera:
-    """Return the same camera with another value of one number."""
+    """Return the same camera with one number changed."""
     part = getattr(camera, section)
     fact = getattr(part, key).model_copy(update={"value": value})
     return camera.model_copy(update={section: part.model_copy(update={key: fact})})  # type: ignore[return-value]
 
 
 def unit_before_plane(camera: AnyCamera, distance_m: float, albedo: float) -> SimulatedUnit:
-    """Return a unit with noise only, without jitter, before a plane tilted to meet all phases of rounding."""
+    """Return a unit with noise only, without jitter, before a plane that is tilted to cover all phases of rounding."""
     lens, (half_h, half_w) = camera.nominal_lens, HALF_PX[camera.kind]
     row, col = int(lens.cy), int(lens.cx)
     region = Region(row - half_h, row + half_h, col - half_w, col + half_w)
@@ -49,8 +49,8 @@ def unit_before_plane(camera: AnyCamera, distance_m: float, albedo: float) -> Si
 
 
 def temporal_sigma_m(camera: AnyCamera, distance_m: float, albedo: float, frames: int, seed: int) -> float:
-    """Return the temporal standard deviation of z (rms over pixels) on a plane, metres; NaN where an imager's pixel is
-    invalid in any frame; a lidar's invalid samples are left out."""
+    """Return the temporal standard deviation of z (rms over pixels) on a plane, metres. NaN if a pixel of an imager is
+    invalid in any frame; invalid samples of a lidar are left out."""
     unit = unit_before_plane(camera, distance_m, albedo)
     z = np.stack([frame.z_m for frame in unit.capture(frames, seed, "calibration").frames()]).astype(float)
     variance = np.nanvar(z, axis=0, ddof=1) if isinstance(camera, ScannedLidar) else z.var(axis=0, ddof=1)
@@ -58,7 +58,7 @@ def temporal_sigma_m(camera: AnyCamera, distance_m: float, albedo: float, frames
 
 
 def calibrated_signal_electrons(camera: PhotonCamera, frames: int | None = None, seed: int = 1) -> float:
-    """Return the gain that meets the camera's calibration point, to 0.5 %."""
+    """Return the gain that reproduces the camera's calibration point to 0.5 %."""
     photons, count = camera.photons, frames or FRAMES[camera.kind]
     wanted = photons.calibration_sigma_mm.value * MM
     distance_m, albedo = photons.calibration_distance_m.value, photons.calibration_albedo.value
@@ -66,7 +66,7 @@ def calibrated_signal_electrons(camera: PhotonCamera, frames: int | None = None,
     def excess(log_electrons: float) -> float:
         trial: PhotonCamera = with_number(camera, "photons", "signal_electrons", float(np.exp(log_electrons)))
         sigma_m = temporal_sigma_m(trial, distance_m, albedo, count, seed)
-        # a camera too dim to see the wall at all is as far too noisy as any
+        # a camera too dim to see the wall at all counts as far too noisy
         with_jitter_m = float(np.hypot(sigma_m, camera.unit.jitter_mm.value * MM))
         return with_jitter_m / wanted - 1 if np.isfinite(sigma_m) else 100.0
 
@@ -74,7 +74,7 @@ def calibrated_signal_electrons(camera: PhotonCamera, frames: int | None = None,
 
 
 def calibrated_numbers(camera: PhotonCamera) -> dict[str, float]:
-    """Return the gain, and of a lidar the threshold at which half are valid at the published reach, by their keys."""
+    """Return the gain and a lidar's threshold at which half of the pixels are valid at the published reach, by key."""
     numbers = {"photons.signal_electrons": calibrated_signal_electrons(camera)}
     if isinstance(camera, ScannedLidar):
         fitted = with_number(camera, "photons", "signal_electrons", numbers["photons.signal_electrons"])

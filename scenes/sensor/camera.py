@@ -25,8 +25,8 @@ from scenes.sensor.empirical.facts import EmpiricalCamera
 from scenes.sensor.lidar.facts import ScannedLidar
 
 CAMERA_FOLDER = Path(__file__).resolve().parent.parent / "cameras"
-DEEPEST = 5  # cameras that are each ``like`` the next
-GROUP = "tofpod.cameras"  # its entry points name the path of a camera's file, called as the entry point is
+DEEPEST = 5  # most cameras in a chain of ``like``
+GROUP = "tofpod.cameras"  # its entry points give the path of a camera's file, which has the entry point's name
 CAMERAS = PlugIns(
     GROUP,
     "camera",
@@ -35,48 +35,48 @@ CAMERAS = PlugIns(
 )
 
 AnyCamera = AmcwCamera | ScannedLidar | EmpiricalCamera
-"""Every kind of camera, told apart by ``kind``. All have name, title, nominal_lens, optics, unit, z_step_m."""
+"""All kinds of camera, distinguished by ``kind``. Each has name, title, nominal_lens, optics, unit, z_step_m."""
 KINDS: dict[str, type[AnyCamera]]
 KINDS = {"amcw_imager": AmcwCamera, "scanned_lidar": ScannedLidar, "empirical": EmpiricalCamera}
 
 
 class EffectsConfig(Config):
-    """Effects of a real unit, as switches; all off is a noise-free camera that sees direct light only."""
+    """Switches for the effects of a real unit. With all off, the camera is noise-free and sees direct light only."""
 
-    noise: bool = Field(True, description="shot and read noise on what the camera samples")
-    multipath: bool = Field(True, description="light that met more than one surface")
-    wiggling: bool = Field(True, description="what factory calibration leaves of the modulation's harmonics")
-    fixed_pattern: bool = Field(True, description="the unit's own error of range in each pixel")
-    unit_offset: bool = Field(True, description="the unit's own constant error of range")
-    warm_up_drift: bool = Field(True, description="error of range that decays after power-on")
-    ambient: bool = Field(True, description="light of the surroundings (`ambient_uw_cm2_nm`): its noise and its room")
-    saturation: bool = Field(True, description="what exceeds a pixel's or its converter's full scale is invalid")
-    frame_jumps: bool = Field(True, description="whole frames displaced: rare jumps, and a small jitter")
+    noise: bool = Field(True, description="shot and read noise of the samples")
+    multipath: bool = Field(True, description="light that was reflected by more than one surface")
+    wiggling: bool = Field(True, description="error that harmonics of the modulation leave after factory calibration")
+    fixed_pattern: bool = Field(True, description="the unit's own range error of each pixel")
+    unit_offset: bool = Field(True, description="the unit's own constant range error")
+    warm_up_drift: bool = Field(True, description="range error that decays after power-on")
+    ambient: bool = Field(True, description="noise and full-scale range that ambient light (`ambient_uw_cm2_nm`) takes")
+    saturation: bool = Field(True, description="pixels beyond their own or the converter's full scale are invalid")
+    frame_jumps: bool = Field(True, description="displacement of whole frames: rare jumps and a small jitter")
 
 
 NO_EFFECTS = EffectsConfig(**dict.fromkeys(EffectsConfig.model_fields, False))  # every effect off
 
 
 class CameraConfig(Config):
-    """Camera of an experiment: its name, the unit and the effects that are on."""
+    """The camera of an experiment: its name, the unit, the effects that are on, and the ambient light."""
 
     name: str = Field(
-        "azure_kinect_nfov", description="a camera of tofpod or an installed package, or the path of its .yaml"
+        "azure_kinect_nfov", description="a camera of tofpod or of an installed package, or the path of a .yaml file"
     )
-    unit_seed: int = Field(1, ge=0, description="which unit: its fixed pattern is drawn from this seed")
+    unit_seed: int = Field(1, ge=0, description="draws the unit's fixed pattern: another seed is another unit")
     effects: EffectsConfig = EffectsConfig()
-    fixed_pattern_scale: float = Field(1.0, ge=0, le=100, description="times the file's fixed pattern; 0: off")
-    edge_gate: bool = Field(True, description="whether the engine's edge threshold, whose rule is inferred, acts")
+    fixed_pattern_scale: float = Field(1.0, ge=0, le=100, description="multiplies the file's fixed pattern; 0: off")
+    edge_gate: bool = Field(True, description="whether pixels at edges are invalid, by a rule inferred from data")
     ambient_uw_cm2_nm: Annotated[float, Field(ge=0, le=200)] = Field(
         0.04,
-        description="irradiance by daylight or lamps at the camera's wavelength, microwatts per square centimetre and "
-        "nanometre; 0.04 is a room with 50 lux of daylight, 0.4 at a window (500 lux of sunlight), 80 full sun",
+        description="irradiance of ambient light at the camera's wavelength, in microwatts per square centimetre and "
+        "nanometre: 0.04 in a room with 50 lux of daylight, 0.4 at a window (500 lux of sunlight), 80 in full sun",
     )
-    minutes_since_power_on: float = Field(60.0, ge=0, le=1e5, description="how far the unit has warmed up")
-    numbers: dict[str, Any] = Field({}, description="numbers of the file to replace, such as lens.fx_px: 505.1")
+    minutes_since_power_on: float = Field(60.0, ge=0, le=1e5, description="time for which the unit has warmed up")
+    numbers: dict[str, Any] = Field({}, description="replaces numbers of the camera file, such as lens.fx_px: 505.1")
 
     def __hash__(self) -> int:
-        # A mapping has no hash of its own, and workers keep by its declaration what they made of a camera.
+        # a mapping has no hash, and workers keep what they derived from a camera by its declaration
         return hash(canonical_json(self.to_data()))
 
 
@@ -86,7 +86,7 @@ def camera_names() -> tuple[str, ...]:
 
 
 def camera_file(name: str) -> Path:
-    """Return the file of a camera, or of a path. Raises UserError for a name unknown, taken twice or without a file."""
+    """Return the path of a camera's file. Raises UserError for a name that is unknown, ambiguous or without a file."""
     if is_camera_path(name):
         return Path(name)
     offer = CAMERAS.offer(name)
@@ -107,15 +107,15 @@ def is_camera_path(name: str) -> bool:
 
 
 def load_camera(name: str) -> AnyCamera:
-    """Return the camera of that name. Raises UserError as `camera_file`, and for a file that describes no camera."""
+    """Return the camera of that name. Raises UserError as `camera_file` does, and for a file that is not a camera."""
     return _camera_at(camera_file(name))
 
 
 def lens_names() -> dict[str, str]:
-    """Return the names under which `lens_named` knows a lens, cameras and further depth modes, each with its camera."""
+    """Return the names that `lens_named` knows (cameras, and further depth modes), each with its camera."""
     names: dict[str, str] = {}
     for camera in camera_names():
-        # a mode that has a file of its own stays with the camera whose mode it is
+        # a mode with its own file stays with the camera whose mode it is
         names = dict.fromkeys((camera, *load_camera(camera).modes), camera) | names
     return names
 
@@ -136,16 +136,16 @@ def camera_of(config: CameraConfig) -> AnyCamera:
 
 
 def guessed_precision(camera: AnyCamera) -> str:
-    """Return a sentence on a camera whose precision is not published (shot noise by its gain); empty for others."""
+    """Return a warning for a camera whose precision is not published (shot noise by its gain); empty for others."""
     if isinstance(camera, EmpiricalCamera) or (gain := camera.photons.signal_electrons).range is None:
         return ""
     low, high = (float(np.sqrt(gain.value / end)) for end in reversed(gain.range))
-    told = f"the precision of {camera.title} is not published: its noise is a guess"
-    return f"{told}, which may be {low:.2g} to {high:.2g} times as much"
+    what = f"the precision of {camera.title} is not published: its noise is a guess"
+    return f"{what}, which may be {low:.2g} to {high:.2g} times as much"
 
 
 def numbers_of_lens(lens: Lens) -> dict[str, Any]:
-    """Return the numbers of a camera's file (`CameraConfig.numbers`) that describe a lens."""
+    """Return the numbers of a camera file (`CameraConfig.numbers`) that describe a lens."""
     numbers = {f"lens.{key}_px": float(getattr(lens, key)) for key in ("fx", "fy", "cx", "cy")}
     return {**numbers, "lens.distortion": [*map(float, lens.distortion)]}
 
@@ -167,7 +167,7 @@ def _with_numbers(name: str, numbers_json: str) -> AnyCamera:
 
 
 def number_paths(data: Mapping[str, Any], prefix: str = "") -> list[str]:
-    """Return dotted paths of all numbers of a camera's plain data."""
+    """Return the dotted paths of all numbers in a camera's plain data."""
     paths: list[str] = []
     for key, value in data.items():
         if isinstance(value, dict):
@@ -176,7 +176,7 @@ def number_paths(data: Mapping[str, Any], prefix: str = "") -> list[str]:
 
 
 def read_camera(path: Path) -> AnyCamera:
-    """Read one camera file. Raises UserError naming the file and each key that is missing, unknown or impossible."""
+    """Read a camera file. Raises UserError that names the file and each key that is missing, unknown or impossible."""
     source = _completed(read_yaml(path))
     camera = read_as(KINDS, "kind", source)
     if camera.name != path.stem:
@@ -186,8 +186,8 @@ def read_camera(path: Path) -> AnyCamera:
 
 
 def _completed(source: Source, depth: int = 0) -> Source:
-    """Return a file's content, what it does not state taken from the camera that its key ``like`` names: whole facts
-    and lists, never parts of them. Other modes of the lens are not taken over."""
+    """Return a file's content, completed from the camera that its key ``like`` names: by whole facts and lists, never
+    by parts of them. Other modes of the lens are not inherited."""
     name = source.data.get("like")
     if name is None:
         return source
@@ -210,7 +210,7 @@ def _named(name: str, depth: int) -> Source:
 
 
 def _stated(data: Mapping[str, Any], prefix: KeyPath = ()) -> Iterator[tuple[KeyPath, Any]]:
-    """Yield the path and value of each fact, and of all else that is no mapping of facts."""
+    """Yield the path and value of each fact, and of everything else that is not a mapping of facts."""
     for key, value in data.items():
         if isinstance(value, dict) and "value" not in value:
             yield from _stated(value, (*prefix, key))

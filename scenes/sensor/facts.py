@@ -1,4 +1,4 @@
-"""Contents of every camera's file, whatever its kind: numbers with their sources, the lens, the traits of a unit."""
+"""The parts of every camera file, whatever the kind: numbers with sources, the lens, the properties of a unit."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from scenes.optics import Optics
 
 T = TypeVar("T")
 
-TERMS = (0, 4, 5, 8)  # numbers of distortion terms that OpenCV's models have
-WORST_PX = 0.01  # largest distance at which a pixel may come back from its direction; good lenses do to 1e-6
-STEEPEST = 6.0  # slope from the axis up to which distortion is examined: 80 degrees
+TERMS = (0, 4, 5, 8)  # numbers of distortion coefficients in OpenCV's models
+WORST_PX = 0.01  # largest error of a pixel after undistortion and distortion; good lenses have 1e-6
+STEEPEST = 6.0  # slope from the axis up to which distortion is checked: 80 degrees
 
 
 class Fact(Config, Generic[T]):
-    """One number of a camera with where it comes from. ``tag``: R read in the named public source, D derived from such,
-    S one secondary source, W measured on public captures, O measured on the owner's by `harness.characterise`, C
+    """One number of a camera with its origin. ``tag``: R read in the named public source, D derived from such, S a
+    single secondary source, W measured on public captures, O measured on the owner's by `harness.characterise`, C
     calibrated, M a guess, G a guess of the precision with its ``range``, U set by the user of an experiment."""
 
     value: T
@@ -39,7 +39,7 @@ class Fact(Config, Generic[T]):
 
 
 def checked(legal: str, holds: Callable[[Any], bool]) -> AfterValidator:
-    """A validator of a fact whose value, or each of whose values, must be what ``legal`` says."""
+    """Return a validator of a fact whose value, or each of its values, must satisfy what ``legal`` states."""
 
     def check(fact: Fact[Any]) -> Fact[Any]:
         for value in fact.value if isinstance(fact.value, tuple) else (fact.value,):
@@ -64,8 +64,8 @@ Wavelength = Annotated[Fact[float], checked("from 300 to 2000 nanometres", lambd
 
 
 class LensFacts(Config):
-    """The nominal lens; ``distortion`` is k1 k2 p1 p2 [k3 [k4 k5 k6]] of OpenCV's model, or empty for none. Pixels
-    beyond ``field_half_angle_deg`` see nothing, and distortion may fold there; None: the image covers the sensor."""
+    """The nominal lens. ``distortion``: k1 k2 p1 p2 [k3 [k4 k5 k6]] of OpenCV's model, or empty. Pixels beyond
+    ``field_half_angle_deg`` see nothing, and distortion may fold there; None: the image covers the sensor."""
 
     width_px: PositiveInt
     height_px: PositiveInt
@@ -97,7 +97,7 @@ class LensFacts(Config):
 
     @cached_property
     def image_radius(self) -> float:
-        """The radius of the lens's image, in focal lengths; infinite where it covers the sensor."""
+        """Radius of the lens's image in focal lengths; infinite if it covers the sensor."""
         if self.field_half_angle_deg is None:
             return float("inf")
         slope = np.tan(np.deg2rad([self.field_half_angle_deg.value]))
@@ -110,7 +110,7 @@ class LensFacts(Config):
         return np.asarray(np.hypot((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy) > self.image_radius)
 
     def lens(self) -> Lens:
-        """The lens in the program's own type."""
+        """The lens as a `Lens` of the program."""
         width, height, terms = self.width_px.value, self.height_px.value, self.distortion.value
         centre = self.cx_px.value, self.cy_px.value
         return Lens(width, height, self.fx_px.value, self.fy_px.value, *centre, (*terms, *(0.0,) * 8)[:8])
@@ -118,9 +118,9 @@ class LensFacts(Config):
 
 class UnitFacts(Config):
     """Differences of a unit from the nominal camera, and of its frames from each other. ``offset_mm``: deviation
-    between units of a constant error of range. ``drift_mm`` exp(-t / ``drift_min``): error of range after power-on,
-    greater by ``drift_ramp`` of itself per unit of x/z. ``jump_rate``: share of frames displaced as a whole by
-    ``jump_mm`` of either sign; ``jitter_mm``: deviation of a small displacement of every frame."""
+    between units of a constant range error. ``drift_mm`` exp(-t / ``drift_min``): range error after power-on, greater
+    by ``drift_ramp`` of itself per unit of x/z. ``jump_rate``: share of frames that are displaced as a whole by
+    ``jump_mm``, either way. ``jitter_mm``: deviation of a small displacement of every frame."""
 
     frames_per_second: Positive
     offset_mm: NonNegative
@@ -133,14 +133,14 @@ class UnitFacts(Config):
 
 
 class SmoothPatternFacts(Config):
-    """Fixed pattern, the same in every frame of a unit: a smooth error of range."""
+    """A fixed pattern, which is the same in every frame of a unit: a smooth range error."""
 
     smooth_mm: NonNegative
     smooth_length_px: LengthPx
 
 
 class OutputFacts(Config):
-    """The least range that a camera gives, and the step of the stored z."""
+    """The smallest range that a camera gives, and the step of the stored z."""
 
     min_range_mm: NonNegative
     output_step_mm: Positive
@@ -159,7 +159,7 @@ class LimitFacts(OutputFacts):
 
 
 class ConeFacts(Config):
-    """A cone about the optical axis, from ``position_mm``, with a linear roll-off between two half angles."""
+    """A cone about the optical axis from ``position_mm``, with a linear roll-off between two half angles."""
 
     position_mm: Fact[tuple[float, float, float]]
     full_half_angle_deg: HalfAngle
@@ -172,7 +172,7 @@ class ConeFacts(Config):
         return self
 
     def optics(self) -> dict[str, Any]:
-        """Return the arguments that a camera's optics take from it."""
+        """Return the arguments that a camera's optics take from this cone."""
         angles = {key: getattr(self, key).value for key in ("full_half_angle_deg", "cutoff_half_angle_deg")}
         return {"emitter_m": np.array(self.position_mm.value) * MM, **angles}
 
@@ -187,11 +187,11 @@ class CameraFacts(Config):
     unit: UnitFacts
     engine: OutputFacts
     modes: Annotated[tuple[str, ...], BeforeValidator(tuple)] = Field((), exclude=True)
-    """Cameras that are other modes of this one, or a mapping by their names; no simulation uses them."""
+    """Cameras that are other modes of this one, or a mapping of them by name; no simulation uses them."""
 
     @cached_property
     def nominal_lens(self) -> Lens:
-        """The lens of the file; without distortion, that of a scanner is the raster of its beam's directions."""
+        """The lens in the file, without distortion; a scanner's is the raster of its beam's directions."""
         return self.lens.lens()
 
     @property
@@ -200,19 +200,19 @@ class CameraFacts(Config):
         return self.engine.output_step_mm.value * MM
 
     def optics_with(self, **own: Any) -> Optics:
-        """Return the camera's optics for the render; ``own``: arguments that only its kind knows."""
+        """Return the camera's optics for the render. ``own``: arguments that only its kind knows."""
         facts = {"title": self.title, "lens": self.nominal_lens, "wavelength_nm": self.wavelength_nm.value}
         return Optics(**facts, nearest_m=self.engine.min_range_mm.value * MM, **own)  # type: ignore[arg-type]
 
     def images(self, points_camera_m: np.ndarray) -> np.ndarray:
-        """Tell which points (..., 3) have an image on the sensor and within the lens's field, (...) bool."""
+        """Return (...) bool: whether points (..., 3) have an image on the sensor and within the lens's field."""
         half_angle, aside = self.lens.field_half_angle_deg, np.linalg.norm(points_camera_m[..., :2], axis=-1)
         widest = np.deg2rad(half_angle.value) if half_angle else np.pi / 2
         return self.nominal_lens.images(points_camera_m) & (np.arctan2(aside, points_camera_m[..., 2]) <= widest)
 
 
 def distorted_slope(slope: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
-    """Return the distorted slopes of true ones (n,) by radial distortion alone (k1 k2 p1 p2 k3 k4 k5 k6)."""
+    """Return the slopes (n,) that radial distortion alone (k1 k2 p1 p2 k3 k4 k5 k6) makes of true slopes (n,)."""
     k1, k2, _, _, k3, k4, k5, k6 = distortion
     s = slope**2
     with np.errstate(divide="ignore", invalid="ignore"):

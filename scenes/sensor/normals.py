@@ -1,4 +1,4 @@
-"""Standard normals for the cameras' noise: vectorised from a generator's raw words. One core, float32."""
+"""Standard normals for the cameras' noise, vectorised, from a generator's raw words; single-threaded, float32."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from numba import types
 from numba.extending import intrinsic
 
 FAST: Any = {"cache": True, "fastmath": {"nsz"}, "error_model": "numpy", "nogil": True}
-"""Options of all kernels of the cameras: operations are neither reordered nor fused, so that every processor gives the
-same bits. No assumption of finiteness: an unlit pixel may divide by zero and is gated out later."""
-EXACT_SUMS: Any = {**FAST, "fastmath": {"nsz", "reassoc"}}  # of whole numbers that float32 holds, exact in any order
+"""Compiler options of all camera kernels: operations are neither reordered nor fused, so that every processor gives the
+same bits. Values may be infinite: an unlit pixel may divide by zero and is gated out later."""
+EXACT_SUMS: Any = {**FAST, "fastmath": {"nsz", "reassoc"}}  # of whole numbers that float32 holds: exact in any order
 IN_DOUBLE: Any = {**FAST, "fastmath": {"contract", "reassoc", "arcp", "nsz"}}
-"""The same for float64 sums that are rounded to float32 afterwards: their order moves a range by 1e-13 m."""
+"""The same for float64 sums that are rounded to float32 afterwards; their order changes a range by 1e-13 m."""
 TWO_PI = np.float32(2.0 * math.pi)
 
 
@@ -35,7 +35,7 @@ def normals_from_bits(bits: np.ndarray, out: np.ndarray) -> None:
 
 @numba.njit(inline="always", **FAST)
 def _log(u):  # type: ignore[no-untyped-def]
-    """Return the natural logarithm of a positive float32: exponent from the bits, mantissa by an atanh series."""
+    """Return the natural logarithm of a positive float32: exponent from its bits, mantissa by an atanh series."""
     word: Any = float_bits(u)
     exponent = np.int32(word >> np.uint32(23)) - np.int32(127)
     mantissa = bits_float((word & np.uint32(0x007FFFFF)) | np.uint32(0x3F800000))
@@ -67,7 +67,7 @@ def _sincos_turns(v):  # type: ignore[no-untyped-def]
 
 
 def _bits(of: Any, into: Any) -> Any:
-    """Return a compiled function that takes the bits of a number of one type as a number of another."""
+    """Return a compiled function that reinterprets the bits of a number of one type as another type."""
 
     def cast(context, value):  # type: ignore[no-untyped-def]
         return into(of), lambda inner, builder, _, args: builder.bitcast(args[0], inner.get_value_type(into))
@@ -79,7 +79,7 @@ float_bits, bits_float = _bits(types.float32, types.uint32), _bits(types.uint32,
 
 
 def standard_normals(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """Draw standard normals (shape) float32 from the generator's raw words; one more word where the count is odd."""
+    """Draw standard normals (shape) float32 from the generator's raw words; an odd count uses one word more."""
     count = math.prod(shape)
     even = count + count % 2
     out = np.empty(even, np.float32)

@@ -1,4 +1,4 @@
-"""A simulated camera as a source of frames: the same interface as a recording."""
+"""A simulated camera as a source of frames, with the same interface as a recording."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from scenes.sensor.unit import FrameTotals, frame_errors_m
 
 @dataclass(frozen=True)
 class SimulatedUnit:
-    """A unit of a camera before a view: the part that frames share. Build once, then `capture` many times."""
+    """A unit of a camera in front of a view: all that its frames share. Build it once, then `capture` many times."""
 
     camera: AnyCamera
     config: CameraConfig
@@ -31,7 +31,7 @@ class SimulatedUnit:
 
     @cached_property
     def model(self) -> AmcwImager | LidarScanner | EmpiricalImager:
-        """The model of the camera's kind on the view's region, with its `expose` and `frame`."""
+        """The model of the camera's kind on the view's region; it has `expose` and `frame`."""
         kinds = {"amcw_imager": AmcwImager, "scanned_lidar": LidarScanner, "empirical": EmpiricalImager}
         return kinds[self.camera.kind](self.camera, self.config, self.view.region, self.view.slopes)
 
@@ -42,16 +42,16 @@ class SimulatedUnit:
 
     @cached_property
     def at_once(self) -> AtOnce | None:
-        """Sums of frames of the view without drawing each; None where frames must be drawn, or for other kinds."""
+        """Sums of frames of this view without drawing each; None if frames must be drawn, or for other kinds."""
         if not isinstance(self.model, AmcwImager):
             return None
-        asked = np.zeros(self.view.range_m.shape, bool)
-        asked[self.cut] = True
-        return at_once(self.model, self.exposure, asked)
+        wanted = np.zeros(self.view.range_m.shape, bool)
+        wanted[self.cut] = True
+        return at_once(self.model, self.exposure, wanted)
 
     @cached_property
     def region(self) -> Region:
-        """The view's region less the margin whose filter window is cut, except at the sensor's own border."""
+        """The view's region without the margin where the filter's window is cut, except at the sensor's own border."""
         outer, lens, m = self.view.region, self.camera.nominal_lens, self.camera.optics.margin_px
         top, left = m * (outer.row0 > 0), m * (outer.col0 > 0)
         bottom, right = m * (outer.row1 < lens.height), m * (outer.col1 < lens.width)
@@ -59,7 +59,7 @@ class SimulatedUnit:
 
     @cached_property
     def rgb(self) -> np.ndarray:
-        """(h, w, 3) uint8 colour on the depth pixels: the albedo, evenly lit, without a colour camera's own noise."""
+        """Colour (h, w, 3) uint8 on the depth pixels: the albedo, evenly lit, without noise of a colour camera."""
         return np.asarray(np.round(255 * self.view.rgb[self.cut]), np.uint8)
 
     @property
@@ -68,7 +68,7 @@ class SimulatedUnit:
         return self.region.within(self.view.region)
 
     def capture(self, frames: int, seed: int, *labels: str | int) -> SimulatedCapture:
-        """Return ``frames`` exposures with noise of the stream (seed, labels); prefixes of longer ones are equal."""
+        """Return ``frames`` exposures with noise of the stream (seed, labels); fewer are a prefix of more."""
         return SimulatedCapture(self, frames, seed, labels)
 
 
@@ -101,8 +101,8 @@ class SimulatedCapture:
         return np.array(list(islice(errors_m, self.n_frames)))
 
     def totals(self, frames: np.ndarray) -> FrameTotals | None:
-        """Return sums over the frames of these numbers (t,), drawn at once: equal in distribution to those of `frames`,
-        and independent of the other numbers. None where frames must be drawn."""
+        """Return sums over the frames with these numbers (t,), drawn at once: their distribution is that of `frames`,
+        and they do not depend on the other numbers. None if frames must be drawn."""
         summer, errors_m = self.unit.at_once, self.errors_m[frames]
         if summer is None or np.abs(errors_m).max(initial=0.0) > summer.farthest_error_m:
             return None

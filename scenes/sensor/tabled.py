@@ -1,8 +1,8 @@
-"""A depth camera's noise from a small table, for any simulator: needs NumPy (or torch) and the table only.
+"""The noise of a depth camera from a small table, for any simulator. It needs only NumPy (or torch) and the table.
 
-`harness.export_noise` measures the table of a camera and copies this file beside it. Per pixel and frame, the noise's
-deviation and the chance of no return follow from the light that comes back, intensity / range^2; neighbours are
-correlated by a separable filter; a unit has a fixed pattern, the same in all frames. Not modelled: errors at steps of
+`harness.export_noise` measures the table of a camera and copies this file beside it. For each pixel and frame, the
+noise's deviation and the probability of no return depend on the light that comes back, intensity / range^2. A separable
+filter correlates neighbours; each unit has a fixed pattern, the same in all frames. Not modelled: errors at steps of
 depth (mixing of neighbours, flying pixels), light over several surfaces, ambient light, warm-up and displacements of
 whole frames. `harness.sweep` simulates all of them."""
 
@@ -12,8 +12,8 @@ import numpy as np
 
 
 class DepthNoise:
-    """Noise of one unit of a camera whose images are (h, w). ``table``: the arrays of the camera's file, or its path.
-    ``slopes`` (h, w, 2): x/z and y/z of each pixel; None takes the camera's own nominal lens. ``seed``: which unit."""
+    """Noise of one unit of a camera with images (h, w). ``table``: the arrays of the camera's file, or its path.
+    ``slopes`` (h, w, 2): x/z and y/z of each pixel; None: the camera's nominal lens. ``seed``: chooses the unit."""
 
     def __init__(self, table, slopes=None, seed=1):  # type: ignore[no-untyped-def]
         self.table = table = _loaded(table)
@@ -34,7 +34,7 @@ class DepthNoise:
             level = np.log2(self.falloff * np.asarray(intensity, np.float32) / (range_m * range_m))
         level *= table["per_octave"]
         level += np.float32(1.5) - table["first"] * table["per_octave"]
-        # entry 0 is no return; no light, which is NaN or minus infinity, falls there
+        # entry 0 means no return; pixels without light (NaN or minus infinity) get it
         place = np.fmin(np.fmax(level, 0.0, out=level), np.float32(len(self.seen) - 1), out=level).astype(np.int32)
         noise = filtered(rng.standard_normal(self.shape, dtype=np.float32), table["rows"], table["columns"])
         seen = rng.random(self.shape, dtype=np.float32) < self.seen.take(place)
@@ -71,7 +71,7 @@ def _loaded(table):  # type: ignore[no-untyped-def]
 
 
 class TorchDepthNoise:
-    """The same for torch on any ``device`` (as torch names it), and for batches (n, h, w)."""
+    """The same for torch on any ``device`` (torch's name), and for batches (n, h, w)."""
 
     def __init__(self, table, device="cpu", seed=1):  # type: ignore[no-untyped-def]
         import torch

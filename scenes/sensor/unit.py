@@ -1,4 +1,4 @@
-"""Frames and their sums, and light and errors of range of a unit or a frame, for every kind of camera."""
+"""Frames and their sums, and the light and range errors of a unit or frame, for every kind of camera."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SUMMED = ("count", "total", "squares", "amplitude")
 
 
 class DecodedFrame(NamedTuple):
-    """A frame: ``z_m`` (h, w) float32, NaN where ``reason`` (h, w) uint8 is not VALID; ``amplitude`` (h, w)."""
+    """A frame. ``z_m`` (h, w) float32: NaN where ``reason`` (h, w) uint8 is not VALID. ``amplitude``: (h, w)."""
 
     z_m: np.ndarray
     reason: np.ndarray
@@ -34,9 +34,9 @@ class DecodedFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class FrameTotals:
-    """Sums over ``frames`` frames on (h, w) pixels, z in whole steps of ``step_m``, so that sums are exact. ``count``
-    of valid samples; ``total`` and ``squares`` of their z less ``base``, and ``amplitude`` in the camera's units;
-    ``reasons`` (r, h, w): how often each `Reason` was given."""
+    """Sums over ``frames`` frames on pixels (h, w), with z in whole steps of ``step_m``, so that sums are exact.
+    ``count``: of valid samples. ``total``, ``squares``: of their z minus ``base``. ``amplitude``: in the camera's
+    units. ``reasons`` (r, h, w): how often each `Reason` occurred."""
 
     frames: int
     step_m: float
@@ -53,13 +53,13 @@ class FrameTotals:
         return replace(self, reasons=self.reasons[:, *at], **images)
 
     def __add__(self, other: FrameTotals) -> FrameTotals:
-        """Add the sums over other frames of the same view; step and base are equal."""
+        """Add sums over other frames of the same view, with the same step and base."""
         sums = {name: getattr(self, name) + getattr(other, name) for name in ("frames", "reasons", *SUMMED)}
         return replace(self, **sums)
 
 
 def rays_of(slopes: np.ndarray, offset_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (h, w) each: an offset's (3,) component along each pixel's unit ray, and the ray's cosine to the axis."""
+    """Return, (h, w) each, an offset's (3,) component along each pixel's unit ray, and the ray's cosine to the axis."""
     rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
     length = np.linalg.norm(rays, axis=-1)
     return rays @ offset_m / length, 1 / length
@@ -78,7 +78,7 @@ def smooth_field(white: np.ndarray, length_px: float) -> np.ndarray:
 
 
 SPECTRUM, LEAST_POWER, FAINT = 256, 1e-3, 0.05
-"""Frequencies of a filter's spectrum, least power there and least tap, over the largest: correlations to 0.015."""
+"""Frequencies of a filter's spectrum, and its least power and tap relative to the largest: correlations to 0.015."""
 
 
 def taps_of(correlation: np.ndarray) -> np.ndarray:
@@ -97,19 +97,19 @@ def taps_of(correlation: np.ndarray) -> np.ndarray:
 
 
 def light_of(view: NoiseFreeView, effects: EffectsConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Return phasors (f, h, w) and intensity (h, w) of all light, or of direct light only where multipath is off: then
-    the longest phasor over the frequencies, too small where two surfaces cancel at every frequency."""
+    """Return phasors (f, h, w) and intensity (h, w) of all light or, with multipath off, of direct light; intensity is
+    then the longest phasor over the frequencies, too small where two surfaces cancel at every frequency."""
     if effects.multipath:
         return view.phasor, view.intensity
     return view.phasor_direct, np.minimum(np.abs(view.phasor_direct).max(axis=0), view.intensity)
 
 
-KEPT_PATTERNS = 4  # whole sensors' patterns that a process keeps, for further views of the same unit
+KEPT_PATTERNS = 4  # whole sensors' patterns that a process keeps for other views of the same unit
 _patterns_mm: dict[tuple[Any, ...], np.ndarray] = {}
 
 
 class UnitModel(ABC, Generic[Camera]):
-    """A unit of a camera on a region of its sensor, whose central rays have ``slopes`` (h, w, 2)."""
+    """A unit of a camera on a region of its sensor whose central rays have ``slopes`` (h, w, 2)."""
 
     def __init__(self, camera: Camera, config: CameraConfig, region: Region, slopes: np.ndarray) -> None:
         self.camera, self.config, self.region, self.slopes = camera, config, region, slopes
@@ -120,7 +120,7 @@ class UnitModel(ABC, Generic[Camera]):
 
     @cached_property
     def static_error_m(self) -> np.ndarray:
-        """(h, w): all errors of range that frames of this unit share, as far as they are on."""
+        """All range errors (h, w) that the frames of this unit share, if they are switched on."""
         camera, config, lens = self.camera, self.config, self.camera.nominal_lens
         error = _drift_m(camera.unit, config.effects, config.minutes_since_power_on, self.slopes[..., 0])
         if config.effects.unit_offset:
@@ -129,7 +129,7 @@ class UnitModel(ABC, Generic[Camera]):
         if not config.effects.fixed_pattern:
             return error
         numbers = canonical_json([config.numbers, camera.fixed_pattern.to_data()])
-        key = camera.name, numbers, config.unit_seed, lens  # several files may bear one name
+        key = camera.name, numbers, config.unit_seed, lens  # several files may have the same name
         if key not in _patterns_mm:
             while len(_patterns_mm) >= KEPT_PATTERNS:
                 del _patterns_mm[next(iter(_patterns_mm))]
@@ -150,8 +150,8 @@ def _drift_m(facts: UnitFacts, effects: EffectsConfig, minutes: float, slope_x: 
 def frame_errors_m(
     facts: UnitFacts, effects: EffectsConfig, minutes: float, rng: np.random.Generator
 ) -> Iterator[float]:
-    """Yield endless errors of range in metres, one a frame: jitter in all, a jump of either sign in a few, and what the
-    drift, on the axis, has changed since the first frame, ``minutes`` after power-on; 0 where off."""
+    """Yield range errors in metres for endless frames: jitter in all, a jump either way in a few, and the change of the
+    drift on the axis since the first frame, ``minutes`` after power-on. An effect that is off adds 0."""
     axis = np.zeros(1)
     first = _drift_m(facts, effects, minutes, axis)[0]
     for frame in count():

@@ -35,9 +35,9 @@ def check_target(config: custom.TargetConfig) -> None:
         problems += _overlap_problems([damage for damage in config.damages if not found[damage.id]], board, face)
         problems += _tape_problems(config) + _pose_problems(config)
     if problems:
-        told = "the target cannot be built:\n" + "\n".join(f"  - {problem}" for problem in problems)
+        what = "the target cannot be built:\n" + "\n".join(f"  - {problem}" for problem in problems)
         legal = "damage and tape lie on the board, apart from one another, and no deeper than it is thick"
-        raise UserError(told, legal=legal, fix="change the numbers named above in the target's declaration")
+        raise UserError(what, legal=legal, fix="change the numbers named above in the target's declaration")
 
 
 def _name(damage: custom.AnyDamage) -> str:
@@ -55,9 +55,9 @@ def _board_problems(board: custom.BoardConfig) -> list[str]:
     if isinstance(shape, custom.MeshConfig):
         vertices = part_of(shape)[0]
         sizes = (vertices.max(axis=0) - vertices.min(axis=0)) / MM
-        said = "width_mm: {:.6g}, height_mm: {:.6g}, thickness_mm: {:.6g}".format(*sizes)
+        sizes_mm = "width_mm: {:.6g}, height_mm: {:.6g}, thickness_mm: {:.6g}".format(*sizes)
         off = np.abs(sizes - (board.width_mm, board.height_mm, board.thickness_mm)).max() > LEAST_WEB_MM
-        return [f"board: its sizes are not those of {shape.file}, which has {said}"] if off else []
+        return [f"board: its sizes are not those of {shape.file}, which has {sizes_mm}"] if off else []
     if isinstance(shape, custom.CylinderConfig | custom.SphereConfig):
         reach = float(np.hypot(half_x, half_y))
         if isinstance(shape, custom.CylinderConfig):
@@ -220,8 +220,8 @@ def _pose_problems(config: custom.TargetConfig) -> list[str]:
         backing = transform_points(T_camera_board, backing_corners_board_m(config, config.backing))
         farthest_m = max(farthest_m, backing[:, 2].max())
     if nearest_m < NEAREST_M:
-        said = f"the board's nearest point is {nearest_m:.3g} m in front of the lens; the limit is {NEAREST_M} m"
-        problems.append(f"pose: {said}")
+        what = f"the board's nearest point is {nearest_m:.3g} m in front of the lens; the limit is {NEAREST_M} m"
+        problems.append(f"pose: {what}")
     floor_m, wall_m = (room.floor_below_lens_m, room.back_wall_distance_m) if room else (None, None)
     if floor_m is not None and lowest_m >= floor_m:
         problems.append(f"room: the board reaches {lowest_m:.3g} m below the lens, through the floor at {floor_m:g} m")

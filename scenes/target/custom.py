@@ -25,7 +25,7 @@ Albedo = Annotated[float, Field(ge=0.0, le=1.0)]
 Rgb = tuple[Albedo, Albedo, Albedo]
 Length = Annotated[float, Field(ge=1.0, le=1e4)]
 SizeMm = tuple[Length, Length]
-Chamfer = Annotated[float, Field(ge=0.0, le=100.0, description="leg of a 45 degree chamfer at the mouth")]
+Chamfer = Annotated[float, Field(ge=0.0, le=100.0, description="leg of the 45 degree chamfer at the mouth; 0: none")]
 
 
 class FlatConfig(Config):
@@ -36,11 +36,11 @@ class FlatConfig(Config):
 
 class _CurvedConfig(Config):
     radius_mm: Annotated[float, Field(ge=10.0, le=1e6)]
-    bulge: Literal["towards", "away"] = Field(default="towards", description="towards or away from the camera")
+    bulge: Literal["towards", "away"] = Field("towards", description="bulges towards the camera or away from it")
 
 
 class CylinderConfig(_CurvedConfig):
-    """A face bent about one axis: z = +-(sqrt(R^2 - s^2) - R), s the co-ordinate across the straight direction."""
+    """A face bent about one axis: z = +-(sqrt(R^2 - s^2) - R), where s runs across the straight direction."""
 
     kind: Literal["cylinder"]
     straight_along: Literal["x", "y"] = "y"
@@ -67,24 +67,24 @@ class TermConfig(Config):
 
 
 class PolynomialConfig(Config):
-    """A face whose height towards the camera is any polynomial: the sum of its terms."""
+    """A face whose height towards the camera is a polynomial in x and y, the sum of its terms."""
 
     kind: Literal["polynomial"]
     terms: Annotated[tuple[TermConfig, ...], Field(min_length=1, max_length=45)]
 
 
 class CorrugatedConfig(Config):
-    """A corrugated sheet: z = depth / 2 (cos(2 pi s / period) - 1), s the co-ordinate across the straight direction."""
+    """A corrugated sheet: z = depth / 2 (cos(2 pi s / period) - 1), where s runs across the straight direction."""
 
     kind: Literal["corrugated"]
     period_mm: Annotated[float, Field(ge=5.0, le=1e3)] = 76.0
-    depth_mm: Annotated[float, Field(gt=0.0, le=200.0)] = Field(18.0, description="from crest to valley")
+    depth_mm: Annotated[float, Field(gt=0.0, le=200.0)] = Field(18.0, description="height from valley to crest")
     straight_along: Literal["x", "y"] = "y"
 
 
 class PanelConfig(Config):
-    """A panel like a car door's, by guess: bent in both directions, with a swage line along x at which the face steps:
-    z = -x^2 / 2 R_x - y^2 / 2 R_y + swage / 2 (tanh((y - y0) / w) + tanh(y0 / w))."""
+    """A panel like that of a car door. It is bent in both directions, and the face steps at a swage line along x:
+    z = -x^2 / 2 R_x - y^2 / 2 R_y + swage / 2 (tanh((y - y0) / w) + tanh(y0 / w)). The default values are guesses."""
 
     kind: Literal["panel"]
     radius_x_mm: Annotated[float, Field(ge=50.0, le=1e6)] = 4000.0
@@ -95,21 +95,22 @@ class PanelConfig(Config):
 
 
 class RoughConfig(Config):
-    """A flat face with random roughness, as of concrete, and a flat back. Heights are Gaussian; their power spectrum in
-    two dimensions is (k^2 + k_outer^2)^-(1 + H), k_outer = 2 pi / ``outer_mm``, up to 2 pi / ``inner_mm``: self-affine
-    between both (Persson et al., J. Phys.: Condens. Matter 17 (2005) R1). Pores and gravel are not modelled."""
+    """A face with random roughness, such as concrete, and a flat back. Heights are Gaussian. Their power spectrum in
+    two dimensions is (k^2 + k_outer^2)^-(1 + H) with k_outer = 2 pi / ``outer_mm``, and ends at 2 pi / ``inner_mm``;
+    between both, the surface is self-affine (Persson et al., J. Phys.: Condens. Matter 17 (2005) R1). Pores and gravel
+    are not modelled."""
 
     kind: Literal["rough"]
     deviation_mm: Annotated[float, Field(gt=0.0, le=20.0)] = Field(0.3, description="standard deviation of the heights")
     outer_mm: Annotated[float, Field(ge=2.0, le=1e3)] = 60.0
     inner_mm: Annotated[float, Field(ge=1.0, le=100.0)] = 6.0
-    hurst: Annotated[float, Field(gt=0.0, le=1.0)] = Field(0.8, description="H")
-    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = Field(1, description="drawn anew for every board of a family")
+    hurst: Annotated[float, Field(gt=0.0, le=1.0)] = Field(0.8, description="H, the Hurst exponent")
+    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = Field(1, description="a family of boards draws it for each board")
 
 
 class _FileConfig(Config):
     file: Annotated[str, Field(min_length=1, max_length=1000)]
-    content: str = Field("", max_length=32, description="the file's digest; filled in, so that results know the file")
+    content: str = Field("", max_length=32, description="the file's digest, filled in when the file is read")
 
     @model_validator(mode="before")
     @classmethod
@@ -121,7 +122,7 @@ class _FileConfig(Config):
 
 
 class MeshConfig(_FileConfig):
-    """The front of a part from a mesh file (`scenes.target.part`); the board's sizes are then those of its bounds."""
+    """The front of a part from a mesh file (`scenes.target.part`). Its bounds give the board's sizes."""
 
     kind: Literal["mesh"]
     unit: FileUnit = "mm"
@@ -142,7 +143,8 @@ ShapeConfig = Annotated[
 
 
 class BoardConfig(Config):
-    """A board, rectangular in plan (along z, in which its size counts), equally thick along the normal."""
+    """A board. Its outline, seen along z, is a rectangle; its thickness, along the face's normal, is the same
+    everywhere."""
 
     width_mm: Annotated[float, Field(ge=5.0, le=5e3)]
     height_mm: Annotated[float, Field(ge=5.0, le=5e3)]
@@ -151,7 +153,7 @@ class BoardConfig(Config):
 
 
 class DamageConfig(PlacedConfig):
-    """Declaration that holes and dents have in common."""
+    """Keys that the declarations of holes and dents share."""
 
     diameter_mm: Annotated[float, Field(ge=0.2, le=1e3)]
 
@@ -172,16 +174,16 @@ class DamageConfig(PlacedConfig):
 
 
 class DrillConfig(Config):
-    """The drill of all holes of a board, in place of what each hole says."""
+    """The drill of all holes of a board. It replaces the diameter, kind, depth and chamfer of each hole."""
 
     diameter_mm: Annotated[float, Field(ge=0.2, le=1e3)]
     kind: Literal["through", "blind"] = "through"
-    depth_mm: Annotated[float, Field(gt=0.0, le=500.0)] | None = Field(default=None, description="blind holes only")
+    depth_mm: Annotated[float, Field(gt=0.0, le=500.0)] | None = Field(default=None, description="of blind holes only")
     chamfer_mm: Chamfer = 0.0
 
 
 class HoleConfig(DrillConfig, DamageConfig):
-    """A drilled cylinder, its axis along the face's normal at its centre. A blind hole has a flat bottom."""
+    """A drilled cylinder whose axis is the face's normal at its centre. A blind hole has a flat bottom."""
 
     @model_validator(mode="after")
     def _depth_where_blind(self) -> Self:
@@ -193,7 +195,7 @@ class HoleConfig(DrillConfig, DamageConfig):
 
 
 class DentConfig(DamageConfig):
-    """A spherical cap: rim diameter and depth as a ball would leave them on a flat face."""
+    """A spherical cap with the rim diameter and depth that a ball would leave in a flat face."""
 
     kind: ClassVar[Literal["dent"]] = "dent"
     depth_mm: Annotated[float, Field(ge=0.04, le=500.0)]
@@ -208,7 +210,7 @@ AnyDamage = HoleConfig | DentConfig | FlawConfig
 
 
 class TapeConfig(Config):
-    """A strip stuck on the face; size and place in plan, the angle from board +x towards +y."""
+    """A strip of tape on the face. Its size and place are those in plan; its angle counts from board +x towards +y."""
 
     centre_mm: PlaceMm
     size_mm: SizeMm
@@ -219,34 +221,34 @@ class TapeConfig(Config):
 
 
 class GlossConfig(Config):
-    """A Phong lobe beside Lambert's: ``share`` of what the albedo returns goes into a lobe about the mirror direction,
-    (exponent + 2) / (2 pi) cos^exponent of the angle from it (Lafortune and Willems 1994). Reciprocal; at no angle does
-    more light leave than the albedo says. Not modelled: the growth at grazing angles (Fresnel)."""
+    """A Phong lobe beside diffuse reflection: the part ``share`` of the reflected light goes into a lobe about the
+    mirror direction, (exponent + 2) / (2 pi) cos^exponent of the angle from it (Lafortune and Willems 1994). The model
+    is reciprocal and never reflects more than the albedo. It lacks the growth at grazing angles (Fresnel)."""
 
     share: Albedo
-    exponent: float = Field(ge=1.0, le=500.0, description="7: 50 degrees wide at half height; 180: 10 degrees")
+    exponent: float = Field(ge=1.0, le=500.0, description="width of the lobe at half height: 7: 50, 180: 10 degrees")
 
 
 class TextureConfig(_FileConfig):
-    """An image on the face in place of the grain, stretched over width and height as the camera sees them, its first
-    row at the top. Its brightness in linear light (decoded from sRGB) scales the albedo at 850 nm and all colours
-    alike, and its mean becomes the declared albedo. Not modelled: a pattern that differs at 850 nm."""
+    """An image on the face in place of the grain. It is stretched over the board's width and height, its first row at
+    the top. Its brightness in linear light (decoded from sRGB) scales the albedo at 850 nm and all colours alike, so
+    that their means are those declared. A pattern that looks different at 850 nm is not modelled."""
 
 
 class ReflectanceConfig(Config):
-    """Reflectance of a board: diffuse, with a grain along x or a ``texture`` that scales 850 nm and all colours alike;
-    with ``gloss`` at the camera's wavelength, on the face and in holes, never on tape."""
+    """Reflectance of a board: diffuse, with a grain along x or a ``texture``, which scale 850 nm and all colours alike.
+    ``gloss`` acts at the camera's wavelength, on the face and in holes, but not on tape."""
 
-    albedo_850: Albedo = Field(0.6, description="pale wood: 0.5 to 0.7; no published value for plywood found")
+    albedo_850: Albedo = Field(0.6, description="pale wood has 0.5 to 0.7; no published value for plywood was found")
     rgb: Rgb = (0.55, 0.42, 0.28)
-    grain_contrast: float = Field(0.05, ge=0.0, le=0.3, description="the albedo's deviation over its mean, unclipped")
-    grain_period_mm: Annotated[float, Field(ge=1.0, le=200.0)] = Field(default=8.0, description="between dark lines")
+    grain_contrast: float = Field(0.05, ge=0.0, le=0.3, description="standard deviation of the albedo over its mean")
+    grain_period_mm: Annotated[float, Field(ge=1.0, le=200.0)] = Field(8.0, description="distance between dark lines")
     gloss: GlossConfig | None = None
     texture: TextureConfig | None = None
 
 
 class MaterialConfig(ReflectanceConfig):
-    """A board's reflectance with the grain of one board among alike boards."""
+    """Reflectance of one board; ``grain_seed`` tells it from boards of the same material."""
 
     grain_seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 1
 
@@ -254,14 +256,15 @@ class MaterialConfig(ReflectanceConfig):
 class BackingConfig(Config):
     """A plane behind the board, parallel to the board frame's x and y."""
 
-    distance_mm: float = Field(ge=0.0, le=5e3, description="behind the deepest point of the back face")
+    distance_mm: float = Field(ge=0.0, le=5e3, description="distance behind the deepest point of the board's back")
     albedo_850: Albedo = 0.6
     rgb: Rgb = (0.55, 0.55, 0.55)
-    size_mm: SizeMm | None = Field(None, description="none: the board's shadow as seen from the lens at zero tilt")
+    size_mm: SizeMm | None = Field(None, description="null: what the board hides from the lens at zero tilt")
 
 
 class RoomConfig(Config):
-    """Surfaces for multipath, in the camera's frame: a floor parallel to the optical axis, a wall across it."""
+    """Floor and back wall, from which light reaches the board (multipath). In the camera's frame, the floor is parallel
+    to the optical axis and the wall is perpendicular to it. A key that is null leaves that surface out."""
 
     floor_below_lens_m: Annotated[float, Field(ge=0.05, le=10.0)] | None = None
     floor_albedo_850: Albedo = 0.3
@@ -269,13 +272,13 @@ class RoomConfig(Config):
     back_wall_distance_m: Annotated[float, Field(ge=0.1, le=20.0)] | None = None
     back_wall_albedo_850: Albedo = 0.6
     back_wall_rgb: Rgb = (0.6, 0.6, 0.6)
-    width_m: float = Field(4.0, ge=0.5, le=40.0, description="of floor and wall, centred")
-    height_m: float = Field(2.5, ge=0.5, le=20.0, description="of the wall, up from the floor")
+    width_m: float = Field(4.0, ge=0.5, le=40.0, description="width of floor and wall, centred on the optical axis")
+    height_m: float = Field(2.5, ge=0.5, le=20.0, description="height of the wall above the floor")
 
 
 class WavelengthConfig(Config):
-    """Albedos at another wavelength than 850 nm, of every surface that the target has; ``tape`` of all strips. A
-    ``board`` that is ``as_at_850`` follows the target's material."""
+    """Albedos at a wavelength other than 850 nm: one for each kind of surface that the target has. ``as_at_850`` gives
+    the ``board`` the albedo that its material has at 850 nm."""
 
     wavelength_nm: Annotated[float, Field(ge=300.0, le=2000.0)]
     board: Albedo | Literal["as_at_850"]
@@ -285,14 +288,14 @@ class WavelengthConfig(Config):
     back_wall: Albedo | None = None
 
 
-_OTHER = Field(max_length=20, description="for cameras that do not work near 850 nm")
+_OTHER = Field(max_length=20, description="albedos for cameras that do not work near 850 nm")
 OtherWavelengths = Annotated[tuple[WavelengthConfig, ...], _OTHER]
 
 
 class PoseConfig(Config):
-    """Place of the face's centre (camera axes) and turns of the board: about its x, then y, then z."""
+    """Pose of the board: the face's centre in the camera's axes, and rotations about the board's own x, then y, z."""
 
-    distance_m: Annotated[float, Field(ge=0.1, le=10.0)] = Field(default=0.7, description="along the optical axis")
+    distance_m: Annotated[float, Field(ge=0.1, le=10.0)] = Field(0.7, description="depth of the face's centre")
     offset_x_mm: Coordinate = 0.0
     offset_y_mm: Coordinate = 0.0
     tilt_x_deg: Annotated[float, Field(ge=-70.0, le=70.0)] = 0.0
@@ -301,8 +304,8 @@ class PoseConfig(Config):
 
     @property
     def T_camera_board(self) -> np.ndarray:
-        """4x4: board to camera. The board is turned in its own axes (x, then y, then z). Positive ``tilt_x_deg`` brings
-        the upper edge nearer, positive ``tilt_y_deg`` the -x edge, positive ``roll_deg`` lifts the +x edge."""
+        """The 4x4 matrix that maps board to camera. Positive ``tilt_x_deg`` brings the upper edge nearer, positive
+        ``tilt_y_deg`` the -x edge, and positive ``roll_deg`` lifts the +x edge."""
         T_camera_board = np.eye(4)
         turned = rotation_xyz_deg(self.tilt_x_deg, self.tilt_y_deg, self.roll_deg)
         T_camera_board[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ turned
@@ -311,10 +314,12 @@ class PoseConfig(Config):
 
 
 class SetUpConfig(Config):
-    """Surroundings of a board, and its pose. ``backing`` or ``room`` left out: nothing stands there."""
+    """Surroundings of a board, and its pose. Without ``backing`` or ``room`` nothing stands there."""
 
     name: str
-    flaws: Annotated[tuple[AnyFlawConfig, ...], Field(max_length=500, description="every other kind of damage")] = ()
+    flaws: Annotated[
+        tuple[AnyFlawConfig, ...], Field(max_length=500, description="damage of all kinds but holes and dents")
+    ] = ()
     material: MaterialConfig = MaterialConfig()
     backing: BackingConfig | None = None
     room: RoomConfig | None = None
@@ -323,11 +328,11 @@ class SetUpConfig(Config):
 
 
 class TargetConfig(SetUpConfig):
-    """A whole target."""
+    """A target declared in full: the board, its damage, tapes, surroundings and pose."""
 
     name: Literal["custom"] = "custom"
     board: BoardConfig
-    drill: DrillConfig | None = Field(None, description="one drill for all holes: a single key to vary")
+    drill: DrillConfig | None = Field(None, description="one drill for all holes, so that an axis can vary it")
     holes: Annotated[tuple[HoleConfig, ...], Field(max_length=500)] = ()
     dents: Annotated[tuple[DentConfig, ...], Field(max_length=500)] = ()
     tapes: Annotated[tuple[TapeConfig, ...], Field(max_length=100)] = ()
@@ -382,8 +387,8 @@ class TargetConfig(SetUpConfig):
             surfaces |= {"floor": room.floor_below_lens_m, "back_wall": room.back_wall_distance_m}
         lacking = [name for name, there in surfaces.items() if there and getattr(albedos, name) is None]
         if lacking:
-            told = f"other_wavelengths: at {albedos.wavelength_nm:g} nm there is no albedo for {', '.join(lacking)}"
-            raise UserError(told, legal="an albedo for every surface that the target has")
+            what = f"other_wavelengths: at {albedos.wavelength_nm:g} nm there is no albedo for {', '.join(lacking)}"
+            raise UserError(what, legal="an albedo for every surface that the target has")
         board = self.material.albedo_850 if albedos.board == "as_at_850" else albedos.board
         changed: dict[str, Any] = {"material": self.material.model_copy(update={"albedo_850": board})}
         changed["tapes"] = tuple(tape.model_copy(update={"albedo_850": albedos.tape}) for tape in self.tapes)

@@ -47,12 +47,12 @@ Jitter = Annotated[float, Field(ge=0.0, le=1e3)]
 
 
 class _Drawn(Config):
-    """Number and sizes of drawn damage; every board has a size from each of ``per_board`` equal parts of the range."""
+    """Number and sizes of drawn damage. Each board has one size from each of ``per_board`` equal parts of the range."""
 
     per_board: Annotated[int, Field(ge=1, le=100)]
     sizes: Literal["uniform", "log"] = Field(
         default="uniform",
-        description="uniform in the size, as MIL-HDBK-1823A advises for the sizes of targets, or in its logarithm",
+        description="uniform in the size, as MIL-HDBK-1823A advises, or in its logarithm",
     )
     size_of: ClassVar[str] = "diameter"
 
@@ -74,7 +74,7 @@ class _Drawn(Config):
 
 
 class DrawnThrough(_Drawn):
-    """Holes drilled through."""
+    """Drilled through-holes. Each board has one diameter from each of ``per_board`` equal parts of the range."""
 
     kind: Literal["through"]
     diameter_mm: Annotated[tuple[Diameter, Diameter], AfterValidator(_ascending)]
@@ -87,9 +87,9 @@ class DrawnThrough(_Drawn):
 
 
 class DrawnDeep(DrawnThrough):
-    """Blind holes with a flat bottom, or spherical caps. Depths are uniform, one from each of ``per_board`` equal parts
-    of their range, in random order. Of a dent it is that part of the range which is legal for its size: no deeper than
-    its radius, and on a bent face no shallower than its ball allows (`scenes.target.checks`)."""
+    """Blind holes with a flat bottom, or dents (spherical caps). Depths are uniform: one from each of ``per_board``
+    equal parts of their range, in random order. A dent's range is cut to the depths that its size allows: at most its
+    radius, and on a bent face at least what its ball needs (`scenes.target.checks`)."""
 
     kind: Literal["blind", "dent"]  # type: ignore[assignment]
     depth_mm: Depths
@@ -103,8 +103,9 @@ RANGES["angle_deg"] = Annotated[tuple[flaws.Angle, flaws.Angle], AfterValidator(
 
 
 class DrawnFlaws(_Drawn):
-    """A kind of `scenes.target.flaws`. Each pair is a range: of the size that ``size_of`` names and of the depth as of
-    holes, of every other quantity uniform and independent; a single number is the same on all boards."""
+    """A kind of damage of `scenes.target.flaws`. Each pair is a range. The size that ``size_of`` names and the depth
+    are drawn as those of holes, all other quantities uniformly and independently; a single number holds for all
+    boards."""
 
     kind: Any
 
@@ -129,10 +130,10 @@ class DrawnFlaws(_Drawn):
 
 
 def _drawn_of(flaw: type[flaws.FlawConfig]) -> type[DrawnFlaws]:
-    """Return the declaration of a family of a kind of flaw: as one of them, with ranges."""
+    """Return the declaration of a family of a kind of flaw: that of a single flaw, with ranges in place of numbers."""
     fields: dict[str, Any] = {}
     for name, field in flaw.model_fields.items():
-        # places and seeds are drawn, and with a chip's place the edge that its angle names
+        # places and seeds are drawn; a chip's place determines the edge, and so its angle
         if name in ("id", "centre_mm", "seed") or (name, flaw) == ("angle_deg", flaws.ChipConfig):
             continue
         range_, default = RANGES.get(name, (field.annotation, field))
@@ -152,31 +153,32 @@ else:
 
 
 class DrawnTargetConfig(Config):
-    """A family of boards. ``drawn`` gives the full declaration of any board, ``declare`` that of the first damaged
-    board. Limits named ``..._mm`` and ``..._deg`` of the pose are the ends of uniform distributions about 0."""
+    """A family of random boards. Offsets, tilts, roll and jitter of the pose are drawn uniformly between plus and minus
+    the given value. ``drawn`` returns the full declaration of any board, ``declare`` that of the first damaged
+    board."""
 
     name: Literal["drawn"] = "drawn"
-    seed: flaws.Seed = Field(1, description="of the boards; an experiment's own seed draws the noise")
+    seed: flaws.Seed = Field(1, description="draws the boards; the experiment's own seed draws the noise")
     damage: AnyDrawn
     board: custom.BoardConfig = Field(
         custom.BoardConfig(width_mm=304.8, height_mm=203.2, thickness_mm=12.7, shape=custom.FlatConfig()),
-        description="the thesis' plywood, of 12 x 8 in: as many pixels as its board of 24 x 4.5 in, fewer at the edge",
+        description="default: plywood of 12 x 8 in, as many pixels as the thesis' 24 x 4.5 in but fewer at the edge",
     )
     apart_mm: Annotated[float, Field(gt=0.0, le=1e4)] = Field(
-        40.0, description="least distance of two centres in plan; more than twice a hit radius: no finding counts twice"
+        40.0, description="least distance of two centres; above two hit radii, no detection counts for two damages"
     )
     edge_mm: Annotated[float, Field(ge=LEAST_WEB_MM, le=1e4)] = Field(
-        15.0, description="least distance of a rim from the board's edge, off which a crop takes 6 to 12 mm"
+        15.0, description="least distance of a damage's rim from the board's edge; a crop removes 6 to 12 mm there"
     )
-    tapes: Annotated[tuple[custom.TapeConfig, ...], Field(max_length=100)] = Field((), description="of all boards")
+    tapes: Annotated[tuple[custom.TapeConfig, ...], Field(max_length=100)] = Field((), description="on all boards")
     distance_m: Annotated[float, Field(ge=NEAREST_M, le=FARTHEST_M)] = 0.7
-    distance_jitter_mm: Jitter = Field(default=10.0, description="so that a limit does not hang on a step of range")
-    offset_mm: Annotated[float, Field(ge=0.0, le=5e3)] = Field(20.0, description="sideways and upwards")
-    tilt_deg: Annotated[float, Field(ge=0.0, le=70.0)] = Field(8.0, description="about x and y: a sheet put up by hand")
-    roll_deg: Annotated[float, Field(ge=0.0, le=90.0)] = Field(2.0, description="a board is set down by eye")
+    distance_jitter_mm: Jitter = Field(default=10.0, description="keeps a limit from depending on one step of range")
+    offset_mm: Annotated[float, Field(ge=0.0, le=5e3)] = Field(20.0, description="offset to the sides and up or down")
+    tilt_deg: Annotated[float, Field(ge=0.0, le=70.0)] = Field(8.0, description="tilt about x and y, as set up by hand")
+    roll_deg: Annotated[float, Field(ge=0.0, le=90.0)] = Field(2.0, description="roll, as set up by eye")
     material: custom.ReflectanceConfig = Field(custom.ReflectanceConfig(), description="each board has its own grain")
     backing: custom.BackingConfig | None = Field(
-        default=custom.BackingConfig(distance_mm=20.0), description="without a size it fills every hole in every pose"
+        default=custom.BackingConfig(distance_mm=20.0), description="without size_mm it fills all holes in all poses"
     )
     room: custom.RoomConfig | None = custom.RoomConfig(floor_below_lens_m=0.75, back_wall_distance_m=2.5)
     other_wavelengths: custom.OtherWavelengths = ()
@@ -189,7 +191,7 @@ class DrawnTargetConfig(Config):
         if declared[1] >= thick and damage.kind not in ("pressed_dent", "pressed_bump", "protrusion"):
             deep = f"{declared[1]:g} mm is not less than the board's thickness, {thick:g} mm"
             problems.append(f"damage.depth_mm: {deep}")
-        # Both limits of a dent's depth grow with the diameter, so the ends of the sizes tell for all.
+        # Both limits of a dent's depth grow with the diameter, so checking the smallest and largest size suffices.
         dents = isinstance(damage, DrawnDeep) and damage.kind == "dent"
         for diameter_mm in sorted(set(damage.size_mm)) if dents else []:
             least_mm, most_mm = _dent_depths_mm(diameter_mm, bend_per_mm)

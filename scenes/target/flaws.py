@@ -1,10 +1,11 @@
-"""Damage beside drilled holes and ball dents: a slot, a gouge, a pressed dent or bump, corrosion, a chip, a protrusion.
+"""Damage other than drilled holes and ball dents: slots, gouges, pressed dents and bumps, corrosion, chips,
+protrusions.
 
-All are a depth over a frame of their own, which touches the face at the damage's centre: s runs along the damage, t
-across it, and depth counts along the face's normal there, into the board. A kind gives its depth on a grid of (s, t)
-whose border is the outline; `mesh.solids_of` cuts or adds the solid between that grid and the face, and
-`truth.truth_of` measures outline, centre line and volume on it. ``angle_deg`` turns s from board +x towards board +y.
-Sizes are those in the plane that touches the face: good to second order in size over radius of curvature.
+Each is a depth over its own frame, which touches the face at the damage's centre: s runs along the damage, t across it,
+and depth counts along the face's normal there, into the board. A kind gives its depth on a grid of (s, t) whose border
+is the outline; `mesh.solids_of` cuts or adds the solid between that grid and the face, and `truth.truth_of` measures
+outline, centre line and volume on it. ``angle_deg`` turns s from board +x towards board +y. Sizes are those in the
+plane that touches the face; they are exact to second order in size over radius of curvature.
 
 Not modelled: burrs, spring-back, rust that stands on the face, another albedo of the exposed material."""
 
@@ -47,7 +48,7 @@ class Relief:
 
 
 class PlacedConfig(Config):
-    """Declaration that all damage has in common. ``size_of``: the size in plan that a limit is of, where it varies."""
+    """Keys that all damage shares. ``size_of`` names the size in plan that a limit states."""
 
     id: Annotated[int, Field(ge=1, le=9999)]
     centre_mm: PlaceMm
@@ -88,7 +89,8 @@ class _FlawConfig(PlacedConfig):
 
 
 class _LongConfig(_FlawConfig):
-    """A damage along a line: ``wander_mm`` is its deviation from a straight one, in waves that ``seed`` draws."""
+    """A damage along a line. ``wander_mm`` is the deviation of the line from a straight one; ``seed`` draws its
+    waves."""
 
     length_mm: Extent
     width_mm: Extent
@@ -108,11 +110,12 @@ class _LongConfig(_FlawConfig):
 
 
 class SlotConfig(_LongConfig):
-    """A slot or open crack with upright walls and blunt ends, as deep everywhere; the limit is of its width."""
+    """A slot or open crack of constant depth, with upright walls and blunt ends. Its limit is a width. ``wander_mm`` is
+    the deviation of its centre line from a straight one; ``seed`` draws the line."""
 
     kind: Literal["slot"]
     size_of: ClassVar[str] = "width"
-    depth_mm: Depth | None = Field(None, description="none: through the board")
+    depth_mm: Depth | None = Field(None, description="null: through the board")
 
     def relief(self) -> Relief:
         """Return the depth over the slot's frame."""
@@ -121,8 +124,9 @@ class SlotConfig(_LongConfig):
 
 
 class GougeConfig(_LongConfig):
-    """A scratch or gouge: its section a V or a parabola, its floor rising to the face over ``run_out_mm`` at each end.
-    Assessments of pipes (ASME B31G, API 579) go by its depth and its length."""
+    """A scratch or gouge. Its section is a V or a parabola, and its floor rises to the face over ``run_out_mm`` at each
+    end. Its limit is a length; assessments of pipes (ASME B31G, API 579) use its depth and its length. ``wander_mm``
+    and ``seed`` are those of a slot."""
 
     kind: Literal["gouge"]
     size_of: ClassVar[str] = "length"
@@ -140,13 +144,13 @@ class GougeConfig(_LongConfig):
 
 
 class RoundConfig(_FlawConfig):
-    """A sheet pressed in (``pressed_dent``) or out (``pressed_bump``): front and back move alike, by a raised cosine of
-    the distance from the centre; it may be deeper than the sheet is thick. Or an object that stands on the face (weld
-    spatter, a rivet's head): a paraboloid, its height ``depth_mm``."""
+    """A sheet that is pressed in (``pressed_dent``) or out (``pressed_bump``): front and back move alike, by a raised
+    cosine of the distance from the centre, and may move further than the sheet is thick. A ``protrusion`` is an object
+    on the face, such as weld spatter or a rivet's head: a paraboloid of height ``depth_mm``."""
 
     kind: Literal["pressed_dent", "pressed_bump", "protrusion"]
     diameter_mm: Extent
-    depth_mm: Annotated[Depth, Field(description="of a protrusion its height over the face")]
+    depth_mm: Annotated[Depth, Field(description="depth; of a protrusion, its height above the face")]
 
     @property
     def pressed(self) -> bool:
@@ -161,13 +165,13 @@ class RoundConfig(_FlawConfig):
 
 
 class CorrosionConfig(_FlawConfig):
-    """A corroded patch: an uneven outline of a circle's area, whose radius varies by ``uneven`` (deviation over mean),
-    and a rough floor of a mean depth, deviation ``rough_mm`` and correlation length ``grain_mm`` (Gaussian, cut at the
-    face), rising to the face over the outer tenth of the radius."""
+    """A corroded patch. Its outline is uneven: the radius varies by ``uneven`` (deviation over mean). Its floor is
+    rough, with the deviation ``rough_mm`` and the correlation length ``grain_mm`` (Gaussian, cut at the face), and
+    rises to the face over the outer tenth of the radius. ``seed`` draws both."""
 
     kind: Literal["corrosion"]
-    diameter_mm: Annotated[Extent, Field(description="of the circle with the patch's area")]
-    depth_mm: Annotated[Depth, Field(description="mean")]
+    diameter_mm: Annotated[Extent, Field(description="diameter of the circle that has the patch's area")]
+    depth_mm: Annotated[Depth, Field(description="mean depth")]
     rough_mm: Annotated[float, Field(ge=0.0, le=100.0)] = 0.2
     grain_mm: Annotated[float, Field(ge=0.1, le=200.0)] = 3.0
     uneven: Annotated[float, Field(ge=0.0, le=0.3)] = 0.12
@@ -195,12 +199,12 @@ class CorrosionConfig(_FlawConfig):
 
 class ChipConfig(_FlawConfig):
     """Material missing at the board's edge (a chip, a spall): a quarter of an ellipsoid about a point of the edge.
-    ``angle_deg`` is the edge's: 0 top, 90 left, 180 bottom, -90 right. The limit is of its length."""
+    ``angle_deg`` names the edge: 0 top, 90 left, 180 bottom, -90 right. Its limit is a length."""
 
     kind: Literal["chip"]
     size_of: ClassVar[str] = "length"
-    length_mm: Annotated[Extent, Field(description="along the edge")]
-    width_mm: Annotated[Extent, Field(description="from the edge inwards")]
+    length_mm: Annotated[Extent, Field(description="length along the edge")]
+    width_mm: Annotated[Extent, Field(description="width from the edge inwards")]
     depth_mm: Depth
     angle_deg: Literal[0, 90, 180, -90]
 
@@ -217,7 +221,8 @@ AnyFlawConfig = Annotated[FlawConfig, Field(discriminator="kind")]
 
 
 def _disc(radius_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a square grid mapped onto a disc, s and t, and each point's part of the radius; the border is the rim."""
+    """Return s and t of a square grid mapped onto a disc, its border on the rim, and each point's share of the
+    radius."""
     u, v = np.meshgrid(np.linspace(-1, 1, ROUND + 1), np.linspace(-1, 1, ROUND + 1))
     s, t = u * np.sqrt(1 - v**2 / 2), v * np.sqrt(1 - u**2 / 2)
     return radius_m * s, radius_m * t, np.minimum(np.hypot(s, t), 1.0)

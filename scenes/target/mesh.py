@@ -73,8 +73,8 @@ def image_pattern(file: str) -> np.ndarray:
     except (OSError, cv2.error) as error:
         raise UserError(f"target.material.texture: {file} cannot be read ({error})") from error
     if image is None or image.dtype.kind != "u" or min(image.shape) < 2 or not image.any():
-        said = f"target.material.texture: {file} is not a readable image, or it is black"
-        raise UserError(said, legal="a PNG, JPEG or TIFF image of 8 or 16 bits")
+        what = f"target.material.texture: {file} is not a readable image, or it is black"
+        raise UserError(what, legal="a PNG, JPEG or TIFF image of 8 or 16 bits")
     encoded = image / (2.0 ** (8 * image.itemsize) - 1)
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
     fewer = min(1.0, MAX_TEXELS / max(linear.shape))

@@ -1,8 +1,8 @@
-"""Parts from mesh files as targets: read, repaired or refused, and their front as a height field.
+"""Parts from mesh files as targets: a file is read, repaired or refused, and its front becomes a height field.
 
 The part's frame is the board's: its ``front`` axis is z, x and y are centred on its bounds, and z = 0 is its foremost
-point. The front is the surface seen along z; damage lies there. Its heights are read off the triangles on a grid of
-`NODES` along the longer side, between which they are bilinear.
+point. The front is the surface seen along z; damage lies there. Its heights are sampled on a grid of `NODES` along the
+longer side, and interpolated bilinearly.
 
 Not checked: neighbouring triangles that fold onto each other. Not modelled: steps of the front within a step of the
 grid; pressed dents and chips, which need a sheet's back or a declared edge."""
@@ -28,10 +28,10 @@ NODES = 1000
 
 
 class MeshTargetConfig(custom.SetUpConfig):
-    """A part from a mesh file, with damage at stated places of its front; the rest as in a whole declaration."""
+    """A part from a mesh file, with damage at the declared places of its front."""
 
     name: Literal["mesh"]
-    file: Annotated[str, Field(min_length=1, max_length=1000, description=".stl, .ply, .obj or .glb")]
+    file: Annotated[str, Field(min_length=1, max_length=1000, description="a .stl, .ply, .obj or .glb file")]
     unit: FileUnit = "mm"
     front: FrontAxis = "+z"
     material: custom.MaterialConfig = custom.MaterialConfig(grain_contrast=0.0)
@@ -54,10 +54,10 @@ def part_of(shape: custom.MeshConfig) -> tuple[np.ndarray, np.ndarray]:
     if shape.content and file_digest(Path(shape.file)) != shape.content:
         raise UserError(f"{shape.file}: has changed since the experiment was declared")
 
-    def refuse(wrong: np.ndarray, said: str, fix: str) -> None:
+    def refuse(wrong: np.ndarray, what: str, fix: str) -> None:
         if len(wrong):
             place = ", ".join(f"{each:.4g}" for each in mesh.vertices[wrong[0]].mean(axis=0))
-            where = f"{shape.file}: {said}: {len(wrong)}, the first at ({place}) {shape.unit} of the file"
+            where = f"{shape.file}: {what}: {len(wrong)}, the first at ({place}) {shape.unit} of the file"
             raise UserError(where, legal="a closed surface", fix=f"{fix} in a mesh editor, such as MeshLab")
 
     edges, counts = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
@@ -66,8 +66,8 @@ def part_of(shape: custom.MeshConfig) -> tuple[np.ndarray, np.ndarray]:
     if not len(mesh.faces):
         raise UserError(f"{shape.file}: is not a mesh: it holds no triangles", legal="a closed surface")
     if not mesh.is_winding_consistent:
-        said = f"{shape.file}: neighbouring triangles face opposite sides"
-        raise UserError(said, fix="orient its faces in a mesh editor, such as MeshLab (Re-Orient All Faces Coherently)")
+        what = f"{shape.file}: neighbouring triangles face opposite sides"
+        raise UserError(what, fix="orient its faces in a mesh editor, such as MeshLab (Re-Orient All Faces Coherently)")
     refuse(mesh.faces[crossing(mesh.triangles)], "triangles that cross others", "unite its overlapping shells")
     if mesh.volume < 0:
         mesh.invert()
@@ -77,8 +77,8 @@ def part_of(shape: custom.MeshConfig) -> tuple[np.ndarray, np.ndarray]:
 
 
 def crossing(corners: np.ndarray) -> np.ndarray:
-    """Return the indices of those triangles (n, 3, 3) that cross another with which they share no corner; touching is
-    not crossing. In strips along x they are swept, so that only those are compared whose extents meet."""
+    """Return the indices of the triangles (n, 3, 3) that cross another with which they share no corner; touching is not
+    crossing. A sweep in strips along x compares only triangles whose extents overlap."""
     low, high = corners.min(axis=1), corners.max(axis=1)
     strip_m = max(float(np.ptp(corners[..., 1])) / max(1, int(np.sqrt(len(corners)) / 8)), 1e-12)
     first, last = (((each[:, 1] - low[:, 1].min()) / strip_m).astype(np.int64) for each in (low, high))
@@ -144,7 +144,7 @@ def front_of(shape: custom.MeshConfig) -> tuple[np.ndarray, float]:
 
 
 def front_derivatives(shape: custom.MeshConfig, x_m: np.ndarray, y_m: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return z, its slopes and its bends, taken as 0, of a part's front; NaN beyond it."""
+    """Return z, its slopes and its second derivatives (taken as 0) of a part's front; NaN beyond it."""
     images, step_m = front_of(shape)
     rows, columns = images.shape[1:]
     places = [np.ravel(y_m) / step_m + rows // 2, np.ravel(x_m) / step_m + columns // 2]

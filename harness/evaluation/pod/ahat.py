@@ -194,8 +194,8 @@ def fit_censored(design: np.ndarray, y: np.ndarray, below: np.ndarray, above: np
     exact = ~(below | above)
     p = design.shape[1]
     if exact.sum() <= p or np.linalg.matrix_rank(design[exact]) < p:
-        said = f"{exact.sum()} of {len(y)} signals lie between the limits: too few, or at too few sizes, for a line"
-        raise UserError(said, legal=f"more than {p} signals that are not censored, at different sizes")
+        what = f"{exact.sum()} of {len(y)} signals lie between the limits: too few, or at too few sizes, for a line"
+        raise UserError(what, legal=f"more than {p} signals that are not censored, at different sizes")
     start = np.linalg.lstsq(design[exact], y[exact], rcond=None)[0]
     rest = y - design @ start
     scale = float(np.sqrt(np.mean(rest[exact] ** 2)))

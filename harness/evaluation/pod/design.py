@@ -36,8 +36,8 @@ def curve_through(a50: float, a90: float, link: str = "logit", *, log_size: bool
     """The curve of ``link`` with POD 0.5 at ``a50`` and 0.9 at ``a90`` (any one unit); its covariance is zero.
     UserError where it would not rise, and for sizes that are not above 0."""
     if not (np.isfinite([a50, a90]).all() and 0 < a50 < a90):
-        said = f"a50 {a50:g} and a90 {a90:g}: the probability of detection must grow with size"
-        raise UserError(said, legal="0 < a50 < a90", fix="a50 is found 50 % of the time and a90 90 %, so a90 is larger")
+        what = f"a50 {a50:g} and a90 {a90:g}: the probability of detection must grow with size"
+        raise UserError(what, legal="0 < a50 < a90", fix="a50 is found 50 % of the time and a90 90 %, so a90 is larger")
     start, end = np.log([a50, a90]) if log_size else (a50, a90)
     half, nine_tenths = link_ppf(link, np.array([0.5, 0.9]))
     sigma = float((end - start) / (nine_tenths - half))
@@ -67,8 +67,8 @@ def design(
             bounds[study] = bound(fit, POD, CONFIDENCE).value
         # Order statistics, as there is no mean between a number and infinity.
         low, median, high = np.quantile(bounds, [0.1, 0.5, 0.9], method="inverted_cdf").tolist()
-        told = (number, studies, guess.size_at(POD))
-        plans.append(StudyPlan(*told, median, low, high, float(np.mean(np.isfinite(bounds))), sizes))
+        facts = (number, studies, guess.size_at(POD))
+        plans.append(StudyPlan(*facts, median, low, high, float(np.mean(np.isfinite(bounds))), sizes))
     return tuple(plans)
 
 

@@ -167,8 +167,8 @@ def floor_ceiling_tests(fit: HitMissFit) -> tuple[FloorCeilingTest, ...]:
     lie on the boundary: 1/2 chi2(0) + 1/2 chi2(1) for one of them, and 1/4, 1/2, 1/4 of chi2(0), chi2(1), chi2(2) for
     both (Self and Liang, JASA 82 (1987), 605, cases 5 and 7, their correlation neglected). None of separated data."""
     tests, sides = [], (("floor", (0.0, 0.5), (1.0, 1.0)), ("ceiling", (0.0, 0.0), (0.5, 1.0)))
-    asked: tuple[tuple[Any, ...], ...] = (*sides, ("both", (0.0, 0.5), (0.5, 1.0)))
-    for beyond, floor, ceiling in asked if fit.method == "ML" else ():
+    cases: tuple[tuple[Any, ...], ...] = (*sides, ("both", (0.0, 0.5), (0.5, 1.0)))
+    for beyond, floor, ceiling in cases if fit.method == "ML" else ():
         place, value = _search(fit.data, np.append(fit.place, [0.0, 1.0]), floor, ceiling)
         statistic = max(2.0 * (value - fit.log_likelihood) / fit.repeats, 0.0)
         one, two = stats.chi2.sf(statistic, [1, 2])

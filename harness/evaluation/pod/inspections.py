@@ -86,8 +86,8 @@ def read_inspections(
     if missing := int(np.isnan(response).sum()):
         notes.append(f"{missing} of {len(response)} inspections state no result and are left out")
     if (below := sizes < 0).any():
-        said = f"{path}, line {lines[below][0]}: {size} is {sizes[below][0]:g}, and no size is below 0"
-        raise UserError(said, fix="give the sizes, not their logarithms: --log takes these")
+        what = f"{path}, line {lines[below][0]}: {size} is {sizes[below][0]:g}, and no size is below 0"
+        raise UserError(what, fix="give the sizes, not their logarithms: --log takes these")
     seen, flawed = ~np.isnan(response), np.nan_to_num(sizes) != 0
     if sites := int((seen & ~flawed).sum()):
         notes.append(f"{sites} of {len(response)} inspections are of unflawed sites (no size, or 0): not in the curve")
@@ -126,8 +126,8 @@ def require_hits(read: Inspections) -> None:
     """Refuse data that are all hits or all misses."""
     if np.ptp(read.response) == 0:
         kind = "hits" if read.response[0] else "misses"
-        said = f"{read.path}: all {len(read.response)} rows of {read.response_column} are {kind}"
-        raise UserError(f"{said}, and a curve needs both hits and misses", fix="add targets of other sizes")
+        what = f"{read.path}: all {len(read.response)} rows of {read.response_column} are {kind}"
+        raise UserError(f"{what}, and a curve needs both hits and misses", fix="add targets of other sizes")
 
 
 def require_positive(read: Inspections, response: bool, why: str) -> None:
@@ -135,8 +135,8 @@ def require_positive(read: Inspections, response: bool, why: str) -> None:
     values, column = (read.response, read.response_column) if response else (read.size, read.size_column)
     wrong = values <= 0
     if wrong.any():
-        said = f"{read.path}, line {read.line[wrong][0]}: {column} is {values[wrong][0]:g}, which has no logarithm"
-        raise UserError(said, legal=f"values above 0 with {why}", fix=f"leave out {why}, or remove the rows")
+        what = f"{read.path}, line {read.line[wrong][0]}: {column} is {values[wrong][0]:g}, which has no logarithm"
+        raise UserError(what, legal=f"values above 0 with {why}", fix=f"leave out {why}, or remove the rows")
 
 
 def _column(path: Path, header: list[str], name: str, chosen: tuple[str | None, ...]) -> int:
@@ -162,15 +162,15 @@ def _hits(path: Path, name: str, lines: np.ndarray, texts: list[str], notes: lis
         if word in HITS:
             found[k] = HITS[word]
         elif word not in NOTHING:
-            said = f"{path}, line {lines[k]}: {name} is {text!r}, which is neither hit nor miss"
+            what = f"{path}, line {lines[k]}: {name} is {text!r}, which is neither hit nor miss"
             legal = "1, yes, true, hit or found; 0, no, false, miss or missed; NA or an empty cell for none"
-            raise UserError(said, legal=legal, fix="a column of signals is analysed with --ahat and --decision")
+            raise UserError(what, legal=legal, fix="a column of signals is analysed with --ahat and --decision")
     return found
 
 
 def _numbers(path: Path, name: str, lines: np.ndarray, texts: list[str], notes: list[str]) -> np.ndarray:
     """Return (n,) numbers, NaN where nothing is stated."""
-    thousands, told = _thousands(path, name, texts)
+    thousands, note = _thousands(path, name, texts)
     found = np.full(len(texts), np.nan)
     for k, text in enumerate(texts):
         if text.casefold() in NOTHING:
@@ -181,11 +181,11 @@ def _numbers(path: Path, name: str, lines: np.ndarray, texts: list[str], notes: 
         with contextlib.suppress(ValueError):
             found[k] = float(plain)
         if not np.isfinite(found[k]):
-            said = f"{path}, line {lines[k]}: {name} is {text!r}, not a number"
-            raise UserError(said, legal="a finite number, or NA", fix="correct the row, or remove it")
-    if told:
-        value = found[texts.index(told)]
-        notes.append(f"{name}: {told!r} was read as {value:g}; write thousands without a mark if it is more")
+            what = f"{path}, line {lines[k]}: {name} is {text!r}, not a number"
+            raise UserError(what, legal="a finite number, or NA", fix="correct the row, or remove it")
+    if note:
+        value = found[texts.index(note)]
+        notes.append(f"{name}: {note!r} was read as {value:g}; write thousands without a mark if it is more")
     return found
 
 
@@ -204,8 +204,8 @@ def _thousands(path: Path, name: str, texts: list[str]) -> tuple[set[str], str]:
         else:
             decimals |= set(marks)
     if parts & decimals or len(decimals) > 1:
-        said = f"{path}: {name} has numbers with the decimal marks {' and '.join(sorted(parts | decimals))}"
-        raise UserError(said, legal="one decimal mark in a column", fix="write thousands without a mark")
+        what = f"{path}: {name} has numbers with the decimal marks {' and '.join(sorted(parts | decimals))}"
+        raise UserError(what, legal="one decimal mark in a column", fix="write thousands without a mark")
     parts |= {mark for mark in grouped if decimals - {mark}}
     return parts, next((text for mark, text in grouped.items() if mark not in parts | decimals), "")
 

@@ -169,10 +169,10 @@ def state_hits(
         likeliest = min(tests, key=lambda test: test.p_value)
         speaks = f"the data suggest {TESTED[likeliest.beyond]} (p = {likeliest.p_value:.2g})"
         notes.append(f"the curve has no floor or ceiling, and {speaks}{DOUBTED}")
-    said = []
+    texts = []
     for test in tests:
         fitted = f"(floor {test.floor:.3f}, ceiling {test.ceiling:.3f})"
-        said.append((TESTED[test.beyond], test.p_value, f"{'needed' if test.needed else 'not needed'} {fitted}"))
+        texts.append((TESTED[test.beyond], test.p_value, f"{'needed' if test.needed else 'not needed'} {fitted}"))
     errors = np.sqrt(np.diag(fit.covariance)).tolist()
     numbers = {"b0": fit.b0, "b0's standard error": errors[0], "b1": fit.b1, "b1's standard error": errors[1]}
     numbers |= {"mu": curve.mu, "sigma": curve.sigma, "deviance": fit.deviance}
@@ -180,7 +180,7 @@ def state_hits(
     numbers |= {"inspections": float(fit.n), "targets": float(fit.targets), "hits": float(fit.hits)}
     numbers |= false_positives(read)
     what = (read, "hit/miss", unit, near, None, _models(models, near), limit)
-    return PodStatement(*what, numbers, tuple(notes), tuple(said))
+    return PodStatement(*what, numbers, tuple(notes), tuple(texts))
 
 
 def state_signals(
@@ -210,9 +210,9 @@ def state_signals(
     numbers |= false_positives(read, fit)
     models = [(one, ahat_bound(one, POD, CONFIDENCE)) for one in tried]
     reads = {True: f"doubtful at {LEVEL:.0%}", False: f"not rejected at {LEVEL:.0%}"}
-    said = [(f"{one.assumption} ({one.test})", one.p_value, reads[one.p_value < LEVEL]) for one in diagnose(fit)]
+    tests = [(f"{one.assumption} ({one.test})", one.p_value, reads[one.p_value < LEVEL]) for one in diagnose(fit)]
     what = (read, "signal against size", unit, (), fit, _models(models, (fit,)), limit)
-    return PodStatement(*what, numbers, (*read.notes, *fit.notes), tuple(said))
+    return PodStatement(*what, numbers, (*read.notes, *fit.notes), tuple(tests))
 
 
 def _models(tried: Sequence[tuple[Any, Bound]], near: Sequence[Any]) -> tuple[ModelRow, ...]:
@@ -270,5 +270,5 @@ def drawn_sizes(size: np.ndarray, log_size: bool, marks: tuple[float, ...]) -> n
 
 
 def _bound_data(bound: Bound) -> dict[str, Any]:
-    told = {name: getattr(bound, name) for name in ("pod", "confidence", "method", "demonstrated", "why")}
-    return {**told, "size": bound.value}
+    facts = {name: getattr(bound, name) for name in ("pod", "confidence", "method", "demonstrated", "why")}
+    return {**facts, "size": bound.value}

@@ -134,19 +134,19 @@ def _level(ideal_mm: np.ndarray, ideal_index: np.ndarray, needed: np.ndarray, al
 
 def warnings_of(rows: list[Efficiency]) -> list[str]:
     """Return sentences on reasons why the ideal observer's figures are unreliable."""
-    said = []
+    warnings = []
     for row in rows:
         name, ideal = row.limit.record.label, row.ideal
         if ideal.kurtosis > HEAVY:
-            said.append(
+            warnings.append(
                 f"{name}: the noise has heavier tails than a Gaussian (excess kurtosis {ideal.kurtosis:.2g}): the ideal"
                 " observer for Gaussian noise is not the best detector there, nor does it keep the stated rate"
             )
         if ideal.lost > MOST_LOST:
-            said.append(
+            warnings.append(
                 f"{name}: up to {100 * ideal.lost:.2g} % of the pixels within a board's damage return nothing, which"
                 " the ideal observer does not use: with missing returns more can be found"
             )
         if row.why:
-            said.append(f"{name}: efficiency is not known: {row.why}")
-    return said
+            warnings.append(f"{name}: efficiency is not known: {row.why}")
+    return warnings

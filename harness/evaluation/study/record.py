@@ -268,6 +268,6 @@ def _mistake(error: ValidationError, data: Any) -> str:
     where, value = ".".join(map(str, path)), first.get("input")
     if path[:1] == ["set_ups"] and len(path) > 1 and isinstance(one := data["set_ups"][path[1]], dict):
         where += f" (set-up {one.get('variant')}, frames {one.get('frames')})"
-    told = f", not {shown(value)}" if value is None or isinstance(value, str | int | float) else ""
+    given = f", not {shown(value)}" if value is None or isinstance(value, str | int | float) else ""
     text = str(first.get("ctx", {}).get("error", first["msg"])).partition(" or an instance of")[0]
-    return f"{where}: {text}{told}" + (f"; and {len(others)} more" if others else "")
+    return f"{where}: {text}{given}" + (f"; and {len(others)} more" if others else "")

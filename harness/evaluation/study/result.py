@@ -140,7 +140,7 @@ def _span(low: float, high: float) -> str:
 
 def _inspected(limits: Sequence[SetUpLimit], sweep: Mapping[str, Sequence[Any]]) -> tuple[str, ...]:
     """Sizes, depths and boards, where all set-ups have them in common, else set-up by set-up; and the axes."""
-    said: dict[str, list[str]] = {}
+    reasons: dict[str, list[str]] = {}
     for limit in limits:
         seen = limit.record.inspected
         if len(seen.hit):
@@ -148,8 +148,8 @@ def _inspected(limits: Sequence[SetUpLimit], sweep: Mapping[str, Sequence[Any]])
             wide, deep = (_span(sizes.min(), sizes.max()) for sizes in (seen.diameter_mm, seen.depth_mm))
             text = f"{limit.targets} damages on {limit.boards} boards, {wide} in {seen.size_of} and {deep} deep"
             text += "" if times == 1 else f", each inspected {times:.3g} times with new noise"
-            said.setdefault(text, []).append(limit.record.label)
-    whose = {text: "" if len(said) == 1 else f"{', '.join(labels)}: " for text, labels in said.items()}
+            reasons.setdefault(text, []).append(limit.record.label)
+    whose = {text: "" if len(reasons) == 1 else f"{', '.join(labels)}: " for text, labels in reasons.items()}
     words = ([in_words(f"{path}={canonical_json(value)}") for value in values] for path, values in sweep.items())
     axes = (f"Varied: {'; '.join(each)}." for each in words)
     return (*(f"{labels}{text}." for text, labels in whose.items()), *axes)
@@ -267,21 +267,21 @@ CONDITIONS = (
 
 def conditions_of(facts: Mapping[str, Any], inspected: int | None = None) -> str:
     """Return the conditions common to all set-ups in one line, damage first; ``inspected``: damages that were seen."""
-    said = [words] if (words := _damage_words(facts)) else []
+    conditions = [words] if (words := _damage_words(facts)) else []
     for path, words in CONDITIONS:
         value: Any = facts
         for key in path.split("."):
             value = value.get(key) if isinstance(value, Mapping) else None
         varied = any(path.startswith(axis) for axis in facts.get("sweep") or {})
-        told = words.startswith("threshold") and any(one.startswith("threshold") for one in said)
-        if value is not None and not varied and not told:
+        known = words.startswith("threshold") and any(one.startswith("threshold") for one in conditions)
+        if value is not None and not varied and not known:
             text = words.format(camera_title(value) if isinstance(value, str) else value)
-            said.append(text.replace(" 1 false calls", " 1 false call"))
+            conditions.append(text.replace(" 1 false calls", " 1 false call"))
     target, study = facts.get("source", {}).get("target") or {}, facts.get("study") or {}
     declared = target.get("damage", {}).get("per_board", 0) * study.get("boards", 0) or len(target.get("holes") or ())
     if inspected is not None and inspected < declared:
-        said.append(f"only {inspected} of {declared} damages were in view and inspected by every set-up")
-    return ", ".join(said)
+        conditions.append(f"only {inspected} of {declared} damages were in view and inspected by every set-up")
+    return ", ".join(conditions)
 
 
 @dataclass(frozen=True, eq=False)

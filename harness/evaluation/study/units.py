@@ -48,9 +48,9 @@ def over_units(
     found = []
     for number in np.unique(unit):
         own = unit == number
-        asked = {"link": curve.link, "log_size": curve.log_size, "inspections": target[own]}
+        options = {"link": curve.link, "log_size": curve.log_size, "inspections": target[own]}
         try:
-            fit = fit_hit_miss(size_mm[own], hit[own], **asked)
+            fit = fit_hit_miss(size_mm[own], hit[own], **options)
             found.append((fit.curve.size_at(POD), bound(fit).value))
         except UserError:
             found.append((np.inf, np.inf))

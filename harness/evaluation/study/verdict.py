@@ -105,11 +105,11 @@ def compare_studies(first: StudyRecord, second: StudyRecord, alpha: float = ALPH
         signal = paired.signal_change(one, other) if same else None
         rows.append(ComparedSetUps(before, now, changed, paired.limit_change(before, now, same), hits, calls, signal))
     # A question that was not asked is no member of the family.
-    asked = [p for row in rows for p in _p_values(row)]
+    p_values = [p for row in rows for p in _p_values(row)]
     sides = []
     for side in (0, 1):
-        adjusted = iter(holm(p[side] for p in asked if p is not None))
-        sides.append([1.0 if p is None else float(next(adjusted)) for p in asked])
+        adjusted = iter(holm(p[side] for p in p_values if p is not None))
+        sides.append([1.0 if p is None else float(next(adjusted)) for p in p_values])
     p = list(zip(*sides, strict=True))
     judged = []
     for k, row in enumerate(rows):
@@ -175,17 +175,17 @@ def not_comparable(first: StudyRecord, second: StudyRecord, one: SetUpRecord, ot
 
 def differences(one: SetUpRecord, other: SetUpRecord) -> tuple[str, ...]:
     """Describe differences that may be the cause."""
-    told = [(f"{of.detector} {of.detector_version}", f"frames {of.frames}") for of in (one, other)]
-    said = [f"{before} → {now.removeprefix('frames ')}" for before, now in zip(*told, strict=True) if before != now]
+    facts = [(f"{of.detector} {of.detector_version}", f"frames {of.frames}") for of in (one, other)]
+    changes = [f"{before} → {now.removeprefix('frames ')}" for before, now in zip(*facts, strict=True) if before != now]
     for axis in sorted({*one.axes, *other.axes}):
         before, now = one.axes.get(axis, "default"), other.axes.get(axis, "default")
         if before != now:
-            said.append(f"{axis} {before} → {now}")
+            changes.append(f"{axis} {before} → {now}")
     if one.targets_digest != other.targets_digest:
-        said.append("other boards")
+        changes.append("other boards")
     elif one.frames_digest != other.frames_digest:
-        said.append("other frames of the same boards")
-    return tuple(said)
+        changes.append("other frames of the same boards")
+    return tuple(changes)
 
 
 def _p_values(row: ComparedSetUps) -> tuple[Tails | None, Tails | None, Tails | None]:

@@ -81,8 +81,8 @@ def settings_of(model: type[C], data: Mapping[str, Any], what: str, within: str 
         source = Source(what, "", whole, {(): Place(what, 0, 1, "")}, {})
         declared = shape.Declared(Config if base else model, whole, {base: model} if base else {})
         problems = [replace(each, place=None) for each in problems_of(error, declared, source, base)]
-        told = dict.fromkeys(str(each).replace("\n", "\n  ") for each in problems)
-        raise UserError(f"{what}:\n  " + "\n  ".join(told)) from error
+        lines = dict.fromkeys(str(each).replace("\n", "\n  ") for each in problems)
+        raise UserError(f"{what}:\n  " + "\n  ".join(lines)) from error
 
 
 def problems_of(error: ValidationError, declared: shape.Declared, source: Source, base: KeyPath = ()) -> list[Problem]:

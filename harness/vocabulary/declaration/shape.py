@@ -197,11 +197,12 @@ def _words(kind: Any, limits: Mapping[str, Any]) -> str:
     return f"{words} {' and '.join(f'{BOUNDS[name]} {bound}' for name, bound in bounds.items())}".strip()
 
 
-def every_key(model: type[BaseModel], before: str = "") -> Iterator[tuple[str, Slot]]:
-    """Yield every key below a model with its place: items as ``key[]``, kinds as ``key[kind=name]``."""
+def every_key(model: type[BaseModel], before: str = "") -> Iterator[tuple[str, Slot, type[BaseModel]]]:
+    """Yield the path of every key below a model (items as ``key[]``, kinds as ``key[kind=name]``), its slot, and the
+    model that declares it."""
     for name, field in model.model_fields.items():
         path, slot = f"{before}{name}", slot_of(field.annotation, field)
-        yield path, slot
+        yield path, slot, model
         for kind, _ in slot.branches:
             if get_origin(kind) in (tuple, list):
                 path, slot = f"{path}[]", slot_of(get_args(kind)[0])

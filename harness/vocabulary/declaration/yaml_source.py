@@ -81,9 +81,9 @@ class DeclarationError(UserError):
     def __init__(self, origin: str, problems: Iterable[Problem]) -> None:
         self.origin, self.problems = origin, in_order(problems)
         count = "1 problem" if len(self.problems) == 1 else f"{len(self.problems)} problems"
-        told = [*map(str, self.problems[:MAX_PROBLEMS])]
-        told += [f"and {further} more"] if (further := len(self.problems) - MAX_PROBLEMS) > 0 else []
-        super().__init__(f"{origin}: {count}; nothing was run\n\n" + "\n\n".join(told))
+        lines = [*map(str, self.problems[:MAX_PROBLEMS])]
+        lines += [f"and {further} more"] if (further := len(self.problems) - MAX_PROBLEMS) > 0 else []
+        super().__init__(f"{origin}: {count}; nothing was run\n\n" + "\n\n".join(lines))
 
     def __reduce__(self) -> tuple[object, ...]:
         return DeclarationError, (self.origin, self.problems)
@@ -234,8 +234,8 @@ class _BoundedParser(Parser):
         self.depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
         self.nodes += isinstance(event, NodeEvent)  # keys, too
         if self.depth > MAX_DEPTH or self.nodes > 2 * MAX_NODES:
-            told = ("nested too deep", MAX_DEPTH) if self.depth > MAX_DEPTH else ("too many values", MAX_NODES)
-            raise _TooMuch(*told, event.start_mark.index)
+            excess = ("nested too deep", MAX_DEPTH) if self.depth > MAX_DEPTH else ("too many values", MAX_NODES)
+            raise _TooMuch(*excess, event.start_mark.index)
         return event
 
 

@@ -1,11 +1,11 @@
-"""Sums over frames of the imager without its frames: most pixels to first order in the noise, the rest one by one.
+"""Sums over the imager's frames without drawing them: most pixels to first order in the noise, the others one by one.
 
-`at_once` sorts the pixels of a view, once. Where all gates are sure to let a pixel through and noise acts to first
-order, z is a moving sum of one normal a pixel, displaced and rounded in each frame; where a gate is sure to stop it,
-nothing is drawn; all others, at rims mostly, go through the whole chain. Not as in a frame: amplitudes have their own
-noise, independent of that of z (in frames their correlation is 0.1 at most); a pixel without a range has, in all its
-frames, the reason that its mean has; variance of second order (2.5 % at most) is put on the centre's noise. The
-variance of averages of 50 frames of a board is equal to 0.002 (even pixels), 0.005 (uneven) and 0.017 (listed;
+`at_once` sorts the pixels of a view once. Where all gates certainly pass a pixel and noise acts to first order, z is a
+moving sum of one normal per pixel, displaced and rounded in each frame. Where a gate certainly stops it, nothing is
+drawn. All other pixels, mostly at rims, go through the whole chain. Differences to real frames: amplitudes have their
+own noise, independent of that of z (in frames their correlation is at most 0.1); a pixel without a range has, in all
+its frames, the reason that its mean has; variance of second order (at most 2.5 %) is added to the centre's noise. The
+variance of averages of 50 frames of a board agrees to 0.002 (even pixels), 0.005 (uneven) and 0.017 (listed;
 tests/validation/at_once.py). Far behind a hole, where light is dim, the variance of means of 8 frames is 13 to 15 %
 less than that of single frames' means (standard error 3 %); the cause is not known."""
 
@@ -37,11 +37,11 @@ NONE, EVEN, UNEVEN = 0, 1, 2
 
 
 class Linear(NamedTuple):
-    """Pixels of a view, (n,) float32 but for ``kind`` (uint8) and ``row`` (int32); z in steps of the output. ``noise``:
-    one deviation of a pixel's noise, in any unit. ``z``: the mean less ``base``, a whole number. ``by_path``: by how
-    much a step of half path moves z. EVEN pixels: ``each``: by how much a neighbour's noise moves z at weight 1,
-    ``more``: the centre's own beyond its weight's part. UNEVEN pixels: ``row`` in ``moved`` (m, k), the same by each
-    neighbour. ``taps`` (side,): symmetric weights by distance along a row."""
+    """Pixels of a view, (n,) float32 except ``kind`` (uint8) and ``row`` (int32); z in steps of the output. ``noise``:
+    one deviation of a pixel's noise, in any unit. ``z``: the mean minus ``base``, a whole number. ``by_path``: change
+    of z per step of half path. EVEN pixels have ``each``, the change of z by a neighbour's noise at weight 1, and
+    ``more``, that by the centre's own noise beyond its weight's part. UNEVEN pixels have ``row`` in ``moved`` (m, k):
+    the same by each neighbour. ``taps`` (side,): symmetric weights by distance along a row."""
 
     kind: np.ndarray
     noise: np.ndarray
@@ -56,12 +56,12 @@ class Linear(NamedTuple):
 
 
 BEND, SCALE = 2.9117528287640084, 0.6075658039822274
-"""SCALE v (1 + BEND v^2) of 256 even v in -1..1 has variance 1 and a normal's kurtosis."""
+"""Constants by which SCALE v (1 + BEND v^2) of 256 even v in -1..1 has variance 1 and a normal's kurtosis."""
 
 
 @numba.njit(**FAST)
 def _noise_row(y, words, given, given_at, noise, w, half, row):  # type: ignore[no-untyped-def]
-    """Write noise of picture row y into ``row`` ((w + 2 half) lanes,), zeros beside the picture."""
+    """Write the noise of picture row y into ``row`` ((w + 2 half) lanes,), with zeros beside the picture."""
     bend, centre, size = f4(BEND), f4(0.5 / 128), f4(1 / 128)
     for x in range(w):
         i = y * w + x
@@ -108,7 +108,7 @@ def _round(z, by_path, errors, each, moved, start, more, own, own_start, rounded
 
 @numba.njit(**EXACT_SUMS)
 def _sums_of(rounded, counted):  # type: ignore[no-untyped-def]
-    """Return sums of z and z^2 over the frames that are ``counted`` (lanes,) 0 or 1: whole numbers, below 2^24."""
+    """Return sums of z and z^2 over the frames whose ``counted`` (lanes,) is 1, not 0: whole numbers, below 2^24."""
     total, squares = f4(0), f4(0)
     for t in range(np.uint64(LANES)):
         r = counted[t] * rounded[t]
@@ -121,9 +121,9 @@ def _sums_of(rounded, counted):  # type: ignore[no-untyped-def]
 def add_linear_frames(  # type: ignore[no-untyped-def]
     shape, linear, words, given, given_at, errors, counted, total, squares
 ):
-    """Add `LANES` frames at the EVEN and UNEVEN pixels of ``linear`` to (n,): z less base, and its square, in steps.
-    ``words`` (n lanes,) int8: random bytes, in whose place ``given`` (g, lanes) normals stand where ``given_at`` (n,)
-    is not -1: pixels simulated otherwise share their noise. ``errors`` (lanes,): displacements in steps."""
+    """Add `LANES` frames at the EVEN and UNEVEN pixels of ``linear`` to (n,): z minus base, and its square, in steps.
+    ``words`` (n lanes,) int8: random bytes; the normals ``given`` (g, lanes) replace them where ``given_at`` (n,) is
+    not -1, so that pixels simulated in another way share their noise. ``errors`` (lanes,): displacements in steps."""
     h, w = shape
     side = linear.taps.size
     half = side // 2
@@ -162,7 +162,7 @@ def add_linear_frames(  # type: ignore[no-untyped-def]
 
 @numba.njit(**EXACT_SUMS)
 def add_bytes(words: np.ndarray, counted: np.ndarray, total: np.ndarray) -> None:
-    """Add to ``total`` (n,) the bytes ``words`` (n lanes,) int8 of the frames that count, as numbers of variance 1."""
+    """Add to ``total`` (n,) the bytes ``words`` (n lanes,) int8 of the counted frames, as numbers of variance 1."""
     scale = f4(1 / np.sqrt((256.0**2 - 1) / 12))
     for i in range(total.size):
         sum_of_all = f4(0)
@@ -171,15 +171,15 @@ def add_bytes(words: np.ndarray, counted: np.ndarray, total: np.ndarray) -> None
         total[i] += scale * sum_of_all
 
 
-MOST_LISTED = 0.25  # share of pixels simulated one by one above which whole frames cost less
-LEAST_DITHER = 0.6  # noise of a sample over the converter's step from which rounding is noise of step^2/12, to 1e-3
-JITTERS = 6.0  # deviations of a frame's displacement that limits of range are kept clear of
+MOST_LISTED = 0.25  # if more of the pixels had to be simulated one by one, whole frames would cost less
+LEAST_DITHER = 0.6  # from this noise of a sample over the converter's step, rounding is noise of step^2/12, to 1e-3
+JITTERS = 6.0  # limits of range keep this many deviations of a frame's displacement away
 
 
 class Listed(NamedTuple):
-    """Pixels to simulate. ``halo`` (g,) flat indices: pixels whose light is needed; ``range`` (m,): those that get a
-    range; ``wanted`` (p,): places in ``range`` of those whose verdict is wanted. ``window`` (m, k): places in ``halo``
-    of each range's window; ``near`` (p, 9): places in ``range`` of the neighbours of each wanted one; -1 for none."""
+    """Pixels to simulate. ``halo`` (g,): flat indices of pixels whose light is needed. ``range`` (m,): those that get a
+    range. ``wanted`` (p,): indices in ``range`` of those whose result is wanted. ``window`` (m, k): indices in ``halo``
+    of each range's window. ``near`` (p, 9): indices in ``range`` of each wanted one's neighbours. -1 means none."""
 
     halo: np.ndarray
     range: np.ndarray
@@ -191,7 +191,7 @@ class Listed(NamedTuple):
 def _listed(wanted: np.ndarray, side: int, flying: bool) -> Listed:
     ranges = ndimage.binary_dilation(wanted, np.ones((3, 3), bool)) if flying else wanted
     halo = ndimage.binary_dilation(ranges, np.ones((side, side), bool))
-    # numbers of the pixels row by row, -1 elsewhere
+    # running numbers of the pixels, -1 elsewhere
     in_range, in_halo = (np.where(m, np.cumsum(m).reshape(m.shape) - 1, -1).astype(np.int32) for m in (ranges, halo))
     range_, wanted_ = np.flatnonzero(ranges), np.flatnonzero(wanted)
     window, near = windows_of(in_halo, side, -1, range_), windows_of(in_range, 3, -1, wanted_)
@@ -199,20 +199,20 @@ def _listed(wanted: np.ndarray, side: int, flying: bool) -> Listed:
 
 
 def windows_of(image: np.ndarray, side: int, beyond: float, pixels: np.ndarray) -> np.ndarray:
-    """Return (m, side^2): an image's (h, w) windows about flat ``pixels`` (m,), with ``beyond`` outside the border."""
+    """Return the windows (m, side^2) of an image (h, w) at flat ``pixels`` (m,), with ``beyond`` outside the border."""
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(image, side // 2, constant_values=beyond), (side, side))
     return windows[np.divmod(pixels, image.shape[1])].reshape(-1, side * side)
 
 
-def at_once(imager: AmcwImager, exposure: AmcwExposure, asked: np.ndarray) -> AtOnce | None:
-    """Return the sums of frames at the pixels ``asked`` (h, w) bool; None where frames must be drawn: without noise
-    that hides the converter's steps, where a sample may saturate or not, or where many pixels hang on a gate."""
+def at_once(imager: AmcwImager, exposure: AmcwExposure, pixels: np.ndarray) -> AtOnce | None:
+    """Return the sums of frames at ``pixels`` (h, w) bool. Return None if frames must be drawn: if noise does not hide
+    the converter's steps, if a sample may saturate, or if a gate may go either way for many pixels."""
     largest = np.abs(exposure.means).max(axis=(0, 1))
     lost = largest - DEVIATIONS * exposure.sigma > exposure.limit
     wild = (largest + DEVIATIONS * exposure.sigma > exposure.limit) & ~lost
     knee = imager.camera.converter.knee_units.value
     step = np.exp2(np.maximum(np.floor(np.log2(np.maximum(largest, 1e-9) / knee)), 0))
-    # without noise that hides the converter's steps frames are not what the linear model says
+    # without noise that hides the converter's steps, frames differ from the linear model
     if wild.any() or not (exposure.sigma > LEAST_DITHER * step).all():
         return None
     space, concentration, dim, *rules = imager.filter_settings
@@ -220,7 +220,7 @@ def at_once(imager: AmcwImager, exposure: AmcwExposure, asked: np.ndarray) -> At
     shape, n, unit = exposure.shape, exposure.sigma.size, imager.camera.unit
     light = light_of_samples(exposure, float(knee), imager.gains)
 
-    # each pixel that is asked for after the filter, and how noise moves it
+    # each requested pixel after the filter, and its change by noise
     noise_free = np.stack([light.phasor.real, light.phasor.imag]).astype(f4)
     noise_free[:, :, lost] = 0
     strength = light.amplitude if window.by_amplitude else light.bright
@@ -229,17 +229,17 @@ def at_once(imager: AmcwImager, exposure: AmcwExposure, asked: np.ndarray) -> At
     even = even_pixels(edge, light, window, shape, wild | lost)
     filtered = unknown_filtered(len(light.turn), n)
     of_even = fill_even(even, alone.reshape(len(alone), 3, n), edge, light, window, shape, filtered)
-    # what the engine looks at in the finished image of the pixels asked for is one pixel farther
-    rest = np.flatnonzero(~even & ndimage.binary_dilation(asked, np.ones((3, 3), bool)).ravel())
+    # in the finished image, the engine looks one pixel beyond the requested ones
+    rest = np.flatnonzero(~even & ndimage.binary_dilation(pixels, np.ones((3, 3), bool)).ravel())
     moved = linearised(rest, light, window, shape, wild, lost, filtered)
     farthest_m = (unit.jump_mm.value + JITTERS * unit.jitter_mm.value + abs(unit.drift_mm.value)) * MM
     certain = certainty(filtered, imager.engine, lost, shape, farthest_m)
-    wanted = ~(certain.always | certain.never) & asked.ravel()
+    wanted = ~(certain.always | certain.never) & pixels.ravel()
     if wanted.mean() > MOST_LISTED:
         return None
 
     metres = imager.engine.lattice.metres_per_turn.astype(float)[:, None] / (2 * np.pi)
-    # metres of half path by a radian of each phase, times the amplitude that carries it, over its median
+    # metres of half path per radian of each phase, times the amplitude that carries it, over its median
     pull = np.broadcast_to(metres, light.turn.shape)
     if window.by_amplitude:
         pull = metres * light.amplitude / np.median(light.amplitude, axis=1, keepdims=True)
@@ -254,7 +254,7 @@ def at_once(imager: AmcwImager, exposure: AmcwExposure, asked: np.ndarray) -> At
 def _linear(
     imager: AmcwImager, light: Light, certain: Certainty, pull: np.ndarray, at_even: Arrays, at_rest: Arrays
 ) -> Linear:
-    """Return the linear pixels: even ones with what `fill_even` returns, the rest with what `linearised` returns."""
+    """Return the linear pixels: even ones with the results of `fill_even`, the others with those of `linearised`."""
     (even, of_each, of_centre), (rest, moved) = at_even, at_rest
     space, by_amplitude = imager.filter_settings.space.astype(float), imager.filter_settings.by_amplitude
     n, step_m, side = light.turn.shape[1], imager.camera.z_step_m, space.shape[0]
@@ -285,9 +285,9 @@ def _linear(
 
 @dataclass(frozen=True)
 class AtOnce:
-    """Sums of frames of an exposure, equal in distribution to those of single frames, for a fraction of their cost.
-    ``light`` and ``shares`` (g, f) of the list's halo: before the filter, and each frequency's in the noise that moves
-    z. A frame may be displaced by ``farthest_error_m`` at most."""
+    """Sums of frames of an exposure. Their distribution is that of single frames, for a fraction of the cost. ``light``
+    and ``shares`` (g, f), on the list's halo: light before the filter, and each frequency's share in the noise of z.
+    ``farthest_error_m``: largest displacement of a frame."""
 
     imager: AmcwImager
     shape: tuple[int, int]
@@ -305,30 +305,30 @@ class AtOnce:
 
     @cached_property
     def noise_m(self) -> float:
-        """Median deviation of a frame's z over the sure pixels, before rounding and without what frames share."""
+        """Median deviation of a frame's z over the sure pixels, before rounding, without noise shared by a frame."""
         return float(np.median(self.certain.deviation_m[self.certain.always])) if self.sure_pixels else 0.0
 
     @cached_property
     def z_by_error(self) -> float:
-        """Movement of z by that of a frame: the median over the sure pixels."""
+        """Change of z per displacement of a frame: the median over the sure pixels."""
         return float(np.median(self.certain.z_by_path[self.certain.always])) if self.sure_pixels else 1.0
 
     @cached_property
     def listed(self) -> np.ndarray:
-        """(p,) flat indices of the pixels that are simulated one by one."""
+        """Flat indices (p,) of the pixels that are simulated one by one."""
         return np.asarray(self.list.range[self.list.wanted])
 
     @cached_property
     def _engine(self) -> ranging.DepthEngine:
-        """The engine of the listed pixels, once for each lane."""
+        """The engine of the listed pixels, repeated for each lane."""
         engine, at = self.imager.engine, np.repeat(self.list.range, LANES)
         return engine._replace(geometry=engine.geometry.take(at, axis=1), outside_mask=engine.outside_mask[at])
 
     def totals(
         self, frames: np.ndarray, errors_m: np.ndarray, stream: Callable[[int], np.random.Generator]
     ) -> FrameTotals:
-        """Sum the frames of numbers ``frames`` (t,), which ``errors_m`` (t,) displace. The noise of frames `LANES` k to
-        `LANES` (k + 1) - 1 is from ``stream`` (k), whichever of them are asked for."""
+        """Sum the frames with numbers ``frames`` (t,), displaced by ``errors_m`` (t,). The noise of frames `LANES` k to
+        `LANES` (k + 1) - 1 comes from ``stream`` (k), whichever of them are requested."""
         n, p, shape, step_m = self.linear.z.size, len(self.listed), self.shape, self.imager.camera.z_step_m
         total, squares, sway, given_at = np.zeros(n), np.zeros(n), np.zeros(n, f4), np.full(n, -1, np.int32)
         given_at[self.list.halo] = np.arange(len(self.list.halo))

@@ -1,9 +1,9 @@
-"""Pixels that have a range in every frame, in none, or are to be simulated one by one.
+"""Sorts pixels into those that have a range in every frame, those that have none, and those to simulate one by one.
 
-Each gate's quantity has a mean and a deviation to first order in the noise (`scenes.sensor.amcw.linear`); a pixel is
-sure where the engine's table of gates (`ranging.first_failed`) says the same of the worst and of the best values within
-`DEVIATIONS`. Where the noise is too much for that, bounds that hold at any noise count. Where a window holds one even
-surface, noise takes the same share off the weight of each neighbour, which is read from a table by the phase noise."""
+Each gate's quantity has a mean and a deviation to first order in the noise (`scenes.sensor.amcw.linear`). A pixel is
+sure if the engine's table of gates (`ranging.first_failed`) gives the same result for the worst and the best values
+within `DEVIATIONS`. If noise is too large for that, bounds that hold at any noise are used. If a window shows one even
+surface, noise lowers the weight of all neighbours by the same share, which a table gives by the phase noise."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from scenes.sensor.amcw.kernels import FilterSettings
 from scenes.sensor.amcw.linear import DEVIATIONS, Filtered, Light, linearised, unknown_filtered
 
 f4 = np.float32
-MOST_LEFT_OUT = 0.025  # variance not of first order above which frames are simulated; below, it is right to 1 %
-STEP_M = 1e-3  # displacement of half a path by which that of z is found
-MOST_TURNED, MOST_SPREAD = 1e3, 1e9  # for an unknown deviation: of a phase in radians, of an amplitude in units
+MOST_LEFT_OUT = 0.025  # most variance not of first order: it is then right to 1 %; beyond, frames are simulated
+STEP_M = 1e-3  # displacement of half a path from which that of z is found
+MOST_TURNED, MOST_SPREAD = 1e3, 1e9  # in place of an unknown deviation: of a phase in radians, of an amplitude in units
 
 
 class Certainty(NamedTuple):
     """Sorted pixels, (n,) bool: ``always`` a range, to first order in the noise; ``never`` a range. Without noise, (n,)
-    float64: ``z_m`` without rounding and by how much a metre of half path moves it; ``deviation_m`` of a frame's z;
-    ``amplitude``, mean over frequencies, and its deviation; ``reason`` uint8."""
+    float64: ``z_m`` before rounding, and its change per metre of half path; ``deviation_m`` of a frame's z;
+    ``amplitude``, the mean over frequencies, and its deviation; ``reason`` uint8."""
 
     always: np.ndarray
     never: np.ndarray
@@ -41,13 +41,13 @@ class Certainty(NamedTuple):
 def certainty(
     filtered: Filtered, engine: ranging.DepthEngine, lost: np.ndarray, shape: tuple[int, int], farthest_error_m: float
 ) -> Certainty:
-    """Sort the pixels of a view of ``shape``; frames are displaced by ``farthest_error_m`` at most."""
+    """Sort the pixels of a view of ``shape`` whose frames are displaced by at most ``farthest_error_m``."""
     gates, lattice, amplitude = engine.gates, engine.lattice, filtered.amplitude
     f, n = amplitude.shape
     turns = np.minimum(filtered.turned, MOST_TURNED) / (2 * np.pi)
     spread = np.minimum(filtered.spread, MOST_SPREAD)
 
-    # the engine on the mean phasors, and what half a path's change does to z
+    # the engine on the mean phasors, and the change of z by half a path
     planes = np.stack([filtered.phasor.real, filtered.phasor.imag, amplitude], axis=1).astype(f4)
     edge = np.where(np.isfinite(filtered.edge), filtered.edge, filtered.edge_least).astype(f4)
     (z_m, reason, _), up, down = (
@@ -59,7 +59,7 @@ def certainty(
     weights = lattice.metres_per_turn.astype(float)[:, None]
     deviation_m = by_path * np.sqrt(((weights * turns) ** 2).sum(axis=0))
 
-    # the lattice residual of the mean phases in turns; whether the wrap counts are sure
+    # the lattice residual of the mean phases in turns, and whether the wrap counts are certain
     turn = (np.angle(filtered.phasor) / (2 * np.pi) % 1.0).astype(f4)
     sums = lattice.combination.astype(float) @ turn
     sway = np.sqrt(lattice.combination.astype(float) ** 2 @ turns**2)
@@ -68,7 +68,7 @@ def certainty(
     ranging.half_path(turn, n, lattice, np.empty(n, f4), residual2)
     residual, unwraps = np.sqrt(residual2.astype(float)), margin & np.isfinite(residual2)
 
-    # each gate at the worst (-1) and at the best (+1) of what noise and displacements leave
+    # each gate at the worst (-1) and the best (+1) values that noise and displacements allow
     both = DEVIATIONS * np.sqrt((spread**2).sum(axis=0))
     reach = DEVIATIONS * turns.max(axis=0)
     slack_m = DEVIATIONS * deviation_m + farthest_error_m
@@ -94,7 +94,7 @@ def certainty(
 
     at_worst, at_best = first_failed(-1), first_failed(1)
     known = np.asarray((filtered.left_out <= MOST_LEFT_OUT).all(axis=0))
-    # a dim pixel's mean over its window, brightest as it may be
+    # a dim pixel's mean over its window, at its brightest
     dim = np.isfinite(filtered.edge).all(axis=0) & (at_best == ranging.LOW_AMPLITUDE)
     fails = (at_best == ranging.AMPLITUDE_RATIO) | ((at_best == ranging.UNWRAP) & margin)
     unmeasured = engine.outside_mask | lost | _edge_fails(filtered, gates) | dim | (known & fails)
@@ -109,7 +109,7 @@ def certainty(
 
 
 def _edge_fails(filtered: Filtered, gates: ranging.Gates) -> np.ndarray:
-    """Find pixels whose edge sum, in some frequency or in the mean of all, is above the limit, always."""
+    """Find pixels whose edge sum, in one frequency or in the mean of all, always exceeds the limit."""
     limit, known = float(gates.edge), np.isfinite(filtered.edge)
     if np.isinf(limit):
         return np.zeros(known.shape[1], bool)
@@ -124,7 +124,7 @@ def _edge_fails(filtered: Filtered, gates: ranging.Gates) -> np.ndarray:
 def _may_fly(
     gate: ranging.FlyingGate, z_m: np.ndarray, slack_m: np.ndarray, known: np.ndarray, unmeasured: np.ndarray
 ) -> np.ndarray:
-    """Find pixels (h, w), flat, that the gate on the finished image may mark in some frame."""
+    """Find pixels (h, w), flat, that the gate on the finished image may remove in some frame."""
     slack_m, z_m = np.nan_to_num(slack_m), np.nan_to_num(z_m)
     measured = known & ~unmeasured
     low, high = np.where(measured, z_m - slack_m, np.inf), np.where(measured, z_m + slack_m, -np.inf)
@@ -136,14 +136,14 @@ def _may_fly(
     return np.asarray(before.astype(int) + behind + count >= 2).ravel()
 
 
-MOST_EDGE = 0.004  # edge sum up to which a window is even: a neighbour 0.13 rad off changes its weight by 3 %
-MOST_UNLIKE = 0.005  # difference of c s^2 within a window up to which its noise is even: that share of a weight
-MOST_NOISE = 0.15  # phase noise in radians up to which the table goes, beyond what `certainty` takes
+MOST_EDGE = 0.004  # a window with a smaller edge sum is even: a neighbour 0.13 rad off changes its weight by 3 %
+MOST_UNLIKE = 0.005  # largest difference of c s^2 in a window with even noise: that share of a weight
+MOST_NOISE = 0.15  # largest phase noise in radians of the table, beyond what `certainty` accepts
 NOISES = np.linspace(0.0, MOST_NOISE, 33)
 
 
 def _shares_of(window: FilterSettings) -> tuple[np.ndarray, np.ndarray]:
-    """Return a neighbour's share and the variance of higher order over the noise's, by phase noise `NOISES`."""
+    """Return a neighbour's share, and the variance of higher order over the noise's, by phase noise `NOISES`."""
     side = window.space.shape[0]
     k, middle = side * side, side * side // 2
     weights = window.space.ravel() / window.space.sum()
@@ -163,7 +163,7 @@ def _shares_of(window: FilterSettings) -> tuple[np.ndarray, np.ndarray]:
 def even_pixels(
     edge: np.ndarray, light: Light, window: FilterSettings, shape: tuple[int, int], unsure: np.ndarray
 ) -> np.ndarray:
-    """Find pixels (n,) bool before one even surface. ``edge`` (f, n): noise-free edge sum; ``unsure`` (n,) bool."""
+    """Return (n,) bool: pixels before one even surface. ``edge`` (f, n): noise-free edge sum; ``unsure`` (n,) bool."""
     size = window.space.shape[0]
     half = size // 2
     unlike = unsure | (light.amplitude * (1 - DEVIATIONS * light.swell) <= window.dim).any(axis=0)
@@ -187,11 +187,11 @@ def fill_even(
     out: Filtered,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fill ``out`` at the ``even`` pixels (n,) bool, from the noise-free ``filtered`` (f, 3, n) and ``edge`` (f, n).
-    Returns (f, m) each: by what a neighbour's noise at weight and amplitude 1 moves the phase, over its deviation, and
-    what one deviation of the centre's does in all."""
+    Return, (f, m) each, the change of the phase by a neighbour's noise at weight and amplitude 1, over its deviation,
+    and by one deviation of the centre's noise in total."""
 
     def summed(values: np.ndarray, space: np.ndarray) -> np.ndarray:
-        """Values (f, n) summed over each window with weights ``space``, which are a product of rows and columns."""
+        """Return values (f, n) summed over each window with weights ``space``, a product of rows and columns."""
         middle = space.shape[0] // 2
         planes, across = values.reshape(-1, *shape), space[middle] / np.sqrt(space[middle, middle])
         border = cv2.BORDER_CONSTANT
@@ -215,10 +215,10 @@ def fill_even(
     centre = np.sqrt((1 - share * (1 - mine)) ** 2 * own**2 + rest)
     variance = each**2 * (squares - (middle * own_carried * own) ** 2) + centre**2
     alone = taken(filtered[:, 0]) + 1j * taken(filtered[:, 1])
-    # noise brings the mean nearer to the centre's own phase, as it does the shares
+    # noise moves the mean towards the centre's own phase, as it does the shares
     mean = taken(light.phasor) * (1 - share) + alone * (share / np.abs(alone))
     out.phasor[:, at] = mean / np.abs(mean)
-    # noise across a mean phasor makes it longer
+    # noise perpendicular to a mean phasor lengthens it
     out.amplitude[:, at] = taken(filtered[:, 2]) * (1 + 0.5 * variance if window.by_amplitude else 1.0)
     out.turned[:, at] = np.sqrt(variance)
     out.spread[:, at] = np.sqrt(spreads) / window.space.sum()

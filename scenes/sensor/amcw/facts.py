@@ -1,4 +1,4 @@
-"""The numbers of a continuous-wave imager, as its file holds them, and the unwrapping that its frequencies allow."""
+"""The numbers of a continuous-wave imager, as in its file, and the phase unwrapping that its frequencies allow."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from scenes.sensor.facts import (
 
 
 class UnwrapTable(NamedTuple):
-    """Tables by which phases of f = 1, 2 or 3 frequencies become half the light's path. ``lattice`` (f,) float32:
-    integers m with f_k = m_k f_0. ``combination`` (f - 1, f) float32: integer rows orthogonal to m; they sum the
-    wrapped phases to whole numbers, which are a key of the wrap counts: ``sizes`` and ``offset`` (f - 1,) int32 of the
+    """Tables that convert phases at f = 1, 2 or 3 frequencies to half the light's path. ``lattice`` (f,) float32:
+    integers m with f_k = m_k f_0. ``combination`` (f - 1, f) float32: integer rows orthogonal to m, which sum the
+    wrapped phases to whole numbers. These are a key of the wrap counts: ``sizes`` and ``offset`` (f - 1,) int32 of the
     keys, ``wraps`` (f, keys) float32, -1 for none. ``metres_per_turn`` (f,) float32. ``unambiguous_m``: c / 2 f_0."""
 
     lattice: np.ndarray
@@ -46,14 +46,14 @@ class UnwrapTable(NamedTuple):
 
 @lru_cache(maxsize=64)
 def unwrap_table(frequencies_hz: tuple[float, ...], fusion: Literal["least_squares", "mean"]) -> UnwrapTable:
-    """Return the table for one to three frequencies. Raises UserError where they have no common base."""
+    """Return the table for one to three frequencies. Raises UserError if they have no common base frequency."""
     lattice, base_hz = _integer_ratios(frequencies_hz)
     combination = _orthogonal_rows(lattice)
     counts = _wrap_counts(lattice)
     keys = counts @ combination.T
     offset = -keys.min(axis=0)
     sizes = keys.max(axis=0) + offset + 1
-    # a single frequency has no keys: then the table's one entry is the count 0
+    # a single frequency has no keys: its table has one entry, the count 0
     strides = np.array([np.prod(sizes[row + 1 :], dtype=int) for row in range(sizes.size)], int)
     table = np.full((np.prod(sizes, dtype=int), lattice.size), -1, np.float32)
     table[(keys + offset) @ strides] = counts
@@ -71,7 +71,7 @@ def unwrap_table(frequencies_hz: tuple[float, ...], fusion: Literal["least_squar
 
 
 def _integer_ratios(frequencies_hz: tuple[float, ...]) -> tuple[np.ndarray, float]:
-    """Return smallest integers m and base frequency with f = m * base, to 1e-6."""
+    """Return the smallest integers m and the base frequency with f = m * base, to 1e-6."""
     frequencies = np.array(frequencies_hz)
     lowest = frequencies.min()
     for divisor in range(1, 65):
@@ -79,12 +79,12 @@ def _integer_ratios(frequencies_hz: tuple[float, ...]) -> tuple[np.ndarray, floa
         if np.abs(multiples - np.round(multiples)).max() < 1e-6 * divisor:
             return np.round(multiples).astype(np.int64), float(lowest / divisor)
     legal = "frequencies that are integer multiples (the lowest at most 64 times) of a common one"
-    told = f"modulation frequencies {[f / 1e6 for f in frequencies_hz]} MHz share no base frequency"
-    raise UserError(told, legal=legal)
+    what = f"modulation frequencies {[f / 1e6 for f in frequencies_hz]} MHz share no base frequency"
+    raise UserError(what, legal=legal)
 
 
 def _wrap_counts(lattice: np.ndarray, noise_turns: float = 0.03) -> np.ndarray:
-    """Return (n, f) wrap counts that occur within the unambiguous range."""
+    """Return the wrap counts (n, f) that occur within the unambiguous range."""
     distance = (np.arange(0, 1, 1 / (64 * int(lattice.max()))) + 1e-9)[:, None] * lattice
     errors = sorted(
         product((-noise_turns, 0.0, noise_turns), repeat=lattice.size), key=lambda e: -sum(abs(x) for x in e)
@@ -94,12 +94,12 @@ def _wrap_counts(lattice: np.ndarray, noise_turns: float = 0.03) -> np.ndarray:
 
 
 def _orthogonal_rows(lattice: np.ndarray, reach: int = 16) -> np.ndarray:
-    """Return (f - 1, f): the shortest independent integer rows t with t . m = 0 that tell all wrap counts apart."""
+    """Return the shortest independent integer rows t (f - 1, f) with t . m = 0 that distinguish all wrap counts."""
     if lattice.size < 3:
         return np.array([[-lattice[1], lattice[0]]]) if lattice.size == 2 else np.empty((0, 1), np.int64)
     rows = [np.array(t) for t in product(range(-reach, reach + 1), repeat=3) if any(t) and np.dot(t, lattice) == 0]
     rows.sort(key=lambda t: (int((t**2).sum()), tuple(-t)))
-    # A pair that spans the whole orthogonal lattice has |t1 x t2| = |m|; a longer cross product would confuse wraps.
+    # a pair that spans the whole orthogonal lattice has |t1 x t2| = |m|; a longer cross product would confuse wraps
     for second in rows[1:]:
         if (np.cross(rows[0], second) ** 2).sum() == (lattice**2).sum():
             return np.stack([rows[0], second])
@@ -109,12 +109,12 @@ def _orthogonal_rows(lattice: np.ndarray, reach: int = 16) -> np.ndarray:
 Contrasts = Annotated[Fact[tuple[float, ...]], checked("above 0 and at most 1", lambda value: 0 < value <= 1)]
 Window = Annotated[Fact[int], checked("an odd number from 1 to 31", lambda value: 0 < value < 32 and value % 2 == 1)]
 Phases = Annotated[Fact[int], checked("3 or more, to tell phase, amplitude and offset apart", lambda value: value >= 3)]
-WIDEST_PX = 2128  # row with the filter's window: `kernels.STRIDE`, written again so that declarations compile nothing
+WIDEST_PX = 2128  # row with the filter's window: `kernels.STRIDE`, repeated here so that declarations compile nothing
 
 
 class EmitterFacts(ConeFacts):
-    """The light source: a point beside the lens, uniform intensity in its cone. ``irradiance_w_m2``: on a surface that
-    faces it on the axis at 1 m; only ambient light is measured by it. ``mask_slopes``: corners (x/z, y/z),
+    """The light source: a point beside the lens with uniform intensity in its cone. ``irradiance_w_m2``: on a facing
+    surface on the axis at 1 m; only a reference for ambient light. ``mask_slopes``: corners (x/z, y/z),
     counter-clockwise in the image's axes, of a convex polygon outside which the camera gives no range."""
 
     irradiance_w_m2: Positive
@@ -123,7 +123,7 @@ class EmitterFacts(ConeFacts):
     @model_validator(mode="after")
     def _mask_is_convex(self) -> EmitterFacts:
         if self.mask_slopes is not None:
-            # corners of a convex area turn one way, counter-clockwise in axes x right, y down as the file has them
+            # corners of a convex area turn one way: counter-clockwise in axes x right, y down, as in the file
             x, y = np.diff([*self.mask_slopes.value, *self.mask_slopes.value[:2]], axis=0).T
             if len(x) < 4 or not (x[:-1] * y[1:] - y[:-1] * x[1:] > 0).all():
                 what = "mask_slopes must be the corners of a convex polygon, counter-clockwise in the image's axes"
@@ -132,7 +132,7 @@ class EmitterFacts(ConeFacts):
 
 
 class ScatterFacts(Config):
-    """Light that reaches pixels other than its own: a Gaussian blur by the lens, deviation ``blur_px``; a share of the
+    """Light that reaches the wrong pixels: the lens blurs by a Gaussian of deviation ``blur_px``, and a share of the
     light is spread by a Gaussian of ``stray_px`` instead. A ghost image at a distance is not modelled."""
 
     blur_px: NonNegative
@@ -141,8 +141,8 @@ class ScatterFacts(Config):
 
 
 class ColourFacts(Config):
-    """The colour camera beside, onto whose pixels depth images may be aligned: ``turn_deg`` (a rotation vector) and
-    ``shift_mm`` take points of the depth camera's frame to its frame. ``distortion`` as of every lens."""
+    """The colour camera, to whose pixels depth images may be aligned. ``turn_deg`` (a rotation vector) and ``shift_mm``
+    map points of the depth camera's frame to its frame. ``distortion``: as for every lens."""
 
     turn_deg: Fact[tuple[float, float, float]]
     shift_mm: Fact[tuple[float, float, float]]
@@ -150,7 +150,7 @@ class ColourFacts(Config):
 
     @property
     def T_colour_depth(self) -> np.ndarray:
-        """(4, 4): the depth camera's frame to the colour camera's."""
+        """The (4, 4) matrix from the depth camera's frame to the colour camera's."""
         from scipy.spatial.transform import Rotation
 
         T_colour_depth = np.eye(4)
@@ -160,8 +160,8 @@ class ColourFacts(Config):
 
 
 class ModulationFacts(Config):
-    """Continuous-wave modulation: one value per frequency but for ``phases``. ``contrast``: of the fundamental's
-    amplitude to the light's mean. ``wiggling_residual``: what calibration and bandwidth leave of harmonics."""
+    """Continuous-wave modulation, one value per frequency except ``phases``. ``contrast``: the fundamental's amplitude
+    over the mean light. ``wiggling_residual``: share of harmonics left after calibration and by bandwidth."""
 
     frequencies_hz: PositiveEach
     phases: Phases
@@ -184,10 +184,9 @@ class ModulationFacts(Config):
 
 
 class PhotonFacts(Config):
-    """The photon budget: one gain, calibrated at one point. ``signal_electrons``: of both wells in one exposure, albedo
-    1, facing, on the axis at 1 m. ``full_well_electrons`` of one well (None: only the converter saturates).
-    ``exposure_ends_electrons``: in both wells, where a pixel's exposure ends; its sample is scaled to the full length.
-    """
+    """The photon budget: one gain, calibrated at one point. ``signal_electrons``: in both wells in one exposure, from
+    albedo 1, facing, on the axis at 1 m. ``full_well_electrons``: of one well (None: only the converter saturates).
+    ``exposure_ends_electrons``: in both wells when a pixel's exposure ends; its sample is scaled to the full length."""
 
     signal_electrons: Positive
     calibration_sigma_mm: Positive
@@ -201,20 +200,20 @@ class PhotonFacts(Config):
 
 
 class ConverterFacts(Config):
-    """Companding converter: unit steps below twice the knee, doubling per octave above."""
+    """A companding converter, with unit steps below twice the knee that double per octave above."""
 
     knee_units: PositiveInt
     full_scale_units: PositiveInt
 
 
 class FixedPatternFacts(SmoothPatternFacts):
-    """A smooth and a per-pixel error of range."""
+    """A smooth range error and one of each pixel."""
 
     pixel_mm: NonNegative
 
 
 class ResidualByAmplitudeFacts(Config):
-    """Lattice residual that dim pixels may have: ``scale_turns`` A^``slope`` of the brightest frequency's amplitude A,
+    """The lattice residual allowed to dim pixels: ``scale_turns`` A^``slope`` of the brightest frequency's amplitude A,
     at most ``greatest_turns`` and at least the engine's ``lattice_residual_turns``."""
 
     scale_turns: Positive
@@ -223,9 +222,9 @@ class ResidualByAmplitudeFacts(Config):
 
 
 class FlyingPixelFacts(Config):
-    """The gate on the finished range image, 3x3: a pixel is removed where its neighbours reach more than ``near_mm``
+    """The gate on the finished range image, 3x3. A pixel is removed if its neighbours reach more than ``near_mm``
     nearer and ``far_mm`` farther, either more than ``most_mm``, and their summed amplitudes scatter by
-    ``relative_deviation`` of their mean or more (the mean taken as at least ``least_mean_units``)."""
+    ``relative_deviation`` of their mean or more (with a mean of at least ``least_mean_units``)."""
 
     relative_deviation: NonNegative
     least_mean_units: NonNegative
@@ -237,11 +236,11 @@ class FlyingPixelFacts(Config):
 class EngineFacts(LimitFacts):
     """The depth engine: phase-space filter, unwrapping, fusion, gates, output. A gate that is left out is not applied.
     ``filter_on``: each phasor counts by its weight alone (``unit_phasors``), or by its amplitude too (``phasors``).
-    ``spatial_sigma_px``: Gaussian of the window; None is a box. A centre not brighter than ``dim_amplitude_units`` gets
-    weights by distance alone; before a brighter one, dimmer neighbours are dropped where ``drop_dim_neighbours``.
-    ``edge_threshold``: limit of the sum over the window of (1 - cos dphi)/2, in ``edges_in`` any of the frequencies or
-    in their mean; ``edges_to_dim``: whether it counts such dim neighbours. ``amplitude_gains`` multiply each
-    frequency's amplitude before all gates. ``limits_along``: of the limits of range."""
+    ``spatial_sigma_px``: Gaussian of the window; None: a box. A centre not brighter than ``dim_amplitude_units`` gets
+    weights by distance alone; if ``drop_dim_neighbours``, a brighter centre ignores dimmer neighbours.
+    ``edge_threshold``: limit of the sum over the window of (1 - cos dphi)/2, ``edges_in`` any of the frequencies or
+    their mean; ``edges_to_dim``: whether it includes such dim neighbours. ``amplitude_gains`` multiply each frequency's
+    amplitude before all gates. ``limits_along``: direction of the limits of range."""
 
     window_px: Window
     filter_on: Fact[Literal["unit_phasors", "phasors"]]
@@ -295,7 +294,7 @@ class AmcwCamera(CameraFacts):
 
     @property
     def frequencies_hz(self) -> tuple[float, ...]:
-        """Modulation frequencies in the file's order."""
+        """Modulation frequencies in the order of the file."""
         return self.modulation.frequencies_hz.value
 
     @cached_property

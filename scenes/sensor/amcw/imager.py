@@ -2,11 +2,11 @@
 
 Modelled: shot and read noise, the harmonics that the number of phases aliases, ambient light, companding, saturation,
 fixed pattern and drift, the phase-space joint bilateral filter, unwrapping of one to three frequencies, the engine's
-gates, the correction for the emitter beside the lens, rounding, the lens' natural fall-off of light, its blur and stray
-light and exposures that end early where the camera's file has them. Not modelled: dark current, motion, light that
-changes during a frame, cross-talk between pixels, in-pixel rejection of ambient light, gain switching, the steps in
-which exposures end, errors of phase that differ between frequencies other than harmonics, any post-processing beyond
-this. The error that a unit's tables of lens, emitter and phase offsets leave is its fixed pattern and offset."""
+gates, the correction for the emitter beside the lens, rounding, the lens's natural fall-off of light and, if the
+camera's file has them, its blur, stray light and exposures that end early. Not modelled: dark current, motion, light
+that changes during a frame, cross-talk between pixels, in-pixel rejection of ambient light, gain switching, the steps
+in which exposures end, phase errors that differ between frequencies (except harmonics), any further post-processing.
+Errors of a unit's tables of lens, emitter and phase offsets are part of its fixed pattern and offset."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from scenes.sensor.normals import standard_normals
 from scenes.sensor.unit import DecodedFrame, UnitModel, light_of, rays_of, smooth_field
 
 f4 = np.float32
-HIGHEST_HARMONIC = 31  # harmonics above change the phase by less than 0.1 mrad in all
+HIGHEST_HARMONIC = 31  # higher harmonics change the phase by less than 0.1 mrad in total
 
 
 class AmcwExposure(NamedTuple):
-    """Light of a view as the converter sees it before noise, in converter units, flat over n = h w pixels.
+    """Light of a view at the converter, before noise, in converter units, flat over n = h w pixels.
 
-    ``means`` (f, k, n): noise-free samples; ``sigma`` (n,): deviation of each sample; ``limit`` (n,): the largest
-    sample that wells and converter hold, infinite where saturation is off; ``shape``: (h, w)."""
+    ``means`` (f, k, n): noise-free samples. ``sigma`` (n,): deviation of each sample. ``limit`` (n,): the largest
+    sample that wells and converter hold; infinite if saturation is off. ``shape``: (h, w)."""
 
     means: np.ndarray
     sigma: np.ndarray
@@ -46,7 +46,7 @@ class AmcwExposure(NamedTuple):
 def with_harmonics(signal: np.ndarray, phases: int, residual: np.ndarray) -> np.ndarray:
     """Return the signal (f, h, w) with the harmonics that N ``phases`` alias onto the fundamental, times ``residual``
     (f,). Square light under square demodulation correlates to a triangle: odd harmonics n of 1/n^2. N equidistant
-    samples see the n-th as the fundamental where n = +1 mod N, as its conjugate where n = -1. Approximation: a pixel
+    samples see harmonic n as the fundamental if n = +1 mod N, and as its conjugate if n = -1. Approximation: a pixel
     that sees several paths has the harmonics of their sum, not the sum of their harmonics."""
     size = np.abs(signal)
     direction = np.divide(signal, size, out=np.zeros_like(signal), where=size > 0)
@@ -60,8 +60,8 @@ def with_harmonics(signal: np.ndarray, phases: int, residual: np.ndarray) -> np.
 
 
 def scattered(image: np.ndarray, facts: ScatterFacts) -> np.ndarray:
-    """Return light (..., h, w) as lens blur and stray light spread it. Beyond the view's region lies the light of its
-    border. Light's fall-off towards the corners is taken as the same where light comes from and where it goes."""
+    """Return light (..., h, w) after lens blur and stray light. Beyond the view's region, the light of its border
+    continues. The fall-off of light towards the corners is assumed to be equal at its source and its destination."""
     share = facts.stray_share.value
 
     def spread(light: np.ndarray, sigma_px: float) -> np.ndarray:
@@ -72,10 +72,10 @@ def scattered(image: np.ndarray, facts: ScatterFacts) -> np.ndarray:
 
 
 def pixel_spans(lens: Lens, slopes: np.ndarray) -> np.ndarray:
-    """Return (h, w): the area of slopes that pixels span at ``slopes`` (h, w, 2), relative to one on the axis."""
+    """Return the area (h, w) of slopes that pixels cover at ``slopes`` (h, w, 2), relative to a pixel on the axis."""
     places = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1).reshape(-1, 3)
     _, by_motion = cv2.projectPoints(places, np.zeros(3), np.zeros(3), lens.matrix, np.array(lens.distortion))
-    # derivatives of u and v by the place's x and y: after the three of the turn stand those of the shift
+    # derivatives of u and v by the point's x and y; they follow the three by the rotation
     (ux, uy), (vx, vy) = np.moveaxis(by_motion.reshape(*slopes.shape[:2], 2, -1)[..., 3:5], (2, 3), (0, 1))
     return np.asarray(lens.fx * lens.fy / np.abs(ux * vy - uy * vx))
 
@@ -92,7 +92,7 @@ class AmcwImager(UnitModel[AmcwCamera]):
 
     @cached_property
     def outside_mask(self) -> np.ndarray:
-        """(h, w) bool: pixels that look beyond the lens's image or the illuminated polygon, if the camera has one."""
+        """Return (h, w) bool: pixels that look beyond the lens's image or the illuminated polygon, if there is one."""
         x, y = self.slopes[..., 0], self.slopes[..., 1]
         outside = self.camera.lens.outside_field(self.region)
         if self.camera.emitter.mask_slopes is not None:
@@ -103,12 +103,12 @@ class AmcwImager(UnitModel[AmcwCamera]):
 
     @cached_property
     def gathered(self) -> np.ndarray:
-        """(h, w): light that a pixel gathers from a surface of given radiance, relative to one on the axis: |d slopes /
-        d pixel| cos^4. Not modelled: mechanical vignetting, and the growth of the pupil with angle."""
+        """Light (h, w) that a pixel gathers from a surface of given radiance, relative to the axis: |d slopes / d
+        pixel| cos^4. Not modelled: mechanical vignetting, and growth of the pupil with angle."""
         return pixel_spans(self.camera.nominal_lens, self.slopes) / (1 + (self.slopes**2).sum(axis=-1)) ** 2
 
     def pattern_mm(self, rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
-        """Draw smooth and pixel-wise errors of range, as before the filter."""
+        """Draw smooth and pixel-wise range errors, before the filter."""
         facts = self.camera.fixed_pattern
         smooth, pixel = rng.standard_normal((2, *shape), dtype=f4)
         return facts.smooth_mm.value * smooth_field(smooth, facts.smooth_length_px.value) + facts.pixel_mm.value * pixel
@@ -123,13 +123,13 @@ class AmcwImager(UnitModel[AmcwCamera]):
         phasor, intensity = light_of(view, self.config.effects)
         electrons = photons.signal_electrons.value * self.gathered
         contrast = np.array(camera.modulation.contrast.value)[:, None, None]
-        # errors of range that all frames share are put in as a delay of the light
+        # range errors that all frames share act as a delay of the light
         turns = np.array(camera.frequencies_hz)[:, None, None] * (2 * self.static_error_m / SPEED_OF_LIGHT_AIR)
         signal = contrast * electrons * phasor * np.exp(2j * np.pi * turns)
         if self.config.effects.wiggling:
             signal = with_harmonics(signal, phases, np.array(camera.modulation.wiggling_residual.value))
         both_wells = electrons * intensity + self.ambient_electrons(view, intensity)
-        # an exposure that ends early is scaled to the full length, and its noise with it
+        # an exposure that ends early is scaled to the full length, with its noise
         share = 1.0
         if photons.exposure_ends_electrons is not None:
             share = np.minimum(1.0, photons.exposure_ends_electrons.value / np.maximum(both_wells, 1e-9))
@@ -153,8 +153,8 @@ class AmcwImager(UnitModel[AmcwCamera]):
         )
 
     def ambient_electrons(self, view: NoiseFreeView, intensity: np.ndarray) -> np.ndarray:
-        """Return (h, w): electrons of daylight or lamps in both wells of one exposure: the emitter's own times the
-        ratio of irradiances within the filter's band, for light that falls alike; at edges, of the nearest surface."""
+        """Return the electrons (h, w) of ambient light in both wells of one exposure: those of the emitter times the
+        ratio of irradiances within the filter's band, for equal incidence; at edges, those of the nearest surface."""
         config, photons = self.config, self.camera.photons
         if not config.effects.ambient:
             return np.zeros(intensity.shape)
@@ -166,7 +166,7 @@ class AmcwImager(UnitModel[AmcwCamera]):
         return np.asarray(one_metre * self.gathered * intensity * range_m**2)
 
     def frame(self, exposure: AmcwExposure, rng: np.random.Generator, error_m: float = 0.0) -> DecodedFrame:
-        """Draw a frame: noise from ``rng`` on the samples, then the depth engine; ``error_m`` displaces the frame."""
+        """Draw a frame with noise from ``rng`` on the samples, then run the engine. ``error_m`` displaces the frame."""
         unit, amplitude, saturated = self.phasors(exposure, rng)
         return self._decode(*self.filter(unit, amplitude, exposure.shape), saturated, error_m)
 
@@ -180,7 +180,7 @@ class AmcwImager(UnitModel[AmcwCamera]):
         return unit, amplitude, saturated
 
     def filter(self, unit: np.ndarray, amplitude: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-        """Filter by the engine's joint bilateral filter: (f, 3, h, w), and edge sums (f, h, w)."""
+        """Apply the engine's joint bilateral filter: (f, 3, h, w), and edge sums (f, h, w)."""
         filtered, edge = np.empty((len(amplitude), 3, *shape), f4), np.empty((len(amplitude), *shape), f4)
         for f in range(len(amplitude)):
             planes, strength = unit[:, f].reshape(2, *shape), amplitude[f].reshape(shape)
@@ -188,7 +188,7 @@ class AmcwImager(UnitModel[AmcwCamera]):
         return filtered, edge
 
     def _decode(self, filtered: np.ndarray, edge: np.ndarray, saturated: np.ndarray, error_m: float) -> DecodedFrame:
-        """Unwrap, correct, gate and round: the rest of the depth engine."""
+        """Unwrap, correct, gate and round: the remaining steps of the depth engine."""
         (n_frequencies, _, *shape), n, engine = filtered.shape, saturated.size, self.engine
         filtered, edge = filtered.reshape(n_frequencies, 3, -1), edge.reshape(n_frequencies, -1)
         z_m, reason, total = ranging.ranges_of(filtered, edge, saturated, engine, np.full(n, error_m))
@@ -202,7 +202,7 @@ class AmcwImager(UnitModel[AmcwCamera]):
 
     @cached_property
     def _near(self) -> np.ndarray:
-        """(n, 9) int32: each pixel's neighbours and itself, -1 beyond the region's border."""
+        """Return (n, 9) int32: each pixel's neighbours and itself, -1 beyond the region's border."""
         h, w = self.region.shape
         return np.ascontiguousarray(windows_of(np.arange(h * w, dtype=np.int32).reshape(h, w), 3, -1, np.arange(h * w)))
 
@@ -220,7 +220,7 @@ class AmcwImager(UnitModel[AmcwCamera]):
 
     @cached_property
     def engine(self) -> ranging.DepthEngine:
-        """Return the engine's steps after the filter."""
+        """The engine's steps after the filter."""
         facts, emitter = self.camera.engine, self.camera.optics.emitter_m
         along, cosine = rays_of(self.slopes, emitter)
         geometry = np.stack([along, np.full_like(along, emitter @ emitter), cosine]).reshape(3, -1).astype(f4)

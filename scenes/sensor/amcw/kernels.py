@@ -1,5 +1,5 @@
-"""Compiled inner loops of the continuous-wave imager up to the filtered phasor: exposure, phase-space filter. The
-filter serves a full image and a list of pixels, of which `LANES` frames are done together. One core, float32."""
+"""Compiled inner loops of the continuous-wave imager up to the filtered phasor: exposure and phase-space filter. The
+filter serves a full image, or a list of pixels with `LANES` frames done together. Single-threaded, float32."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ f4 = np.float32
 ZERO, HALF, ONE = f4(0), f4(0.5), f4(1)
 C2, C3, C4, C5 = HALF, f4(1 / 6), f4(1 / 24), f4(1 / 120)
 SMALLEST = f4(1e-30)
-OUTSIDE = f4(-1)  # amplitude of what is beyond the border or saturated: below every floor, so that it is always dropped
+OUTSIDE = f4(-1)  # amplitude beyond the border and of saturated pixels: below every floor, so always dropped
 
-STRIDE = 2128  # longest padded row of an image; a power of two would share the cache's lines, up to 4 times as slow
-LANES = 56  # frames of a listed pixel that are drawn together; loops of 8 n frames are vector code from n = 4 on
+STRIDE = 2128  # longest padded row of an image; a power of two would share cache lines, up to 4 times as slow
+LANES = 56  # frames of a listed pixel that are drawn together; loops over 8 n frames are vectorised from n = 4 on
 BLOCK = 3 * LANES  # numbers of one listed pixel and frequency: re, im and amplitude of all frames
 
 
@@ -25,10 +25,10 @@ BLOCK = 3 * LANES  # numbers of one listed pixel and frequency: re, im and ampli
 def expose(  # type: ignore[no-untyped-def]
     means, sigma, limit, normals, knee, gains, cosines, sines, unit, amplitude, saturated
 ):
-    """Convert samples to unit phasors and amplitudes: the fields of `imager.AmcwExposure`, ``normals`` (f, k, n),
-    ``gains`` (f,), ``cosines`` and ``sines`` (k,) of the phases. Writes ``unit`` (2, f, n), ``amplitude`` (f, n) and
-    ``saturated`` (n,). The difference of two wells, with Poisson shot noise and read noise of both, is taken as a
-    normal, cut off at the limit, then companded. A pixel with a saturated sample has no phasor."""
+    """Convert samples to unit phasors and amplitudes. Inputs: the fields of `imager.AmcwExposure`, ``normals`` (f, k,
+    n), ``gains`` (f,), ``cosines`` and ``sines`` (k,) of the phases. Writes ``unit`` (2, f, n), ``amplitude`` (f, n)
+    and ``saturated`` (n,). The difference of two wells, with Poisson shot noise and read noise of both, is approximated
+    by a normal, clipped at the limit, then companded. A pixel with a saturated sample has no phasor."""
     n_frequencies, n_phases, n = means.shape
     per_knee = ONE / knee
     saturated[:] = 0
@@ -44,7 +44,7 @@ def expose(  # type: ignore[no-untyped-def]
                 size = abs(sample)
                 saturated[i] |= np.uint8(size > limit[i])
                 size = min(size, limit[i])
-                # the step is the power of two at or below size / knee, and 1 below the knee: the bits without mantissa
+                # the step is the power of two at or below size / knee, 1 below the knee: the bits without the mantissa
                 word: Any = float_bits(size * per_knee)
                 step = max(bits_float(word & np.uint32(0x7F800000)), ONE)
                 code = step * np.floor(size / step + HALF)
@@ -90,8 +90,8 @@ def _filter_of(stride: int) -> Any:
 
     @numba.njit(**FAST)
     def filter_window(planes, centre, starts, length, settings, total, filtered, edge):  # type: ignore[no-untyped-def]
-        """Filter ``length`` values. ``planes``: flat, with re, im and amplitude ``stride`` apart; ``centre`` and
-        ``starts`` (k,): where the values and their neighbours begin, -1 for none; ``total``: room for 7 planes. Writes
+        """Filter ``length`` values. ``planes``: flat, with re, im and amplitude ``stride`` apart. ``centre``,
+        ``starts`` (k,): start of the values and of their neighbours, -1 for none. ``total``: room for 7 planes. Writes
         ``filtered`` (3, length) and ``edge`` (length,). Indices are unsigned: the compiler gathers by signed ones."""
         weights, concentration, dim, drop_dim, dim_edges, by_amplitude = settings
         space = weights.ravel()
@@ -138,7 +138,7 @@ def _filter_of(stride: int) -> Any:
             size = np.sqrt(a * a + b * b) if by_amplitude else total[p2 + x]
             filtered[0, x] = a
             filtered[1, x] = b
-            # nothing is kept where the whole window is saturated
+            # nothing is kept if the whole window is saturated
             filtered[2, x] = size / max(total[p3 + x], SMALLEST)
             edge[x] = HALF * total[p4 + x]
 
@@ -149,9 +149,9 @@ _filter_row, _filter_frames = _filter_of(STRIDE), _filter_of(LANES)
 
 
 class FilterSettings(NamedTuple):
-    """Settings of the joint bilateral filter, float32 in its kernels: ``space`` (k, k), weights by distance. A centre
-    not brighter than ``dim`` takes all by distance alone; before a brighter one neighbours below ``dim`` are dropped
-    where ``drop_dim``, and count in the edge sum where ``dim_edges``. ``by_amplitude``: phasors count by it too."""
+    """Settings of the joint bilateral filter, float32 in its kernels. ``space`` (k, k): weights by distance. A centre
+    not brighter than ``dim`` weights all neighbours by distance alone; if ``drop_dim``, a brighter one drops neighbours
+    below ``dim``, which count in the edge sum if ``dim_edges``. ``by_amplitude``: phasors also count by amplitude."""
 
     space: np.ndarray
     concentration: Any
@@ -182,7 +182,7 @@ def filter_image(unit, amplitude, settings, filtered, edge):  # type: ignore[no-
             im = re + STRIDE
             amp = im + STRIDE
             if 0 <= y + dy < h:
-                # to the left and right of the picture stand the zeros and ``OUTSIDE`` of the start
+                # beside the picture, the initial zeros and ``OUTSIDE`` remain
                 rows[re : re + w] = unit[0, y + dy]
                 rows[im : im + w] = unit[1, y + dy]
                 rows[amp : amp + w] = amplitude[y + dy]
@@ -194,8 +194,8 @@ def filter_image(unit, amplitude, settings, filtered, edge):  # type: ignore[no-
 
 @numba.njit(**FAST)
 def filter_listed(planes, window, settings, filtered, edge):  # type: ignore[no-untyped-def]
-    """Filter listed pixels as `filter_image` does: ``planes`` (g, f, 3 lanes) of `noisy_phasors`, ``window`` (m, k)
-    places among them, -1 for none. Writes ``filtered`` (f, 3, m, lanes) and ``edge`` (f, m, lanes)."""
+    """Filter listed pixels as `filter_image` does. ``planes`` (g, f, 3 lanes): from `noisy_phasors`. ``window`` (m, k):
+    indices into them, -1 for none. Writes ``filtered`` (f, 3, m, lanes) and ``edge`` (f, m, lanes)."""
     n_frequencies, _, m, _ = filtered.shape
     flat = planes.reshape(planes.size)
     k = window.shape[1]

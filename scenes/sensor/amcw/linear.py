@@ -1,11 +1,11 @@
-"""The engine's filter to first order in the noise: each pixel's mean, and how far noise moves it.
+"""The engine's filter to first order in the noise: the mean of each pixel, and its change by noise.
 
-Before the filter noise turns a pixel's phasor and changes its amplitude (`Light`). The filtered phasor S is a sum over
-the window of s F(t), F = exp(i t - c (1 - cos t)), t = the neighbour's phase less its own. Noise of a neighbour turns t
-by a normal of variance v, so F acts as F + v F''/2 in the mean and, to first order, by its derivative F' + v F'''/2
-(Stein: E[f(x) x] = E[f'(x)] E[x^2]). The centre's noise is in all differences: over it the mean is taken last, of arg
-S, by three nodes. On a face of phase noise s the centre's own noise so counts more than by its weight, by some c s^2 of
-the window's sum, and a neighbour's less by c s^2. Terms of second and third order are left out and estimated."""
+Before the filter, noise turns a pixel's phasor and changes its amplitude (`Light`). The filtered phasor S is a sum over
+the window of s F(t), F = exp(i t - c (1 - cos t)), t = the neighbour's phase minus its own. Noise of a neighbour turns
+t by a normal of variance v, so F acts as F + v F''/2 in the mean and, to first order, by its derivative F' + v F'''/2
+(Stein: E[f(x) x] = E[f'(x)] E[x^2]). The centre's noise is in all differences; the mean over it is taken last, of arg
+S, by three nodes. On a face with phase noise s, the centre's own noise counts for more than its weight, by some c s^2
+of the window's sum, and a neighbour's for less by c s^2. Terms of second and third order are estimated."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from scenes.sensor.normals import FAST
 if TYPE_CHECKING:
     from scenes.sensor.amcw.imager import AmcwExposure
 
-DEVIATIONS = 4.5  # distance from a limit at which it is taken never to be met: 3e-6 a frame of pixels just so far off
-NOISY = 0.35  # phase noise in radians above which a pixel's phase is no longer a normal about its mean
-LITTLE = 0.004  # c s^2 below which (c s^2)^2 does not matter (phase noise of 0.033 rad): half the work
+DEVIATIONS = 4.5  # a limit so far away counts as never met: 3e-6 a frame for pixels just that far off
+NOISY = 0.35  # phase noise in radians above which a pixel's phase is not a normal about its mean
+LITTLE = 0.004  # c s^2 below which (c s^2)^2 is negligible (phase noise of 0.033 rad); this halves the work
 SMALLEST = 1e-12
 
 
 class Light(NamedTuple):
-    """Each pixel before the filter, all (f, n) float64: ``phasor`` of length 1; ``amplitude`` without noise,
-    ``bright``: with it; ``turn``: deviation of the phase in radians; ``swell``: of the amplitude, over it."""
+    """Each pixel before the filter, all (f, n) float64. ``phasor``: of length 1. ``amplitude``: without noise;
+    ``bright``: with it. ``turn``: deviation of the phase in radians. ``swell``: that of the amplitude, over it."""
 
     phasor: np.ndarray
     amplitude: np.ndarray
@@ -39,9 +39,9 @@ class Light(NamedTuple):
 
 
 class Near(NamedTuple):
-    """A pixel's window, (k,) each: ``at``: flat indices; ``between``: exp(i t) of their phases less its own;
-    ``weight`` in the filter, without noise; ``slopes`` and ``bends``: room for derivatives. ``kept`` and ``others``:
-    places of the neighbours that count, with the centre and without it; ``c``: the concentration that holds here."""
+    """A pixel's window, (k,) each. ``at``: flat indices. ``between``: exp(i t) of their phases minus its own.
+    ``weight``: in the filter, without noise. ``slopes``, ``bends``: room for derivatives. ``kept``, ``others``: indices
+    of the neighbours that count, with and without the centre. ``c``: the concentration that holds here."""
 
     space: np.ndarray
     at: np.ndarray
@@ -57,9 +57,9 @@ class Near(NamedTuple):
 class Filtered(NamedTuple):
     """Each pixel after the filter, (f, n) float64: mean ``phasor`` (complex, length 1) and ``amplitude``; ``turned``
     and ``spread``: deviations of the phase in radians and of the amplitude. ``left_out``: share of the phase's variance
-    that is not of first order; infinite where neighbours are too noisy, or may or may not count. ``edge``,
-    ``edge_spread``: mean and deviation of the sum over neighbours of (1 - cos)/2, infinite where unknown.
-    ``edge_least``: what the mean is at least, and ``edge_loose``, a bound of its deviation then: right at any noise."""
+    that is not of first order; infinite if neighbours are too noisy, or if it is uncertain whether they count.
+    ``edge``, ``edge_spread``: mean and deviation of the sum over neighbours of (1 - cos)/2, infinite if unknown.
+    ``edge_least``: a lower bound of that mean, and ``edge_loose``, a bound of its deviation: they hold at any noise."""
 
     phasor: np.ndarray
     amplitude: np.ndarray
@@ -79,7 +79,7 @@ def unknown_filtered(frequencies: int, n: int) -> Filtered:
 
 
 def light_of_samples(exposure: AmcwExposure, knee: float, gains: np.ndarray) -> Light:
-    """Return the light of an exposure: each sample has its own variance and step^2/12 of the converter's rounding."""
+    """Return the light of an exposure. Each sample has its own variance, plus step^2/12 by the converter's rounding."""
     frequencies, phases, n = exposure.means.shape
     angle = 2 * np.pi * np.arange(phases) / phases
     phasor = np.empty((frequencies, n), complex)
@@ -87,7 +87,7 @@ def light_of_samples(exposure: AmcwExposure, knee: float, gains: np.ndarray) -> 
     _moments(exposure.means, exposure.sigma, knee, np.cos(angle), np.sin(angle), phasor, size, across, along)
     scale = gains.astype(float)[:, None] * 2.0 / phases
     bright = np.sqrt(size**2 + across**2)
-    # the mean length of a vector plus normals of one deviation in both directions (Rice)
+    # the mean length of a vector plus normals of equal deviation in both directions (Rice)
     near = size < 10 * along
     deviation = np.sqrt((across[near] ** 2 + along[near] ** 2) / 2)
     x = (size[near] / np.maximum(deviation, SMALLEST)) ** 2 / 4
@@ -109,11 +109,11 @@ def _moments(means, sigma, knee, cosines, sines, phasor, size, across, along):  
             if length > SMALLEST:
                 re /= length
                 im /= length
-            else:  # no light has no direction: any will do
+            else:  # without light there is no direction: any will do
                 re, im, length = 1.0, 0.0, SMALLEST
             over, beside = 0.0, 0.0
             for k in range(phases):
-                # the companding converter's step at a sample of so many knees
+                # the companding converter's step at a sample, in knees
                 knees, step = abs(means[f, k, i]) / knee, 1.0
                 while 2.0 * step <= knees:
                     step *= 2.0
@@ -135,8 +135,8 @@ def linearised(
     lost: np.ndarray,
     out: Filtered,
 ) -> np.ndarray:
-    """Fill ``out`` at the ``pixels`` (m,) of a view of ``shape``; return (f, m, k): by how many radians one deviation
-    of each neighbour's noise moves a pixel's phase. ``window``: the filter, in float64. ``wild`` and ``lost`` (n,)
+    """Fill ``out`` at the ``pixels`` (m,) of a view of ``shape``. Return (f, m, k): the change of a pixel's phase, in
+    radians, by one deviation of each neighbour's noise. ``window``: the filter, in float64. ``wild`` and ``lost`` (n,)
     bool: pixels whose samples may saturate, and those where they always do."""
     moved = np.zeros((len(light.turn), len(pixels), window.space.size))
     for f, plane in enumerate(moved):
@@ -147,7 +147,7 @@ def linearised(
 
 @numba.njit(**FAST)
 def _linearise(pixels, light, window, shape, wild, lost, out, moved):  # type: ignore[no-untyped-def]
-    """`linearised` for one frequency: all without their first axis."""
+    """Do the work of `linearised` for one frequency; arrays have no first axis."""
     k, space = window.space.size, window.space.ravel()
     (at, kept, others), weight, between = np.empty((3, k), np.int64), np.empty(k), np.empty(k, np.complex128)
     room = Near(space, at, between, weight, np.empty_like(between), np.empty_like(between), kept, others, 0.0)
@@ -170,7 +170,7 @@ def _linearise(pixels, light, window, shape, wild, lost, out, moved):  # type: i
 
 @numba.njit(**FAST)
 def _look_around(i, light, window, shape, wild, lost, near):  # type: ignore[no-untyped-def]
-    """Return the window, whether it is sure which neighbours count, and whether it is sure if the centre is bright."""
+    """Return the window, and whether it is certain which neighbours count and if the centre is bright."""
     h, w = shape
     side = window.space.shape[0]
     half = side // 2
@@ -206,8 +206,8 @@ def _look_around(i, light, window, shape, wild, lost, near):  # type: ignore[no-
 
 @numba.njit(**FAST)
 def _edge_of(i, light, window, near, out):  # type: ignore[no-untyped-def]
-    """Write the edge sum's mean, deviation and bounds; return whether the window is too noisy for the former, and
-    whether they are right: it is sure which neighbours are counted, and those are not too noisy."""
+    """Write the edge sum's mean, deviation and bounds. Return whether the window is too noisy for mean and deviation,
+    and whether they are right: it is certain which neighbours count, and these are not too noisy."""
     own = light.turn[i]
     noisy = own > NOISY
     mean, variance, sines, cosines = 0.0, 0.0, 0.0, 0.0
@@ -233,11 +233,11 @@ def _edge_of(i, light, window, near, out):  # type: ignore[no-untyped-def]
         variance += (0.25 * between.real) ** 2 * (2.0 * turn * turn * (turn * turn + 2.0 * own * own))
         # a phase's mean resultant length is concave in 1 / turn, so its slope at 0, sqrt(pi / 8), bounds it
         longest += between * min(1.0, 0.6267 / max(turn, 1e-9))
-        # of any phase (1 - cos)/2 scatters no wider than that of an even one, 1/8; of a known one by half its noise
+        # (1 - cos)/2 of any phase scatters no more than that of a uniform one, 1/8; of a known phase, by half its noise
         loose += min(0.125, 0.25 * turn * turn) if turn < NOISY else 0.125
     out.edge[i] = mean
     out.edge_spread[i] = np.sqrt(variance + (sines * own) ** 2 + 2.0 * (cosines * own * own) ** 2)
-    # the centre's own noise turns it at most as far as that, and where it is large anywhere
+    # the centre's own noise turns it at most that far or, where that is large, to any angle
     away = max(abs(np.angle(longest)) - DEVIATIONS * own, 0.0) if own < NOISY else 0.0
     out.edge_least[i] = 0.5 * (counted - abs(longest) * np.cos(away))
     out.edge_loose[i] = np.sqrt(loose)
@@ -246,7 +246,7 @@ def _edge_of(i, light, window, near, out):  # type: ignore[no-untyped-def]
 
 @numba.njit(**FAST)
 def _amplitude_of(i, light, by_amplitude, near, out):  # type: ignore[no-untyped-def]
-    """Write the filtered amplitude and its deviation, and the filtered phasor where noise leaves the phases alone."""
+    """Write the filtered amplitude and its deviation, and the filtered phasor if noise leaves the phases unchanged."""
     total, c = 0.0j, near.c
     weights, amplitudes, spread = 0.0, 0.0, 0.0
     for q in near.kept:
@@ -256,13 +256,13 @@ def _amplitude_of(i, light, by_amplitude, near, out):  # type: ignore[no-untyped
         mean = near.weight[q] * (1.0 + 0.5 * min(variance, 0.25) * curved)
         weights += mean
         amplitudes += mean * light.bright[j]
-        # noise across makes a phasor longer by what it takes of its mean
+        # noise across lengthens a phasor by what it takes from its mean
         total += mean * light.amplitude[j] * between
         spread += (mean * light.amplitude[j] * light.swell[j]) ** 2
     weights = max(weights, SMALLEST)
     out.amplitude[i] = (abs(total) if by_amplitude else amplitudes) / weights
     out.phasor[i] = total * light.phasor[i] / max(abs(total), SMALLEST)
-    # noise of phases changes weights, and how phasors add up: its variance, times the weights' sum squared
+    # noise of phases changes weights and how phasors add up: its variance, times the squared sum of weights
     along = total.conjugate() / max(abs(total), SMALLEST)
     common = 0.0
     for q in near.others:
@@ -278,11 +278,11 @@ def _amplitude_of(i, light, by_amplitude, near, out):  # type: ignore[no-untyped
 
 @numba.njit(inline="always", **FAST)
 def _turned(c, between, v):  # type: ignore[no-untyped-def]
-    """Return F, F' and F'' at an angle whose exp(i t) is ``between``."""
+    """Return F, F' and F'' at the angle t whose exp(i t) is ``between``."""
     cosine = c * between.real
     sine = c * between.imag
     value = np.exp(cosine - c) * between
-    # of ln F: g, and its derivatives -cosine, sine, cosine, -sine
+    # derivatives of ln F: g, then -cosine, sine, cosine, -sine
     g = complex(-sine, 1.0)
     g2 = g * g
     second = g2 - cosine
@@ -299,7 +299,7 @@ def _turned(c, between, v):  # type: ignore[no-untyped-def]
 
 @numba.njit(**FAST)
 def _moves_of(i, light, by_amplitude, near, out, moved):  # type: ignore[no-untyped-def]
-    """Write the mean phasor, and into ``moved`` (k,) how far each neighbour's phase moves its."""
+    """Write the mean phasor, and into ``moved`` (k,) the change of its phase by each neighbour's phase."""
     own = light.turn[i]
     little = near.c * own * own < LITTLE
     far = own if little else np.sqrt(3.0) * own
@@ -312,7 +312,7 @@ def _moves_of(i, light, by_amplitude, near, out, moved):  # type: ignore[no-unty
         for q in near.kept:
             j, size = near.at[q], near.space[q]
             if by_amplitude:
-                # a phasor with noise across is longer: a cos t keeps its mean only with that
+                # a phasor with noise across is longer: only with that does a cos t keep its mean
                 size *= light.amplitude[j] * (1.0 + 0.5 * light.turn[j] ** 2)
             if j == i:
                 total += size
@@ -327,7 +327,7 @@ def _moves_of(i, light, by_amplitude, near, out, moved):  # type: ignore[no-unty
             step = near.slopes[q] * inverse * light.turn[near.at[q]]
             squares += step * step
         for q in near.others:
-            # E[d arg S], S and its derivative moving together: d^3 ln S has 2 S'^3 / S^3 and -3 S' S'' / S^2
+            # E[d arg S], with S and its derivative moving together: d^3 ln S has 2 S'^3 / S^3 and -3 S' S'' / S^2
             own_turn = light.turn[near.at[q]]
             slope = near.slopes[q] * inverse
             slope *= 1.0 + squares - near.bends[q] * inverse * own_turn**2
@@ -362,12 +362,12 @@ def _rest_of(i, light, by_amplitude, near, out, moved):  # type: ignore[no-untyp
             moved[q] = np.copysign(np.sqrt(moved[q] * moved[q] + swollen * swollen), moved[q])
         variance += moved[q] * moved[q]
     rest += 0.5 * bends * bends * own2 * own2
-    # what is of higher order hangs on the centre most, being in all differences
+    # terms of higher order depend most on the centre, which is in all differences
     centre2 = (1.0 - common) * (1.0 - common) * own2 + rest
     moved[near.at.size // 2] = np.sqrt(centre2)
     out.turned[i] = np.sqrt(variance + centre2)
     if by_amplitude:
-        # noise across a mean phasor makes it longer
+        # noise across a mean phasor lengthens it
         out.amplitude[i] *= 1.0 + 0.5 * (variance + centre2)
     out.left_out[i] = rest / max(variance + centre2, SMALLEST)
 

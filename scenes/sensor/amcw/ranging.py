@@ -27,10 +27,10 @@ EDGE, OUT_OF_RANGE = map(np.int32, (Reason.EDGE, Reason.OUT_OF_RANGE))
 
 class Gates(NamedTuple):
     """Limits of the engine, all float32; a gate that a camera lacks is infinite or 0. ``edge``: sum of (1 - cos
-    dphi)/2, in the mean of the frequencies where ``edge_mean`` is 1, else in any. Residual limit in turns:
-    ``residual``, or ``residual_scale`` A^``residual_slope`` of the greatest amplitude A within ``residual`` and
-    ``residual_most``. ``ratio``: (greatest - least) / greatest amplitude. ``least`` amplitude and ``total`` in units,
-    ``reflectivity`` in units m^2. Range counts along the optical axis where ``axial`` is 1, else along the ray."""
+    dphi)/2, in the mean of the frequencies if ``edge_mean`` is 1, else in any. Residual limit in turns: ``residual``,
+    or ``residual_scale`` A^``residual_slope`` of the greatest amplitude A, within ``residual`` and ``residual_most``.
+    ``ratio``: (greatest - least) / greatest amplitude. ``least`` amplitude and ``total`` in units, ``reflectivity`` in
+    units m^2. Range counts along the optical axis if ``axial`` is 1, else along the ray."""
 
     edge: np.float32
     edge_mean: np.float32
@@ -48,7 +48,7 @@ class Gates(NamedTuple):
 
 
 class FlyingGate(NamedTuple):
-    """`scenes.sensor.amcw.facts.FlyingPixelFacts` in metres and units, float32."""
+    """The settings of `scenes.sensor.amcw.facts.FlyingPixelFacts` in metres and units, float32."""
 
     relative_deviation: np.float32
     least_mean: np.float32
@@ -58,8 +58,8 @@ class FlyingGate(NamedTuple):
 
 
 class DepthEngine(NamedTuple):
-    """The gates and tables that are applied after the filter. ``geometry`` (3, n) of each pixel's unit ray u and the
-    emitter at e: u.e, e.e, u_z; ``outside_mask`` (n,) bool: pixels that the emitter's polygon leaves out."""
+    """The gates and tables that are applied after the filter. ``geometry`` (3, n), of each pixel's unit ray u and the
+    emitter at e: u.e, e.e, u_z. ``outside_mask`` (n,) bool: pixels outside the emitter's polygon."""
 
     geometry: np.ndarray
     outside_mask: np.ndarray
@@ -101,7 +101,7 @@ def _add_scaled(scale: np.float32, plane: np.ndarray, total: np.ndarray) -> None
 @numba.njit(**FAST)
 def half_path(turn: np.ndarray, n: int, lattice: UnwrapTable, half: np.ndarray, residual2: np.ndarray) -> None:
     """Convert wrapped phases (f, >= n) in turns, unwrapped in place, to half the light's path (n,) in metres, with the
-    squared lattice residual (n,) in turns^2, infinite where no wrap counts fit."""
+    squared lattice residual (n,) in turns^2, infinite if no wrap counts fit."""
     n_frequencies = turn.shape[0]
     key = np.zeros(n, np.int32)
     sums = np.empty(n, np.float32)
@@ -109,7 +109,7 @@ def half_path(turn: np.ndarray, n: int, lattice: UnwrapTable, half: np.ndarray, 
         sums[:] = f4(0)
         for f in range(n_frequencies):
             _add_scaled(lattice.combination[row, f], turn[f, :n], sums)
-        # one more whole number of the key of each pixel, -1 where it names no entry of the table
+        # another whole number of each pixel's key; -1 if the key is not in the table
         size, offset = lattice.sizes[row], lattice.offset[row]
         for i in range(np.uint64(n)):
             digit = offset - np.int32(np.floor(sums[i] + HALF))
@@ -137,9 +137,9 @@ def half_path(turn: np.ndarray, n: int, lattice: UnwrapTable, half: np.ndarray, 
 
 
 class GateInputs(NamedTuple):
-    """Quantities of a pixel that the gates look at: amplitudes; the squared lattice residual, infinite where no wrap
-    counts fit; range, and what is limited, along the ray or the axis. Where noise leaves an interval, each gate gets
-    the worse (or better) end of it, hence ``greatest`` beside ``brightest`` and ``low`` beside ``high``."""
+    """Quantities of a pixel for the gates: amplitudes; the squared lattice residual, infinite if no wrap counts fit;
+    range, and the limited range, along ray or axis. If noise leaves an interval, each gate gets its worse (or better)
+    end; hence ``greatest`` beside ``brightest``, and ``low`` beside ``high``."""
 
     edge: Any
     least: Any
@@ -154,15 +154,15 @@ class GateInputs(NamedTuple):
 
 @numba.njit(inline="always", **FAST)
 def first_failed(gates, at):  # type: ignore[no-untyped-def]
-    """Return the code of the first gate that a pixel fails, VALID where it passes all: the engine's table of gates."""
+    """Return the code of the first gate that a pixel fails, or VALID: the engine's table of gates."""
     limit = gates.residual
     if gates.residual_slope != f4(0):
         by_amplitude = gates.residual_scale * np.exp(gates.residual_slope * np.log(at.brightest))
         limit = min(gates.residual_most, max(limit, np.float32(by_amplitude)))
-    # The first gate that fails names the reason, so gates are tried from the last to the first.
+    # the first gate that fails gives the reason, so gates are tried from the last to the first
     code = LOW_REFLECTIVITY if at.total * at.range_m * at.range_m < gates.reflectivity else VALID
     code = code if (at.low_m >= gates.nearest_m) & (at.high_m <= gates.farthest_m) else OUT_OF_RANGE
-    # an infinite residual says that no wrap counts fit: no gate may let it through
+    # an infinite residual means that no wrap counts fit: no gate may pass it
     code = code if (at.residual2 < INFINITE) & (at.residual2 <= limit * limit) else UNWRAP
     code = AMPLITUDE_RATIO if at.greatest - at.least > gates.ratio * at.greatest else code
     code = EDGE if at.edge >= gates.edge else code
@@ -185,7 +185,7 @@ def first_failed_each(gates, at):  # type: ignore[no-untyped-def]
 def ranges_of(
     filtered: np.ndarray, edge: np.ndarray, saturated: np.ndarray, engine: DepthEngine, errors_m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Convert filtered phasors (f, 3, n) and edge sums (f, n) to z in metres, of invalid pixels too, the first gate
+    """Convert filtered phasors (f, 3, n) and edge sums (f, n) to z in metres (of invalid pixels too), the first gate
     that each pixel fails, and the sum of amplitudes, (n,) each. ``errors_m`` (n,) is added to half the path."""
     n = len(errors_m)
     out = np.empty(n, f4), np.empty(n, np.uint8), np.empty(n, f4)
@@ -235,9 +235,9 @@ def _range_and_gates(  # type: ignore[no-untyped-def]
 
 @numba.njit(**FAST)
 def find_flying(z_m, total, reason, pixels, near, gate, flying):  # type: ignore[no-untyped-def]
-    """Find pixels between a nearer and a farther surface, on the finished image. ``z_m``, ``total`` and ``reason`` (m,
-    t): t frames of m pixels. ``pixels`` (p,): those in question; ``near`` (p, 9): their neighbours and themselves, -1
-    for none. Writes ``flying`` (p, t) bool. Neighbours whose phases fit a distance count, even out of range."""
+    """Find pixels between a nearer and a farther surface in the finished image. ``z_m``, ``total`` and ``reason`` (m,
+    t): t frames of m pixels. ``pixels`` (p,): those to check. ``near`` (p, 9): their neighbours and themselves, -1 for
+    none. Writes ``flying`` (p, t) bool. Neighbours whose phases fit a distance count, even out of range."""
     window = np.empty(9, np.float32)
     for p in range(pixels.size):
         i = pixels[p]
@@ -259,7 +259,7 @@ def find_flying(z_m, total, reason, pixels, near, gate, flying):  # type: ignore
             between = z - nearest > gate.near_m and farthest - z > gate.far_m
             if between and max(z - nearest, farthest - z) > gate.most_m:
                 sample = window[:size]
-                # amplitudes scatter by the gate's share of their mean
+                # amplitudes scatter by at least the gate's share of their mean
                 flying[p, t] = sample.std() >= gate.relative_deviation * max(sample.mean(), gate.least_mean)
 
 

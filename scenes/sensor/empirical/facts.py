@@ -1,4 +1,4 @@
-"""The numbers of an empirical camera, as its file holds them: statistics of a real unit's captures."""
+"""The numbers of an empirical camera, as in its file: statistics of a real unit's captures."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from harness.vocabulary.geometry import MM
 from scenes.optics import Optics
 from scenes.sensor.facts import CameraFacts, Fact, LimitFacts, NonNegative, Positive, PositiveEach, ShareEach, checked
 
-CARRIER_HZ = 1e6  # its phase tells a pixel's mean distance, without ambiguity up to 150 m; complex64 rounds by 2 um
-BLUR_REACH = 3.0  # deviations of the edge's kernel that a region needs as margin: 0.3 % of it lies beyond
+CARRIER_HZ = 1e6  # its phase gives a pixel's mean distance, unambiguous up to 150 m; complex64 rounds by 2 um
+BLUR_REACH = 3.0  # margin of a region in deviations of the edge's kernel: 0.3 % of the kernel lies beyond
 
-Taps = Fact[tuple[float, ...]]  # of a causal filter; their squares sum to 1
+Taps = Fact[tuple[float, ...]]  # taps of a causal filter; their squares sum to 1
 
 
 class SurfaceLightFacts(Config):
     """The recorded surface as a standard of brightness. ``amplitude_at_1m``: in the recording's units, facing the
-    camera; amplitudes fall with the square of the distance. ``albedo`` that the surface is taken to have."""
+    camera; amplitudes fall with the square of the distance. ``albedo``: assumed for that surface."""
 
     amplitude_at_1m: Positive
     albedo: Annotated[Fact[float], checked("above 0 and at most 1", lambda value: 0 < value <= 1)]
 
 
 class NoiseLawFacts(Config):
-    """Temporal noise of single pixels along the ray, before rounding. ``sigma_mm`` of the recorded surface, facing, at
-    each of ``range_mm``; logarithms are interpolated, beyond the ends the power ``range_exponent`` holds. A surface b
-    times as bright has b^-``brightness_exponent`` times as much. ``rows``, ``columns``: filters down and across."""
+    """Temporal noise of single pixels along the ray, before rounding. ``sigma_mm``: of the recorded surface, facing, at
+    each of ``range_mm``; logarithms are interpolated; beyond the ends the power ``range_exponent`` holds. A surface b
+    times as bright has b^-``brightness_exponent`` times the noise. ``rows``, ``columns``: filters down, across."""
 
     range_mm: PositiveEach
     sigma_mm: PositiveEach
@@ -49,15 +49,15 @@ class FilteredPatternFacts(Config):
 
 
 class DropoutFacts(Config):
-    """Chance of no return in a frame: ``share`` at each of ``amplitude``, interpolated over its logarithm."""
+    """Probability of no return in a frame: ``share`` at each of ``amplitude``, interpolated over its logarithm."""
 
     amplitude: PositiveEach
     share: ShareEach
 
 
 class EdgeKernelFacts(Config):
-    """Losses at steps of depth of ``least_step_mm`` or more between neighbours: no return within a band of ``gap_px``
-    across them. ``blur_px``: deviation of the Gaussian that depth is smoothed by everywhere."""
+    """Losses at steps of depth of ``least_step_mm`` or more between neighbours: no return in a band of ``gap_px``
+    across them. ``blur_px``: deviation of the Gaussian that smooths depth everywhere."""
 
     gap_px: Annotated[Fact[float], checked("from 0 to 100 pixels", lambda value: 0 <= value <= 100)]
     blur_px: Annotated[Fact[float], checked("from 0 to 30 pixels", lambda value: 0 <= value <= 30)]
@@ -65,7 +65,7 @@ class EdgeKernelFacts(Config):
 
 
 class EmpiricalCamera(CameraFacts):
-    """Any depth camera, described by statistics of its captures."""
+    """Any depth camera, described by the statistics of its captures."""
 
     kind: Literal["empirical"]
     light: SurfaceLightFacts
@@ -85,7 +85,7 @@ class EmpiricalCamera(CameraFacts):
 
     @cached_property
     def optics(self) -> Optics:
-        """Optics for the render: a source of light in the lens itself, without shadows; the margin of the edge."""
+        """Optics for the render: a light source in the lens, which casts no shadows; the margin of the edge kernel."""
         blur_px, half_gap_px = BLUR_REACH * self.edge.blur_px.value, self.edge.gap_px.value / 2
         return self.optics_with(
             emitter_m=np.zeros(3),

@@ -1,10 +1,10 @@
-"""Frames of an empirical camera: the ideal range of the view with the noise that a real unit's captures show.
+"""Frames of an empirical camera: the ideal range of the view, with the noise that a real unit's captures show.
 
 Modelled: noise that grows with range and darkness as measured, its correlation between neighbours, a fixed pattern with
 the measured spectrum, dropouts by amplitude, smoothed depth and missing pixels at steps, displacements of whole frames,
-drift, rounding. Not modelled by measurement: light that met more than one surface (the direct light alone counts),
-shadows of an emitter or of a second lens, texture that a stereo camera needs, noise shared by successive frames, and
-dropouts that come in clusters. The effects multipath, wiggling, ambient and saturation change nothing."""
+drift, rounding. Not modelled: light that met more than one surface (only direct light counts), shadows of an emitter or
+of a second lens, the texture that a stereo camera needs, noise shared by successive frames, and clustered dropouts. The
+effects multipath, wiggling, ambient and saturation change nothing."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ f4 = np.float32
 
 
 class IdealRange(NamedTuple):
-    """A view before noise, (h, w) each; ``amplitude`` in the recording's units, ``chance`` of no return in a frame."""
+    """A view without noise, (h, w) each. ``amplitude``: in the recording's units. ``chance``: that of no return."""
 
     range_m: np.ndarray
     sigma_m: np.ndarray
@@ -42,7 +42,7 @@ class EmpiricalImager(UnitModel[EmpiricalCamera]):
         self._filters = [np.asarray(taps.value, f4) for taps in (camera.noise.rows, camera.noise.columns)]
 
     def pattern_mm(self, rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
-        """Draw a pattern with the measured spectrum."""
+        """Draw a fixed pattern with the measured spectrum."""
         facts = self.camera.fixed_pattern
         taps = (np.asarray(each.value, f4) for each in (facts.rows, facts.columns))
         return filtered(rng.standard_normal(shape, dtype=f4), *taps) * facts.deviation_mm.value
@@ -55,7 +55,7 @@ class EmpiricalImager(UnitModel[EmpiricalCamera]):
         return np.asarray(MM * np.exp(logs) * beyond * brightness**-law.brightness_exponent.value)
 
     def expose(self, view: NoiseFreeView) -> IdealRange:
-        """Return the range, noise and chances of a view that covers this region."""
+        """Return range, noise and probabilities of no return of a view that covers this region."""
         camera, direct = self.camera, view.phasor_direct[0].astype(complex)
         light = np.abs(direct)
         lit = light > 0
@@ -74,8 +74,8 @@ class EmpiricalImager(UnitModel[EmpiricalCamera]):
         return IdealRange(*(each.astype(f4) for each in (range_m, sigma_m, amplitude, chance)))
 
     def _gap(self, range_m: np.ndarray) -> np.ndarray:
-        """Return the chance (h, w) that a step of depth takes a pixel's return; a share of a pixel is a chance. The gap
-        counts along the row or the column that crosses the step, so diagonal neighbours are none."""
+        """Return the probability (h, w) that a step of depth removes a pixel's return; a share of a pixel is a
+        probability. The gap counts along the row or column that crosses the step, not towards diagonal neighbours."""
         edge, beside = self.camera.edge, ndimage.generate_binary_structure(2, 1)
         far, near = (
             fold(np.where(np.isfinite(range_m), range_m, empty), footprint=beside)
@@ -90,7 +90,7 @@ class EmpiricalImager(UnitModel[EmpiricalCamera]):
         known, blur_px = np.isfinite(range_m), self.camera.edge.blur_px.value
         if blur_px == 0:
             return range_m
-        # of 1/z a plane is linear, so that only steps and curvature change
+        # a plane is linear in 1/z, so that only steps and curvature change
         weight = ndimage.gaussian_filter(known.astype(float), blur_px)
         inverse = ndimage.gaussian_filter(np.where(known, 1 / (range_m / self._stretch), 0.0), blur_px)
         with np.errstate(divide="ignore", invalid="ignore"):

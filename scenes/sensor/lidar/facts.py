@@ -1,4 +1,4 @@
-"""The numbers of a scanned lidar, as its file holds them."""
+"""The numbers of a scanned lidar, as in its file."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ from scenes.sensor.facts import (
     checked,
 )
 
-SMOOTHING_REACH = 2.5  # deviations at which the smoothing's weights end: 0.04 of the middle one
+SMOOTHING_REACH = 2.5  # deviations at which the smoothing's weights end: 0.04 of the central weight
 NS, MRAD, MW = 1e-9, 1e-3, 1e-3  # seconds in a nanosecond, radians in a milliradian, watts in a milliwatt
 
 
 class BeamFacts(Config):
-    """The beam at rest: round, Gaussian in angle. ``power_mw``: averaged over the code, to measure ambient light by."""
+    """The beam at rest: round, Gaussian in angle. ``power_mw``: mean over the code, a reference for ambient light."""
 
     fwhm_mrad: Annotated[Fact[float], checked("above 0 and at most 20 milliradians", lambda value: 0 < value <= 20)]
     power_mw: Positive
 
 
 class ScanFacts(Config):
-    """The raster: a column is one sweep, a point every ``point_ns``; ``sweep_jitter_mm``: error of a whole sweep."""
+    """The raster: a column is one sweep, a point every ``point_ns``. ``sweep_jitter_mm``: error of a whole sweep."""
 
     point_ns: Positive
     sweep_jitter_mm: NonNegative
 
 
 class CodeFacts(Config):
-    """The code and its correlation's pulse, taken as Gaussian. ``band_floor``: the spectrum ends at the last line above
-    this share of its greatest. ``integration_ns``: how much of the return makes one point."""
+    """The code, and its correlation's pulse, assumed Gaussian. ``band_floor``: the spectrum ends at the last line above
+    this share of its maximum. ``integration_ns``: duration of the return that makes one point."""
 
     period_ns: Positive
     correlation_fwhm_ns: Positive
@@ -52,9 +52,9 @@ class CodeFacts(Config):
 
 
 class LidarPhotonFacts(Config):
-    """The photon budget, in primary electrons, before the avalanche, of one point's integration. ``signal_electrons``:
+    """The photon budget in primary electrons, before the avalanche, of one point's integration. ``signal_electrons``:
     from albedo 1 facing the camera at 1 m on the axis. ``amplifier_electrons``: standard deviation. ``room_albedo``:
-    mean over the field, whose ambient light the detector sees. ``calibration_*``: published points to be fitted."""
+    mean over the field, whose ambient light the detector sees. ``calibration_*``: published points to fit."""
 
     signal_electrons: Positive
     excess_noise_factor: Annotated[Fact[float], checked("1 or more", lambda value: value >= 1)]
@@ -70,9 +70,9 @@ class LidarPhotonFacts(Config):
 
 
 class LidarEngineFacts(OutputFacts):
-    """Processing on the device. ``smoothing_px``: standard deviations of the Gaussian weights with which neighbours
-    are averaged along columns, then along rows; 0: not at all. ``agree_deviations``: by which a neighbour's half path
-    may differ. ``least_agreeing``: share of the weights that must agree. ``confidence_electrons``: least strength."""
+    """Processing on the device. ``smoothing_px``: standard deviations of the Gaussian weights of the average over
+    neighbours along columns, then along rows; 0: none. ``agree_deviations``: largest difference of a neighbour's half
+    path. ``least_agreeing``: share of the weights that must agree. ``confidence_electrons``: least strength."""
 
     smoothing_px: Annotated[Fact[tuple[float, float]], checked("from 0 to 6 pixels", lambda value: 0 <= value <= 6)]
     agree_deviations: Positive
@@ -81,7 +81,7 @@ class LidarEngineFacts(OutputFacts):
 
 
 class ScannedLidar(CameraFacts):
-    """A lidar that sends one beam per pixel, one after the other; pixels are directions at the transmitter."""
+    """A lidar that sends one beam per pixel, one after another; pixels are directions at the transmitter."""
 
     kind: Literal["scanned_lidar"]
     receiver: Annotated[ConeFacts, Field(description="the one detector, of the whole field, beside the transmitter")]
@@ -106,22 +106,23 @@ class ScannedLidar(CameraFacts):
 
     @property
     def period_s(self) -> float:
-        """The code's period."""
+        """Period of the code, seconds."""
         return self.code.period_ns.value * NS
 
     @property
     def unambiguous_m(self) -> float:
-        """Half the path of light in one period."""
+        """Half the path of light in one period, metres."""
         return SPEED_OF_LIGHT_AIR * self.period_s / 2
 
     @property
     def integration_points(self) -> float:
-        """Number of points' times that the integration of a point spans."""
+        """Number of points whose time the integration of one point covers."""
         return self.code.integration_ns.value / self.scan.point_ns.value
 
     @cached_property
     def weights(self) -> np.ndarray:
-        """(K,) the correlation pulse's spectrum on lines 1..K of the comb, 1 at frequency 0 (which is filtered out)."""
+        """Spectrum (K,) of the correlation's pulse on lines 1..K of the comb; 1 at frequency 0, which is filtered
+        out."""
         deviation_s = self.code.correlation_fwhm_ns.value * NS / FWHM_PER_DEVIATION
         last_hz = np.sqrt(-2 * np.log(self.code.band_floor.value)) / (2 * np.pi * deviation_s)
         lines = np.arange(1, int(last_hz * self.period_s) + 1)
@@ -129,27 +130,27 @@ class ScannedLidar(CameraFacts):
 
     @cached_property
     def bandwidth_rad_s(self) -> float:
-        """Root mean square angular frequency of the correlation pulse's spectrum."""
+        """Root mean square angular frequency of the correlation's pulse."""
         omega = 2 * np.pi * np.arange(1, len(self.weights) + 1) / self.period_s
         return float(np.sqrt((self.weights * omega**2).sum() / self.weights.sum()))
 
     @cached_property
     def field_sr(self) -> float:
-        """The field's solid angle as a flat aperture sees it: foreshortened by the cosine to the axis."""
+        """Solid angle of the field as a flat aperture sees it: foreshortened by the cosine to the axis."""
         lens = self.nominal_lens
         slopes = lens.region_slopes(lens.whole)
         return float((1 / (1 + (slopes**2).sum(axis=-1)) ** 2).sum() / (lens.fx * lens.fy))
 
     def ambient_electrons(self, irradiance_uw_cm2_nm: float) -> float:
-        """Return electrons of an integration from daylight or lamps of that irradiance on the whole field: the field's
-        solid angle sends a E / pi times it, the beam of power P from albedo 1 at 1 m P / pi."""
+        """Return the electrons of an integration from ambient light of that irradiance on the whole field. The field's
+        solid angle sends a E / pi times it; the beam of power P sends, from albedo 1 at 1 m, P / pi."""
         irradiance_w_m2 = irradiance_uw_cm2_nm * UW_CM2 * self.photons.band_nm.value
         by_beam = irradiance_w_m2 * self.photons.room_albedo.value * self.field_sr / (self.beam.power_mw.value * MW)
         return self.photons.signal_electrons.value * by_beam
 
     @cached_property
     def smoothing_taps(self) -> tuple[np.ndarray, np.ndarray]:
-        """(2 r + 1,) float32 weights of sum 1 along columns and along rows."""
+        """Return (2 r + 1,) float32 weights with sum 1, along columns and along rows."""
         found = []
         for deviation_px in self.engine.smoothing_px.value:
             reach = int(np.ceil(SMOOTHING_REACH * deviation_px))
@@ -159,7 +160,7 @@ class ScannedLidar(CameraFacts):
 
     @cached_property
     def optics(self) -> Optics:
-        """Optics for the render: pixels are beams from the origin, and the receiver stands where an emitter would."""
+        """Optics for the render: pixels are beams from the origin; the receiver takes the place of an emitter."""
         smoothed_px = max(len(taps) // 2 for taps in self.smoothing_taps)
         return self.optics_with(
             **self.receiver.optics(),

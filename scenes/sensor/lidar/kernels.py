@@ -1,8 +1,8 @@
-"""Compiled inner loops of the scanned lidar: peaks of the correlation, which peak wins, smoothing, gates. One core.
+"""Compiled inner loops of the scanned lidar: peaks of the correlation, choice of peak, smoothing, gates. One thread.
 
-A code of period T correlates to a pulse that repeats with T, so its spectrum stands on the lines k / T. The view's
-phasors on that comb are the spectrum H of all paths of light within a beam, hence with weights W of the pulse c(t) =
-sum_k W_k Re(H_k exp(-2 pi i k t / T)) / sum_k W_k, whose single return of light a is a pulse of height a."""
+A code of period T correlates to a pulse that repeats with T, so its spectrum is on the lines k / T. The view's phasors
+on that comb are the spectrum H of all light paths within a beam. With weights W, the correlation is c(t) = sum_k W_k
+Re(H_k exp(-2 pi i k t / T)) / sum_k W_k; a single return of light a is a pulse of height a."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ import numpy as np
 from harness.vocabulary.geometry import Reason
 from scenes.sensor.normals import FAST, IN_DOUBLE
 
-SAMPLES_PER_LINE = 4  # of the correlation in a period, per spectral line; two would just hold it, four miss no peak
-NEWTON_STEPS = 4  # from a sample's parabola: three converge to 1e-7 of a sample even where two pulses nearly part
-NO_PEAK = -1e9  # stand-in for the height of a peak that does not exist
+SAMPLES_PER_LINE = 4  # of the correlation per spectral line in a period; two just represent it, four miss no peak
+NEWTON_STEPS = 4  # from a sample's parabola: three converge to 1e-7 of a sample even where two pulses almost separate
+NO_PEAK = -1e9  # height of a peak that does not exist
 
 
 class Peaks(NamedTuple):
     """The two strongest peaks of correlations, the stronger first; all (2, ...) float64. ``delay``: in periods, 0..1.
-    ``height``: `NO_PEAK` where there is none. ``curvature``: minus the second derivative by angle 2 pi t / T."""
+    ``height``: `NO_PEAK` if there is none. ``curvature``: minus the second derivative by the angle 2 pi t / T."""
 
     delay: np.ndarray
     height: np.ndarray
@@ -45,7 +45,7 @@ def strongest_peaks(phasor: np.ndarray, weights: np.ndarray) -> Peaks:
 
 @numba.njit(**IN_DOUBLE)
 def _derivatives(spectrum: np.ndarray, angle: float) -> tuple[float, float, float]:
-    """Return the correlation with ``spectrum`` (2 K,) at an angle, its first and its second derivative by angle."""
+    """Return the correlation with ``spectrum`` (2 K,) at an angle, and its first and second derivative by the angle."""
     lines = spectrum.size // 2
     step_re, step_im = np.cos(angle), np.sin(angle)
     re, im = 1.0, 0.0
@@ -63,11 +63,11 @@ def _derivatives(spectrum: np.ndarray, angle: float) -> tuple[float, float, floa
 
 @numba.njit(**IN_DOUBLE)
 def _refined(spectrum: np.ndarray, start: float, spacing: float) -> tuple[float, float, float]:
-    """Return (angle, height, curvature) of the peak beside the sample at ``start``, within one sample of it."""
+    """Return (angle, height, curvature) of the peak next to the sample at ``start``, at most one sample away."""
     angle = start
     for _ in range(NEWTON_STEPS):
         _, slope, bend = _derivatives(spectrum, angle)
-        # where two pulses merge the curve may be hollow beside its peak: then climb by half a sample
+        # where two pulses merge, the curve may be convex beside its peak: climb by half a sample
         step = -slope / bend if bend < 0.0 else np.sign(slope) * 0.5 * spacing
         angle = min(max(angle + step, start - spacing), start + spacing)
     value, _, bend = _derivatives(spectrum, angle)
@@ -130,9 +130,9 @@ def correlate_along_columns(normals: np.ndarray, taps: np.ndarray) -> None:
 def stronger_peak(  # type: ignore[no-untyped-def]
     height, half_m, deviation_m, noise, normals, sweep_m, won_m, won_height, won_deviation_m
 ):
-    """Choose the higher of two peaks after noise, with the noise of its range. ``height``, ``half_m``, ``deviation_m``
-    (2, h, w) of the peaks; ``noise`` (h, w): deviation of a height; ``normals`` (3, h or more, w): of the heights and
-    of the winner's range; ``sweep_m`` (w,) added to a column. Writes into the last three, (h, w)."""
+    """Choose the higher of two peaks after noise is added, with the noise of its range. ``height``, ``half_m``,
+    ``deviation_m`` (2, h, w): of the peaks. ``noise`` (h, w): deviation of a height. ``normals`` (3, h or more, w): for
+    both heights and the winner's range. ``sweep_m`` (w,): added to each column. Writes into the last three, (h, w)."""
     h, w = noise.shape
     for v in range(h):
         for u in range(w):
@@ -150,10 +150,10 @@ def stronger_peak(  # type: ignore[no-untyped-def]
 def noise_peaks(  # type: ignore[no-untyped-def]
     weak, noise, averaged, uniforms, rate, bandwidth_m, unambiguous_m, won_m, won_height, won_deviation_m
 ):
-    """Let the highest maximum of the noise over one period win where it exceeds the return; flat indices ``weak``. A
-    level of x deviations is crossed upwards rate * exp(-x^2 / 2) times in a period (Rice); taken as Poisson, the
-    highest maximum has P(< x) = exp(-rate exp(-x^2 / 2)). ``averaged``: what the mean over neighbours leaves of the
-    noise before the peak is looked for. ``bandwidth_m``: deviation of half the path at one noise deviation."""
+    """Let the highest maximum of the noise over one period win where it exceeds the return, at flat indices ``weak``.
+    Noise crosses a level of x deviations upwards rate * exp(-x^2 / 2) times in a period (Rice); if Poisson, the highest
+    maximum has P(< x) = exp(-rate exp(-x^2 / 2)). ``averaged``: share of the noise that the mean over neighbours leaves
+    before the peak is found. ``bandwidth_m``: deviation of half the path at one noise deviation."""
     w = noise.shape[1]
     for i in range(weak.size):
         v, u = weak[i] // w, weak[i] % w
@@ -170,10 +170,10 @@ def noise_peaks(  # type: ignore[no-untyped-def]
 def smooth(  # type: ignore[no-untyped-def]
     half_m, share, height, gate_m, taps, along_rows, out_m, out_share, out_height
 ):
-    """Average with ``taps`` (2 r + 1,) the neighbours of a column, or of a row with ``along_rows``, that agree.
+    """Average the neighbours of a column (or of a row, with ``along_rows``) that agree, with ``taps`` (2 r + 1,).
     ``half_m``, ``share``, ``height`` (h + 2 p, w + 2 q), with a border of p and q at least r where the taps reach: half
-    path; weight of what agreed so far; strength. ``gate_m`` (h, w): how far a neighbour's half path may differ. Writes
-    the mean half path, the weight and the strength of those that agree, (h, w) each."""
+    path, weight of what has agreed so far, and strength. ``gate_m`` (h, w): largest difference of a neighbour's half
+    path. Writes the mean half path, the weight and the strength of those that agree, (h, w) each."""
     h, w = gate_m.shape
     p, q, r = (half_m.shape[0] - h) // 2, (half_m.shape[1] - w) // 2, taps.size // 2
     zero = np.float32(0)
@@ -200,10 +200,10 @@ def smooth(  # type: ignore[no-untyped-def]
 def gated(  # type: ignore[no-untyped-def]
     half_m, share, height, everyone, along_m, cosine, saturated, limits, error_m, z_m, reason, strength
 ):
-    """Turn smoothed half paths (h, w) into ranges; gates and rounding. ``share``, ``height``: weight and strength of
-    the neighbours that agree; ``everyone``: weight of all within the picture. Half the path s by a receiver at e gives
-    the range r = (4 s^2 - e.e) / (4 s - 2 u.e) along the unit ray u; ``along_m`` is u.e, ``cosine`` u_z. ``limits``:
-    e.e, least strength, least agreeing share, least and greatest range, step."""
+    """Convert smoothed half paths (h, w) to ranges, with gates and rounding. ``share``, ``height``: weight and strength
+    of the neighbours that agree. ``everyone``: weight of all within the picture. Half the path s with a receiver at e
+    gives the range r = (4 s^2 - e.e) / (4 s - 2 u.e) along the unit ray u; ``along_m`` is u.e, ``cosine`` u_z.
+    ``limits``: e.e, least strength, least agreeing share, least and greatest range, step."""
     h, w = cosine.shape
     e2, least, alike, nearest, farthest, step = limits
     for v in range(h):

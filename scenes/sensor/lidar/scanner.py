@@ -1,12 +1,12 @@
-"""The scanned lidar: the correlation's peaks in each beam to range, with a reason for each invalid pixel.
+"""The scanned lidar: converts the peaks of each beam's correlation to range, with a reason for each invalid pixel.
 
-Modelled: a beam per pixel whose light, by all its paths, meets one detector; the coded pulse's strongest peak; shot
-noise with the avalanche's excess, ambient light and the amplifier's noise on heights and places of peaks; maxima of the
-noise after an average over neighbours; integration over more than one point's time; an error that a sweep shares;
+Modelled: a beam per pixel whose light, over all paths, meets one detector; the strongest peak of the coded pulse; shot
+noise with the avalanche's excess, ambient light, and the amplifier's noise on height and position of peaks; maxima of
+the noise after an average over neighbours; integration over more than one point's time; an error that a sweep shares;
 ripples of a unit; smoothing among agreeing neighbours; confidence threshold, least range, saturation; the receiver
-beside the transmitter; rounding. Not modelled: wiggling and the edge gate (those effects change nothing), side lobes of
-the real code, the mirror's uneven speed and errors of direction, the beam's width changing with distance, drift over
-seconds, light of other lidars, motion, walk error with amplitude, and the vendor's own filters beyond these."""
+beside the transmitter; rounding. Not modelled: wiggling and the edge gate (these effects change nothing), side lobes of
+the real code, uneven speed and direction errors of the mirror, a beam width that changes with distance, drift over
+seconds, light of other lidars, motion, walk error with amplitude, and other filters of the vendor."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from scenes.sensor.normals import standard_normals
 from scenes.sensor.unit import DecodedFrame, UnitModel, light_of, rays_of, smooth_field
 
 f4 = np.float32
-BLOCK_ROWS = 16  # rows whose correlations are held at once: 16 rows of 1,024 pixels take 8 MB
-CERTAIN_DEVIATIONS = 10.0  # a return so far above the noise is never beaten by its maximum (chance below 1e-9)
-FACTOR_ROWS = 400  # of the matrix whose Cholesky factor ends in the taps of a moving sum, good to 0.3 %
+BLOCK_ROWS = 16  # rows whose correlations are held at once: 16 rows of 1,024 pixels need 8 MB
+CERTAIN_DEVIATIONS = 10.0  # noise never exceeds a return so far above it (probability below 1e-9)
+FACTOR_ROWS = 400  # rows of the matrix whose Cholesky factor ends in the taps of a moving sum, accurate to 0.3 %
 
 
 class LidarReturns(NamedTuple):
-    """Light that a view sends back before noise. The two strongest peaks, (2, h, w) float32: ``height`` (electrons),
+    """Light that a view sends back, without noise. The two strongest peaks, (2, h, w) float32: ``height`` (electrons),
     ``half_m`` (half the path, with the unit's errors), ``deviation_m`` of it. ``noise`` (h, w): deviation of a height,
-    electrons. ``saturated`` (h, w) bool. ``weak`` (m,): flat indices of pixels that a maximum of the noise may win."""
+    electrons. ``saturated`` (h, w) bool. ``weak`` (m,): flat indices of pixels where noise may win."""
 
     height: np.ndarray
     half_m: np.ndarray
@@ -51,13 +51,13 @@ class LidarScanner(UnitModel[ScannedLidar]):
         super().__init__(camera, config, region, slopes)
         # weights of the points along a column whose light one point integrates
         self.smear = smear_weights(camera.integration_points)
-        # a slope's error over the curvature is the place's error; the noise has the pulse's own spectrum
+        # the error of position is the slope's error over the curvature; the noise has the pulse's own spectrum
         self.slope = camera.bandwidth_rad_s * camera.period_s / (2 * np.pi)
-        # electrons of ambient light in one integration, the same in all pixels: one detector sees the whole field
+        # electrons of ambient light in one integration, equal for all pixels: one detector sees the whole field
         ambient = config.effects.ambient
         self.ambient_electrons = camera.ambient_electrons(config.ambient_uw_cm2_nm) if ambient else 0.0
         self._noise_taps = overlap_taps(camera.integration_points).astype(f4)
-        # (2, h, w): the receiver's offset along the ray in metres, the ray's cosine to the axis
+        # (2, h, w): the receiver's offset along the ray in metres, and the ray's cosine to the axis
         receiver_m, engine = camera.optics.emitter_m, camera.engine
         self._geometry = np.stack(rays_of(slopes, receiver_m)).astype(f4)
         least = receiver_m @ receiver_m, engine.confidence_electrons.value, engine.least_agreeing.value
@@ -71,13 +71,13 @@ class LidarScanner(UnitModel[ScannedLidar]):
 
     @cached_property
     def averaged(self) -> float:
-        """Share of the noise's deviation that the smoothing leaves where all neighbours agree."""
+        """Share of the noise's deviation that smoothing leaves if all neighbours agree."""
         along, across = self.camera.smoothing_taps
         return float(np.linalg.norm(np.convolve(along, self._noise_taps)) * np.linalg.norm(across))
 
     @cached_property
     def gathered(self) -> np.ndarray:
-        """(h, w): signal electrons of a point per unit of the view's light: the receiver's aperture is flat."""
+        """Signal electrons (h, w) of a point per unit of the view's light: the receiver's aperture is flat."""
         return np.asarray(self.camera.photons.signal_electrons.value / np.sqrt(1 + (self.slopes**2).sum(axis=-1)))
 
     def expose(self, view: NoiseFreeView) -> LidarReturns:
@@ -85,7 +85,7 @@ class LidarScanner(UnitModel[ScannedLidar]):
         effects, photons = self.config.effects, self.camera.photons
         phasor, intensity = light_of(view, effects)
         electrons = self.gathered * self._along_sweeps(intensity)
-        # the deviation of the correlation: sqrt(F (signal + ambient) + amplifier^2)
+        # deviation of the correlation: sqrt(F (signal + ambient) + amplifier^2)
         shot = photons.excess_noise_factor.value * (electrons + self.ambient_electrons)
         noise = np.sqrt(shot + photons.amplifier_electrons.value**2)
         height, half_m, deviation_m = self._peaks(phasor, noise)
@@ -104,7 +104,7 @@ class LidarScanner(UnitModel[ScannedLidar]):
         with np.errstate(divide="ignore", invalid="ignore"):
             metres_per_radian = camera.unambiguous_m / (2 * np.pi)
             deviation_m = metres_per_radian * self.slope * noise / (peaks.curvature * self.gathered)
-        # where two pulses are about to part the peak is flat; it still lies within their width
+        # where two pulses almost separate, the peak is flat; it still lies within their width
         width_m = camera.unambiguous_m * camera.code.correlation_fwhm_ns.value / camera.code.period_ns.value
         deviation_m = np.where(deviation_m >= 0, np.minimum(deviation_m, width_m), width_m)
         return peaks.height * self.gathered, peaks.delay * camera.unambiguous_m, deviation_m
@@ -133,7 +133,7 @@ class LidarScanner(UnitModel[ScannedLidar]):
             kernels.correlate_along_columns(normals, taps)
             sweep_m = standard_normals(rng, (w,)) * f4(camera.scan.sweep_jitter_mm.value * MM)
         kernels.stronger_peak(*exposure[:4], normals, sweep_m, *won)
-        # the Cramer-Rao bound of a delay in white noise through the matched filter, at a height of one noise deviation
+        # Cramer-Rao bound of a delay in white noise after the matched filter, at a height of one noise deviation
         bound_m = camera.unambiguous_m / (camera.period_s * camera.bandwidth_rad_s)
         rates = self.slope, bound_m, camera.unambiguous_m
         uniforms = rng.random((2, exposure.weak.size))
@@ -155,7 +155,7 @@ class LidarScanner(UnitModel[ScannedLidar]):
 
 
 def smear_weights(points: float) -> np.ndarray:
-    """Return weights, of sum 1, of points about one whose integration spans ``points``; light between is linear."""
+    """Return weights, with sum 1, of points around one whose integration covers ``points``; light between is linear."""
     reach = int(np.ceil(points / 2))
     hat, half = interpolate.BSpline.basis_element([-1, 0, 1]), points / 2
     weights = [hat.integrate(-half - k, half - k, extrapolate=False) for k in range(-reach, reach + 1)]
@@ -163,8 +163,8 @@ def smear_weights(points: float) -> np.ndarray:
 
 
 def overlap_taps(points: float) -> np.ndarray:
-    """Return taps, of sum of squares 1, of a moving sum of white noise that correlates as integrations over ``points``
-    points do, 1 - k / p at lag k: the last row of the Cholesky factor of its matrix (Bauer 1955)."""
+    """Return taps, with squares that sum to 1, of a moving sum of white noise that correlates like integrations over
+    ``points`` points, 1 - k / p at lag k: the last row of the Cholesky factor of its matrix (Bauer 1955)."""
     lags = np.arange(int(np.ceil(points)) if points > 1 else 1)
     correlation = np.zeros(FACTOR_ROWS)
     correlation[: len(lags)] = 1 - lags / max(points, 1.0)
