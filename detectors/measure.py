@@ -76,7 +76,8 @@ def extents(points_m: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def centres_of(points_m: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
-    """Return the centres (count, 3) by `extents` of the clusters of points (n, 3) that ``labels`` (n,) make."""
+    """Return the centres (count, 3) by `extents` of the clusters of points (n, 3) that ``labels`` (n,) make; -1: of
+    none."""
     return np.asarray(points_m[_extremes(points_m, labels, count)].mean(axis=1))
 
 
@@ -85,11 +86,10 @@ def _extremes(points: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
     """Return the numbers (count, 4) of the points with the least and greatest x, and the least and greatest y."""
     found = np.full((count, 4), -1)
     for i in range(len(labels)):
-        best = found[labels[i]]
-        for end in range(4):
-            sign = 1.0 if end % 2 else -1.0
-            if best[end] < 0 or sign * points[i, end // 2] > sign * points[best[end], end // 2]:
-                best[end] = i
+        for end in range(4 if labels[i] >= 0 else 0):
+            sign, best = 1.0 if end % 2 else -1.0, found[labels[i], end]
+            if best < 0 or sign * points[i, end // 2] > sign * points[best, end // 2]:
+                found[labels[i], end] = i
     return found
 
 
