@@ -111,13 +111,13 @@ def _painted(
 ) -> np.ndarray:
     half_u, half_v, layers = 0.5 * blur_u, 0.5 * blur_v, len(sights) * len(NODES)
     images, weights, chords = np.zeros((len(holes), h, w)), np.empty(layers), np.empty((2, layers, STRIPS))
-    # by strip the sum of its layers in a row of pixels from column ``left`` on, and its integral over the strips above
-    across, above = np.empty((STRIPS, w)), np.zeros((STRIPS + 1, w))
+    # in each column from ``left`` on, by strip: the sum of the layers, and its integral over the strips above
+    across, above = np.empty((w, STRIPS)), np.zeros((w, STRIPS + 1))
     left = width = 0
     for n in range(len(holes)):
         u, v, radius, depth, wall = holes[n, 0], holes[n, 1], holes[n, 2], holes[n, 3], holes[n, 4]
         height = radius * math.sqrt(metric[0, 0] / (metric[0, 0] * metric[1, 1] - metric[0, 1] ** 2))
-        # a hole that is only moved has the chords of the one before; moved along v, its rows of pixels too
+        # a hole that is only moved has the chords of the one before; moved along v, its columns of strips too
         is_moved = n > 0 and radius == holes[n - 1, 2] and depth == holes[n - 1, 3] and wall == holes[n - 1, 4]
         if not is_moved:
             _cut(radius, depth, wall, sights, metric, weights, chords)
@@ -131,17 +131,16 @@ def _painted(
             if last > first:
                 left = max(0, math.ceil(first - half_u))
                 width = max(min(w - 1, math.floor(last + half_u)) + 1 - left, 0)
-            for s in range(STRIPS):
-                for c in range(width):
-                    across[s, c] = 0.0
+            for c in range(width):
+                low, high, column = left + c - half_u - u, left + c + half_u - u, across[c]
+                for s in range(STRIPS):
+                    column[s] = 0.0
                 for k in range(layers):
-                    start, end, weight = u - left + chords[0, k, s], u - left + chords[1, k, s], weights[k]
-                    if end > start and weight != 0.0:
-                        for c in range(width):
-                            across[s, c] += weight * max(min(end, c + half_u) - max(start, c - half_u), 0.0)
-                thickness = height * (EDGES[s + 1] - EDGES[s])
-                for c in range(width):
-                    above[s + 1, c] = above[s, c] + thickness * across[s, c]
+                    starts, ends, weight = chords[0, k], chords[1, k], weights[k] / (blur_u * blur_v)
+                    for s in range(STRIPS):
+                        column[s] += weight * max(min(ends[s], high) - max(starts[s], low), 0.0)
+                for s in range(STRIPS):
+                    above[c, s + 1] = above[c, s] + height * (EDGES[s + 1] - EDGES[s]) * column[s]
         i = j = 0
         for r in range(max(0, math.ceil(v - height - half_v)), min(h - 1, math.floor(v + height + half_v)) + 1):
             top, bottom = max(r - half_v - v, -height), min(r + half_v - v, height)
@@ -151,8 +150,7 @@ def _painted(
                 j += 1
             top, bottom, row = top - height * EDGES[i], bottom - height * EDGES[j], images[n, r, left:]
             for c in range(width):
-                whole = above[j, c] + bottom * across[j, c] - above[i, c] - top * across[i, c]
-                row[c] = whole / (blur_u * blur_v)
+                row[c] = above[c, j] + bottom * across[c, j] - above[c, i] - top * across[c, i]
     return images
 
 
@@ -165,7 +163,8 @@ def _cut(  # type: ignore[no-untyped-def]
     g11, g12, g22 = metric[0, 0], metric[0, 1], metric[1, 1]
     # the mouth's height and half-width in px per metre of radius, and the drift of its chords along u by v
     height, width, slant = math.sqrt(g11 / (g11 * g22 - g12 * g12)), 1.0 / math.sqrt(g11), -g12 / g11
-    # three circles that a layer's light has passed, in px: shift along u and v, and half-height
+    per_height = 1.0 / height  # a division, which may fail, is no vector operation
+    # three circles that a layer's light has passed: shift along u and v, and radius
     shift_u, shift_v, size = np.empty(3), np.empty(3), np.empty(3)
     for k in range(len(weights)):
         place, node = sights[k // len(NODES)], k % len(NODES)
@@ -181,15 +180,16 @@ def _cut(  # type: ignore[no-untyped-def]
         shift_u[0], shift_v[0] = tube * place[1] * scale, tube * place[2] * scale
         shift_u[1], shift_v[1] = -lit * beam_u, -lit * beam_v
         shift_u[2], shift_v[2] = shift_u[0] - below * beam_u, shift_v[0] - below * beam_v
+        starts, ends = chords[0, k], chords[1, k]
         for s in range(STRIPS):
-            down, reach = radius * height * MIDDLES[s], radius * HALF_CHORDS[s] * width
-            start, end = slant * down - reach, slant * down + reach
-            for circle in range(3):
-                off = down - shift_v[circle]
+            drift, reach = slant * radius * height * MIDDLES[s], radius * HALF_CHORDS[s] * width
+            starts[s], ends[s] = drift - reach, drift + reach
+        for circle in range(3):
+            for s in range(STRIPS):
+                off = radius * height * MIDDLES[s] - shift_v[circle]
                 middle = shift_u[circle] + slant * off
-                half = width * math.sqrt(max(size[circle] ** 2 - (off / height) ** 2, 0.0))
-                start, end = max(start, middle - half), min(end, middle + half)
-            chords[0, k, s], chords[1, k, s] = start, end
+                half = width * math.sqrt(max(size[circle] ** 2 - (off * per_height) ** 2, 0.0))
+                starts[s], ends[s] = max(starts[s], middle - half), min(ends[s], middle + half)
 
 
 @dataclass(frozen=True)
