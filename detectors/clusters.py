@@ -7,10 +7,10 @@ from typing import Any
 
 import numba
 import numpy as np
-from scipy.spatial import cKDTree
 
 from harness.vocabulary.errors import UserError
 
+AXIS_BITS, NEAR_CELLS = 21, 2
 MAX_CELLS = 1 << 20  # cells along one axis that a 63-bit key of three axes can hold
 PLAIN: dict[str, Any] = {"cache": True, "nogil": True}
 
@@ -30,8 +30,8 @@ def nested_clusters(
     points_m: np.ndarray, scores: np.ndarray, distance_m: float, min_points: int, thresholds: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Label finite points (n, 3) as `euclidean_clusters` does, those with a score (n,) above each of ``thresholds``
-    (t,), which rise: (t, n) int64, -1 also for the others. And return (t, n) by label the lowest threshold at which its
-    cluster is no longer found, as parts of it that are large enough remain longest."""
+    (t,), which rise: (t, n) int64, -1 also for the others. And return by label, (t, m), the lowest threshold at which
+    its cluster is no longer found, as parts of it that are large enough remain longest."""
     if not len(points_m):
         return np.zeros((len(thresholds), 0), np.int64), np.zeros((len(thresholds), 0))
     # a little below distance / sqrt(3): rounding must not put two points of one cell beyond the distance
@@ -40,20 +40,15 @@ def nested_clusters(
         what = f"points spread over {np.ptp(points_m, axis=0).max():.3g} m cannot be clustered with a distance of"
         fix = "crop the cloud, check its unit, or choose a larger cluster distance"
         raise UserError(f"{what} {distance_m * 1e3:.3g} mm", fix=fix)
-    x, y, z = cells.astype(np.int64).T
+    # with a margin, so that the key of a neighbour is the sum of the keys of the cell and of the way to it
+    x, y, z = cells.astype(np.int64).T + NEAR_CELLS
     falling = np.argsort(-scores, kind="stable")
-    key = ((x << 42) | (y << 21) | z)[falling]
+    key = (((x << AXIS_BITS | y) << AXIS_BITS) | z)[falling]
     by_cell = np.argsort(key, kind="stable")
     starts = np.flatnonzero(np.diff(key[by_cell], prepend=-1))
     order = falling[by_cell]  # the points of a cell, one cell after another, the highest score first
-    near = cKDTree(cells[order[starts]]).query_pairs(2.5, p=np.inf, output_type="ndarray")
-    near = np.concatenate([near, near[:, ::-1]])
-    near = near[np.argsort(near[:, 0], kind="stable")]
-    ends = np.searchsorted(near[:, 0], np.arange(len(starts) + 1))
-    return _nested(
-        points_m, scores, falling, order, np.append(starts, len(order)), ends, near[:, 1].copy(), distance_m**2,
-        min_points, thresholds,
-    )  # fmt: skip
+    places = points_m, scores, falling, order, np.append(starts, len(order)), key[by_cell[starts]]
+    return _nested(*places, distance_m**2, min_points, thresholds)
 
 
 @numba.njit(**PLAIN)
@@ -67,16 +62,31 @@ def root_of(parent: np.ndarray, i: int) -> int:
 
 @numba.njit(**PLAIN)
 def _nested(  # type: ignore[no-untyped-def]
-    points, scores, falling, order, starts, ends, near, limit, least, thresholds
+    points, scores, falling, order, starts, keys, limit, least, thresholds
 ):
-    """`nested_clusters` of points of which each cell c holds those at ``order[starts[c]:starts[c + 1]]`` and is near to
-    the cells ``near[ends[c]:ends[c + 1]]``. ``limit``: the distance squared. ``falling``: the points by score."""
-    n = len(falling)
-    parent, sizes, held = np.arange(len(starts) - 1), np.zeros(len(starts) - 1, np.int64), np.zeros_like(starts)
-    completed, cell = np.full(len(parent), -np.inf), np.empty_like(falling)
-    labels, strengths = np.full((len(thresholds), n), -1, np.int64), np.zeros((len(thresholds), n))
-    for c in range(len(parent)):
-        cell[order[starts[c] : starts[c + 1]]] = c
+    """`nested_clusters` of points of which each cell c, with the ascending ``keys``, holds those at
+    ``order[starts[c]:starts[c + 1]]``. ``limit``: the distance squared. ``falling``: the points by score."""
+    n, cells, side = len(falling), len(keys), 2 * NEAR_CELLS + 1
+    parent, cell = np.arange(cells), np.empty(n, np.int64)
+    sizes, held = np.zeros(cells, np.int64), np.zeros(cells, np.int64)
+    completed, strengths = np.full(cells, -np.inf), np.zeros((len(thresholds), cells))
+    labels = np.full((len(thresholds), n), -1, np.int64)
+    # near to cell c are near[stops[c]:stops[c + 1]]: by each column of cells along z those from the first to the last
+    near, stops, count = np.empty(side**3 * cells, np.int32), np.zeros(cells + 1, np.int64), 0
+    first, end = np.zeros(side**2, np.int64), np.zeros(side**2, np.int64)
+    for c in range(cells):
+        for i in order[starts[c] : starts[c + 1]]:
+            cell[i] = c
+        for column in range(side**2):
+            key = keys[c] + ((((column // side - NEAR_CELLS) << AXIS_BITS) + column % side - NEAR_CELLS) << AXIS_BITS)
+            while first[column] < cells and keys[first[column]] < key - NEAR_CELLS:
+                first[column] += 1
+            while end[column] < cells and keys[end[column]] <= key + NEAR_CELLS:
+                end[column] += 1
+            for other in range(first[column], end[column]):
+                near[count] = other
+                count += 1
+        stops[c + 1] = count
     done = 0
     for level in range(len(thresholds) - 1, -1, -1):
         while done < n and scores[falling[done]] > thresholds[level]:
@@ -86,7 +96,8 @@ def _nested(  # type: ignore[no-untyped-def]
             root = root_of(parent, own)
             held[own] += 1
             sizes[root] += 1
-            for c in near[ends[own] : ends[own + 1]]:
+            for k in range(stops[own], stops[own + 1]):
+                c = near[k]
                 if held[c] and root_of(parent, c) != root and _touches(points, i, order, starts[c], held[c], limit):
                     other = root_of(parent, c)
                     parent[other] = root

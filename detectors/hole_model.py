@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-import scipy.linalg
 
 from detectors.clusters import PLAIN
 from detectors.whitening import correlated_products, noise_factor
@@ -27,6 +26,8 @@ NODES, WEIGHTS = np.array([0.5 - 0.15**0.5, 0.5, 0.5 + 0.15**0.5, 1.0]), np.arra
 """Gauss and Legendre's rule of three points on (0, 1), for the integral over the depth of the wall; and its end."""
 STEP = 1e-3
 """Size of differences that stand for derivatives: in pixels, relative for radius and depth, absolute for the wall."""
+MOVED, ROWS = np.array([1, 0, 2, 3, 4]), np.array([1, 0, 2, 3, 5])
+"""Numbers of a hole in the order in which pictures with one of them changed share most, and the derivatives' rows."""
 MOST_STEPS, TOLERANCE = 40, 1e-5  # limits of a descent: its steps, and the relative gain below which it ends
 DAMPING, LEAST_M, SMALLEST = 1e-3, 1e-9, 1e-18
 """Damping of the first step; deviation that is rounding of the arithmetic, and its square."""
@@ -108,52 +109,87 @@ def pictures(patch: HolePatch, holes: np.ndarray) -> np.ndarray:
 def _painted(
     holes: np.ndarray, sights: np.ndarray, metric: np.ndarray, blur_u: float, blur_v: float, h: int, w: int
 ) -> np.ndarray:
+    half_u, half_v, layers = 0.5 * blur_u, 0.5 * blur_v, len(sights) * len(NODES)
+    images, weights, chords = np.zeros((len(holes), h, w)), np.empty(layers), np.empty((2, layers, STRIPS))
+    # in each column from ``left`` on, by strip: the sum of the layers, and its integral over the strips above
+    across, above = np.empty((w, STRIPS)), np.zeros((w, STRIPS + 1))
+    left = width = 0
+    for n in range(len(holes)):
+        u, v, radius, depth, wall = holes[n, 0], holes[n, 1], holes[n, 2], holes[n, 3], holes[n, 4]
+        height = radius * math.sqrt(metric[0, 0] / (metric[0, 0] * metric[1, 1] - metric[0, 1] ** 2))
+        # a hole that is only moved has the chords of the one before; moved along v, its columns of strips too
+        is_moved = n > 0 and radius == holes[n - 1, 2] and depth == holes[n - 1, 3] and wall == holes[n - 1, 4]
+        if not is_moved:
+            _cut(radius, depth, wall, sights, metric, weights, chords)
+        if not is_moved or u != holes[n - 1, 0]:
+            first, last = np.inf, -np.inf
+            for k in range(layers):
+                for s in range(STRIPS):
+                    if chords[1, k, s] > chords[0, k, s]:
+                        first, last = min(first, u + chords[0, k, s]), max(last, u + chords[1, k, s])
+            left = width = 0
+            if last > first:
+                left = max(0, math.ceil(first - half_u))
+                width = max(min(w - 1, math.floor(last + half_u)) + 1 - left, 0)
+            for c in range(width):
+                low, high, column = left + c - half_u - u, left + c + half_u - u, across[c]
+                for s in range(STRIPS):
+                    column[s] = 0.0
+                for k in range(layers):
+                    starts, ends, weight = chords[0, k], chords[1, k], weights[k] / (blur_u * blur_v)
+                    for s in range(STRIPS):
+                        column[s] += weight * max(min(ends[s], high) - max(starts[s], low), 0.0)
+                for s in range(STRIPS):
+                    above[c, s + 1] = above[c, s] + height * (EDGES[s + 1] - EDGES[s]) * column[s]
+        i = j = 0
+        for r in range(max(0, math.ceil(v - height - half_v)), min(h - 1, math.floor(v + height + half_v)) + 1):
+            top, bottom = max(r - half_v - v, -height), min(r + half_v - v, height)
+            while i < STRIPS - 1 and height * EDGES[i + 1] < top:
+                i += 1
+            while j < STRIPS - 1 and height * EDGES[j + 1] < bottom:
+                j += 1
+            top, bottom, row = top - height * EDGES[i], bottom - height * EDGES[j], images[n, r, left:]
+            for c in range(width):
+                row[c] = above[c, j] + bottom * across[c, j] - above[c, i] - top * across[c, i]
+    return images
+
+
+@numba.njit(**PLAIN)
+def _cut(  # type: ignore[no-untyped-def]
+    radius, depth, wall, sights, metric, weights, chords
+):
+    """Fill in the ``weights`` (k,) of a hole's layers, and ``chords`` (2, k, s): start and end of each in each strip,
+    in pixels along u from the centre."""
     g11, g12, g22 = metric[0, 0], metric[0, 1], metric[1, 1]
     # the mouth's height and half-width in px per metre of radius, and the drift of its chords along u by v
     height, width, slant = math.sqrt(g11 / (g11 * g22 - g12 * g12)), 1.0 / math.sqrt(g11), -g12 / g11
-    half_u, half_v = 0.5 * blur_u, 0.5 * blur_v
-    images, across = np.zeros((len(holes), h, w)), np.zeros(w)
-    # of each layer its weight, and three circles that its light has passed: shift along u and v, and scale
-    layers, weights = np.empty((len(sights) * len(NODES), 3, 3)), np.empty(len(sights) * len(NODES))
-    for n in range(len(holes)):
-        u, v, radius, depth, wall = holes[n]
-        for k in range(len(weights)):
-            cosine, drift_u, drift_v, shrink, beam_u, beam_v, emitter, share = sights[k // len(NODES)]
-            node = k % len(NODES)
-            deepest = depth * cosine
-            length = wall * deepest if depth > 0 else 0.0
-            tube, is_wall = length * NODES[node], NODES[node] < 1.0
-            end = tube if is_wall else max(deepest, 0.0)
-            weights[k] = share / cosine * (length * WEIGHTS[node] if is_wall else deepest - length)
-            scale, lit = 1.0 / (1.0 + tube * shrink), end / (end + emitter)
-            below = (end - tube) / (end - tube + emitter)
-            shift_u, shift_v = tube * drift_u * scale, tube * drift_v * scale
-            layers[k, 0] = shift_u, shift_v, scale
-            layers[k, 1] = -lit * beam_u, -lit * beam_v, 1.0
-            layers[k, 2] = shift_u - below * beam_u, shift_v - below * beam_v, scale
+    per_height = 1.0 / height  # a division, which may fail, is no vector operation
+    # three circles that a layer's light has passed: shift along u and v, and radius
+    shift_u, shift_v, size = np.empty(3), np.empty(3), np.empty(3)
+    for k in range(len(weights)):
+        place, node = sights[k // len(NODES)], k % len(NODES)
+        cosine, beam_u, beam_v, emitter = place[0], place[4], place[5], place[6]
+        deepest = depth * cosine
+        length = wall * deepest if depth > 0 else 0.0
+        tube, is_wall = length * NODES[node], NODES[node] < 1.0
+        end = tube if is_wall else max(deepest, 0.0)
+        weights[k] = place[7] / cosine * (length * WEIGHTS[node] if is_wall else deepest - length)
+        scale, lit = 1.0 / (1.0 + tube * place[3]), end / (end + emitter)
+        below = (end - tube) / (end - tube + emitter)
+        size[0], size[1], size[2] = radius * scale, radius, radius * scale
+        shift_u[0], shift_v[0] = tube * place[1] * scale, tube * place[2] * scale
+        shift_u[1], shift_v[1] = -lit * beam_u, -lit * beam_v
+        shift_u[2], shift_v[2] = shift_u[0] - below * beam_u, shift_v[0] - below * beam_v
+        starts, ends = chords[0, k], chords[1, k]
         for s in range(STRIPS):
-            first, last = w, -1
-            bottom, top = v + radius * height * EDGES[s], v + radius * height * EDGES[s + 1]
-            down = radius * height * MIDDLES[s]
-            for k in range(len(weights)):
-                reach = radius * HALF_CHORDS[s] * width
-                start, end = slant * down - reach, slant * down + reach
-                for shift_u, shift_v, scale in layers[k]:
-                    middle = shift_u + slant * (down - shift_v)
-                    half = width * math.sqrt(max((radius * scale) ** 2 - ((down - shift_v) / height) ** 2, 0.0))
-                    start, end = max(start, middle - half), min(end, middle + half)
-                start, end = u + start, u + end
-                if end > start:
-                    left, right = max(0, math.ceil(start - half_u)), min(w - 1, math.floor(end + half_u))
-                    first, last = min(first, left), max(last, right)
-                    for c in range(left, right + 1):
-                        across[c] += weights[k] * max(min(end, c + half_u) - max(start, c - half_u), 0.0)
-            for r in range(max(0, math.ceil(bottom - half_v)), min(h - 1, math.floor(top + half_v)) + 1):
-                along = max(min(top, r + half_v) - max(bottom, r - half_v), 0.0) / (4.0 * half_u * half_v)
-                for c in range(first, last + 1):
-                    images[n, r, c] += along * across[c]
-            across[first : last + 1] = 0.0
-    return images
+            drift, reach = slant * radius * height * MIDDLES[s], radius * HALF_CHORDS[s] * width
+            starts[s], ends[s] = drift - reach, drift + reach
+        for circle in range(3):
+            for s in range(STRIPS):
+                off = radius * height * MIDDLES[s] - shift_v[circle]
+                middle = shift_u[circle] + slant * off
+                half = width * math.sqrt(max(size[circle] ** 2 - (off * per_height) ** 2, 0.0))
+                starts[s], ends[s] = max(starts[s], middle - half), min(ends[s], middle + half)
 
 
 @dataclass(frozen=True)
@@ -183,7 +219,10 @@ def fit_hole(patch: HolePatch, u: float, v: float, radius_m: float, depth_m: flo
     factor = noise_factor(used, patch.correlation, max(patch.noise_m, LEAST_M), error_m)
     weight = patch.prior_weight if factor is None else 1.0 / WALL_PRIOR[1]
     start = np.array([u, v, math.log(radius_m), depth_m * radius_m**2, offset_m, WALL_PRIOR[0]])
-    hole, offset, by, left, converged = _descent(patch, data, factor, weight, start)
+    upper = np.zeros((0, 0)) if factor is None else np.ascontiguousarray(factor.T)
+    optics = patch.sights, patch.metric_m2, *patch.blur_px, *used.shape
+    hole, offset, rows, converged = _descent(data, np.flatnonzero(used), upper, weight, start, *optics)
+    by, left = rows[:6], rows[6]
     u, v, radius, depth, wall = hole.tolist()
     square = float(left @ left)
     if factor is None:
@@ -197,67 +236,96 @@ def fit_hole(patch: HolePatch, u: float, v: float, radius_m: float, depth_m: flo
     return HoleFit(u, v, radius, depth, offset, wall, covariance, converged, math.sqrt(variance))
 
 
-def _descent(
-    patch: HolePatch, data: np.ndarray, factor: np.ndarray | None, weight: float, q: np.ndarray
-) -> tuple[np.ndarray, float, np.ndarray, np.ndarray, bool]:
-    """Return the best hole (5,), its offset, derivatives (6, n) of the used pixels by (u, v, radius, depth, offset,
-    wall), what is left of the ``data`` (n,), both whitened by the noise's ``factor`` (n, n) where there is any, and
-    whether the descent from ``q`` (6,) has converged. ``weight``: of the prior."""
-    h, w = patch.used.shape
+@numba.njit(**PLAIN)
+def _descent(  # type: ignore[no-untyped-def]
+    data, places, factor, weight, start, sights, metric, blur_u, blur_v, h, w
+):
+    """Return the best hole (5,), its offset, rows (7, n) and whether the descent from ``start`` (6,) has converged. The
+    rows are derivatives of the used pixels, at flat ``places`` (n,), by (u, v, radius, depth, offset, wall), and what
+    is left of their ``data`` (n,); whitened by the noise's ``factor`` (n, n), upper, where it is not empty. ``weight``:
+    of the prior."""
+    n, step, q, square, damping, converged = len(data), np.zeros(6), start, np.inf, 10.0 * DAMPING, False
+    rows, left, products, promised = np.empty((7, n)), np.empty((1, n)), np.empty((7, 7)), np.inf
+    best, holes, sizes = np.empty(5), np.empty((6, 5)), np.array([STEP, STEP, STEP, STEP, 1.0, STEP])
     # keeps a wild trial step finite: no disc is larger than ten patches
-    low = -10.0 * w, -10.0 * h, -20.0
-    high = 10.0 * w, 10.0 * h, math.log(10.0 * (h + w) * math.sqrt(patch.metric_m2.max()))
-    places = np.flatnonzero(patch.used)
-
-    def seen(holes: np.ndarray) -> np.ndarray:
-        return pictures(patch, holes).reshape(len(holes), -1).take(places, axis=1)
-
-    def left_by(q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-        """Return the hole (5,), its picture (n,), what it leaves of the data (n,), whitened, and of the prior."""
-        u, v, log_radius = (min(max(at, least), most) for at, least, most in zip(q.tolist(), low, high, strict=False))
-        radius = math.exp(log_radius)
-        hole = np.array([u, v, radius, q[3] / radius**2, math.sin(0.5 * math.pi * q[5]) ** 2])
-        (image,) = seen(hole[None])
-        return hole, image, _whitened(factor, image + (q[4] - data)), weight * (hole[4] - WALL_PRIOR[0])
-
-    def slopes_of(hole: np.ndarray, image: np.ndarray) -> np.ndarray:
-        depth = hole[3] if hole[3] != 0.0 else STEP
-        steps = STEP * np.array([1.0, 1.0, hole[2], depth, -1.0 if hole[4] >= 0.5 else 1.0])
-        slopes = np.ones((6, len(data)))  # the offset, the fifth, moves all pixels alike
-        slopes[[0, 1, 2, 3, 5]] = (seen(hole + np.diag(steps)) - image) / steps[:, None]
-        return _whitened(factor, slopes)
-
-    hole, image, left, prior = left_by(q)
-    square, damping, by, converged = left @ left + prior**2, DAMPING, slopes_of(hole, image), False
-    for _ in range(MOST_STEPS):
-        # derivatives by q from those by the hole's numbers
-        chain = np.eye(6)
-        chain[2, 2], chain[3, 2], chain[3, 3] = hole[2], -2.0 * hole[3], hole[2] ** -2
-        chain[5, 5] = 0.5 * math.pi * math.sin(math.pi * q[5])
-        information, pull = chain.T @ (by @ by.T) @ chain, chain.T @ (by @ left)
-        information[5, 5] += (weight * chain[5, 5]) ** 2
-        pull[5] += weight * chain[5, 5] * prior
-        information.flat[::7] = np.maximum(information.diagonal() * (1.0 + damping), SMALLEST)
-        step = np.linalg.solve(information, -pull)
-        new_hole, image, new_left, new_prior = left_by(q + step)
-        new_square, enough = new_left @ new_left + new_prior**2, TOLERANCE * square + SMALLEST
-        converged = bool(-(step @ pull) < enough or 0.0 <= square - new_square < enough)
-        if new_square < square:
-            q, hole, left, prior, square = q + step, new_hole, new_left, new_prior, new_square
-            by = slopes_of(hole, image)
-            damping *= 0.1
+    widest = math.log(10.0 * (h + w) * math.sqrt(max(metric[0, 0], metric[1, 1])))
+    for trial in range(MOST_STEPS + 1):
+        at = q + step
+        for k in range(6):
+            holes[k, 0], holes[k, 1] = min(max(at[0], -10.0 * w), 10.0 * w), min(max(at[1], -10.0 * h), 10.0 * h)
+            holes[k, 2] = math.exp(min(max(at[2], -20.0), widest))
+            holes[k, 3], holes[k, 4] = at[3] / holes[k, 2] ** 2, math.sin(0.5 * math.pi * at[5]) ** 2
+        image = _painted(holes[:1], sights, metric, blur_u, blur_v, h, w).reshape(1, h * w)
+        for i in range(n):
+            left[0, i] = image[0, places[i]] + at[4] - data[i]
+        _whiten(factor, left)
+        prior = weight * (holes[0, 4] - WALL_PRIOR[0])
+        new_square, enough = prior**2, TOLERANCE * square + SMALLEST
+        for i in range(n):
+            new_square += left[0, i] ** 2
+        converged = promised < enough or 0.0 <= square - new_square < enough
+        if trial == 0 or new_square < square:
+            q, square, damping = at, new_square, 0.1 * damping
+            for k in range(5):
+                best[k] = holes[0, k]
+            radius, depth, bend = best[2], best[3], 0.5 * math.pi * math.sin(math.pi * at[5])
+            sizes[2], sizes[3] = STEP * radius, STEP * (depth if depth != 0.0 else STEP)
+            sizes[5] = -STEP if best[4] >= 0.5 else STEP
+            for k in range(5):
+                holes[k + 1, MOVED[k]] += sizes[ROWS[k]]
+            images = _painted(holes, sights, metric, blur_u, blur_v, h, w).reshape(6, h * w)
+            for k in range(5):
+                for i in range(n):
+                    rows[ROWS[k], i] = (images[k + 1, places[i]] - images[0, places[i]]) / sizes[ROWS[k]]
+            for i in range(n):
+                rows[4, i], rows[6, i] = 1.0, left[0, i]
+            _whiten(factor, rows[:6])
+            products = np.dot(rows, rows.T)
+            # derivatives by q from those by the hole's numbers
+            for _ in range(2):
+                for j in range(7):
+                    products[j, 2] = radius * products[j, 2] - 2.0 * depth * products[j, 3]
+                    products[j, 3] /= radius**2
+                    products[j, 5] *= bend
+                products = products.T.copy()
+            products[5, 5] += (weight * bend) ** 2
+            products[5, 6] += weight * bend * prior
         else:
             damping *= 10.0
         if converged:
             break
-    return hole, float(q[4]), by, left, converged
+        step, promised = _damped(products, damping)
+    return best, q[4], rows, converged
 
 
-def _whitened(factor: np.ndarray | None, rows: np.ndarray) -> np.ndarray:
-    """Return the inverse of a lower factor (n, n) times each of the rows (n,) or (k, n); the rows without a factor."""
-    if factor is None:
-        return rows
-    return np.asarray(scipy.linalg.solve_triangular(factor, rows.T, lower=True, check_finite=False).T)
+@numba.njit(**PLAIN)
+def _whiten(upper: np.ndarray, rows: np.ndarray) -> None:
+    """Replace each of the rows (k, n) by the inverse of the transpose of an upper factor (n, n) times it, if any."""
+    for j in range(len(upper)):
+        for row in rows:
+            row[j] /= upper[j, j]
+            for i in range(j + 1, len(upper)):
+                row[i] -= row[j] * upper[j, i]
+
+
+@numba.njit(**PLAIN)
+def _damped(products, damping):  # type: ignore[no-untyped-def]
+    """Return the step (6,) of normal equations ``products`` (7, 7), right side last, and the gain that it promises."""
+    lower, step, promised = np.zeros((7, 6)), np.zeros(6), 0.0
+    for j in range(6):
+        for i in range(j, 7):
+            total = products[j, i] * (1.0 + damping if i == j else 1.0)
+            least = max(1e-14 * total, SMALLEST)
+            for k in range(j):
+                total -= lower[i, k] * lower[j, k]
+            lower[i, j] = math.sqrt(max(total, least)) if i == j else total / lower[j, j]
+    for j in range(5, -1, -1):
+        total = -lower[6, j]
+        for k in range(j + 1, 6):
+            total -= lower[k, j] * step[k]
+        step[j] = total / lower[j, j]
+        promised -= step[j] * products[j, 6]
+    return step, promised
 
 
 def sandwich_covariance(patch: HolePatch, by: np.ndarray, square_m2: float) -> np.ndarray:

@@ -13,12 +13,12 @@ def on_grid(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return image
 
 
-def holes_filled(mask: np.ndarray) -> np.ndarray:
-    """Return the mask with everything that it encloses."""
+def holes_filled(mask: np.ndarray, rim_px: int = 0) -> np.ndarray:
+    """Return the mask with everything that it encloses, and an empty rim of 0 or 1 pixels."""
     image = np.zeros((mask.shape[0] + 2, mask.shape[1] + 2), np.uint8)
     image[1:-1, 1:-1] = mask
     cv2.floodFill(image, None, (0, 0), 2)
-    return np.asarray(image[1:-1, 1:-1] != 2)
+    return np.asarray((image if rim_px else image[1:-1, 1:-1]) != 2)
 
 
 def notches_filled(mask: np.ndarray, radius_px: int) -> np.ndarray:

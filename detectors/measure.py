@@ -15,7 +15,7 @@ from detectors.clusters import PLAIN
 from detectors.hole_model import MOST_MISFIT, HoleFit, HolePatch, fit_hole, normal_of, pictures, sight, straight_sight
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.masks import grown, parts_with
-from detectors.noise import median_of, sigma_of
+from detectors.noise import median_of, quantile_of, sigma_of
 from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import MM, Cloud, Region, rotate_vectors
 
@@ -76,7 +76,8 @@ def extents(points_m: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def centres_of(points_m: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
-    """Return the centres (count, 3) by `extents` of the clusters of points (n, 3) that ``labels`` (n,) make."""
+    """Return the centres (count, 3) by `extents` of the clusters of points (n, 3) that ``labels`` (n,) make; -1: of
+    none."""
     return np.asarray(points_m[_extremes(points_m, labels, count)].mean(axis=1))
 
 
@@ -85,11 +86,10 @@ def _extremes(points: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
     """Return the numbers (count, 4) of the points with the least and greatest x, and the least and greatest y."""
     found = np.full((count, 4), -1)
     for i in range(len(labels)):
-        best = found[labels[i]]
-        for end in range(4):
-            sign = 1.0 if end % 2 else -1.0
-            if best[end] < 0 or sign * points[i, end // 2] > sign * points[best[end], end // 2]:
-                best[end] = i
+        for end in range(4 if labels[i] >= 0 else 0):
+            sign, best = 1.0 if end % 2 else -1.0, found[labels[i], end]
+            if best < 0 or sign * points[i, end // 2] > sign * points[best, end // 2]:
+                found[labels[i], end] = i
     return found
 
 
@@ -211,12 +211,12 @@ def _surroundings(
         return None
     centre, per_px = plane
     # what stands out without touching the detection is other damage, with the blur around it
-    stands_out = (np.abs(np.nan_to_num(residual - offset)) > OTHER_DAMAGE_SIGMAS * max(noise, 1e-9)) | own
+    stands_out = (np.abs(residual - offset) > OTHER_DAMAGE_SIGMAS * max(noise, 1e-9)) | own
     others = stands_out & ~parts_with(stands_out, own)
     used = finite & (own | ~grown(others, int(blur / 2)))
     deviations = residual[own] - offset
     sign = 1.0 if deviations.sum() >= 0 else -1.0
-    peak = max(float(np.quantile(sign * deviations, 0.9)), 1e-9)
+    peak = max(quantile_of(sign * deviations, 0.9), 1e-9)
     # from where the surface's point is seen: the camera, or all those that a map was made from
     emitter, views = np.array(config.emitter_mm) * MM, cloud.map_views
     if cloud.projection == "central":
@@ -242,19 +242,17 @@ def local_plane(
     of directions (in a parallel projection of x and y) and of the surface's z."""
     v0, u0 = (float(axis.mean()) for axis in np.nonzero(own))
     v, u = np.nonzero(finite)
-    design = np.column_stack([np.ones(len(u)), u - u0, v - v0])
-    seen = points[finite]
-    across = seen[:, :2] if projection == "parallel" else seen[:, :2] / seen[:, 2:]
+    design, (x, y, z) = np.stack([np.ones(len(u)), u - u0, v - v0]), points[finite].T
+    seen = np.stack([x, y, surface_z[finite]] if projection == "parallel" else [x / z, y / z, surface_z[finite]])
     try:
-        beta = np.linalg.solve(design.T @ design, design.T @ np.column_stack([across, surface_z[finite]]))
+        beta = np.linalg.solve(design @ design.T, design @ seen.T)
     except np.linalg.LinAlgError:
         return None
     if projection == "parallel":
         centre, per_px = beta[0], beta[1:]
     else:
-        slopes, z = np.append(beta[0, :2], 1.0), beta[0, 2]
-        centre = slopes * z
-        per_px = np.stack([np.append(beta[k, :2], 0.0) * z + slopes * beta[k, 2] for k in (1, 2)])
+        ray = np.array([*beta[0, :2], 1.0])
+        centre, per_px = ray * beta[0, 2], beta[1:] * [1.0, 1.0, 0.0] * beta[0, 2] + ray * beta[1:, 2:]
     if not np.linalg.norm(normal_of(per_px)) > 1e-12:
         return None
     return centre, per_px

@@ -30,6 +30,14 @@ def median_of(values: np.ndarray) -> float:
     return float(0.5 * (low + high))
 
 
+def quantile_of(values: np.ndarray, share: float) -> float:
+    """Return the value below which this share of finite values (n,) lies, n >= 1, interpolated linearly."""
+    place = share * (len(values) - 1)
+    low, high = int(place), min(int(place) + 1, len(values) - 1)
+    ordered = np.partition(values, (low, high))
+    return float(ordered[low] + (place - low) * (ordered[high] - ordered[low]))
+
+
 def sigma_of(values: np.ndarray) -> float:
     """Return the robust standard deviation of finite values (n,) about 0: the median size over 0.6745."""
     return median_of(np.abs(values)) / 0.6745

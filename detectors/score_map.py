@@ -57,9 +57,8 @@ class ScoreMapDetector(ABC, Generic[S]):
         points, scores = cloud.points_m.reshape(-1, 3)[pixels], evidence.score.reshape(-1)[pixels]
         found = []
         for labels, strengths in zip(*self._clusters(self.places(points), scores, thresholds), strict=True):
-            count, kept = int(labels.max(initial=-1)) + 1, labels >= 0
-            centres_m = centres_of(points[kept], labels[kept], count)
-            found.append(Findings(strengths[:count], pixels[kept], labels[kept], centres_m))
+            count = int(labels.max(initial=-1)) + 1
+            found.append(Findings(strengths[:count], pixels, labels, centres_of(points, labels, count)))
         return found
 
     def quiet_threshold(self, cloud: Cloud, evidence: Evidence) -> float:
@@ -96,7 +95,7 @@ class ScoreMapDetector(ABC, Generic[S]):
 @dataclass(frozen=True)
 class Findings:
     """Findings at one threshold: ``scores`` (k,), ``centres_m`` (k, 3), and the flat ``pixels`` (n,), ascending, with
-    the number (n,) of the finding of each."""
+    the number (n,) of the finding of each, -1 for none."""
 
     scores: np.ndarray
     pixels: np.ndarray
@@ -115,8 +114,11 @@ class Findings:
     def detections(self) -> tuple[Detection, ...]:
         """The findings as single detections, strongest first."""
         by_label = np.argsort(self.labels, kind="stable")
-        groups = np.split(self.pixels[by_label], np.cumsum(np.bincount(self.labels, minlength=len(self.scores)))[:-1])
-        found = (Detection(float(self.scores[k]), groups[k], self.centres_m[k]) for k in range(len(self.scores)))
+        _, *groups = np.split(
+            self.pixels[by_label], np.cumsum(np.bincount(self.labels + 1, minlength=len(self.scores) + 1))[:-1]
+        )
+        of_each = zip(self.scores.tolist(), groups, self.centres_m, strict=True)
+        found = (Detection(score, pixels, centre) for score, pixels, centre in of_each)
         return tuple(sorted(found, key=lambda detection: (-detection.score, int(detection.pixels[0]))))
 
 

@@ -7,9 +7,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
+import numba
 import numpy as np
 
+from detectors.clusters import PLAIN
 from detectors.masks import components, grown, holes_filled, nearest_pixel, parts_with, shrunk
+from detectors.noise import quantile_of
 from harness.vocabulary.geometry import MM, Cloud, Region
 
 MAX_SURFACE_TILT, STEP_SIGMAS = 6.0, 6.0
@@ -45,25 +48,24 @@ class Surfaces:
 
 def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces:
     """Find the smooth surfaces of an organised cloud by windows of about ``smooth_px``, wider in noise."""
-    points, seen = cloud.points_m, cloud.valid
+    points, seen = np.array(cloud.points_m, np.float64), cloud.valid
     valid = seen
     if seen.any() and not seen.all():
         apart, nearest = nearest_pixel(seen)
         valid = apart <= BRIDGED_PX
         gaps = valid & ~seen
-        points = points.copy()
-        points[gaps] = cloud.points_m.reshape(-1, 3)[nearest[gaps]]
+        points[gaps] = points.reshape(-1, 3)[nearest[gaps]]
     # the noise of a difference between neighbours, from the quieter quarter of the second differences of z along rows
     # (three quarters of the picture may be rubble), which have sqrt(6) of white noise's sigma; the first have sqrt(2)
     z = np.ascontiguousarray(cloud.points_m[..., 2])
     bends = np.abs(z[:, 2:] - 2.0 * z[:, 1:-1] + z[:, :-2])
     bends = bends[np.isfinite(bends)]
-    noise_m = float(np.quantile(bends, 0.25)) / 0.3186 * np.sqrt(2.0 / 6.0) if len(bends) else 0.0
+    noise_m = quantile_of(bends, 0.25) / 0.3186 * np.sqrt(2.0 / 6.0) if len(bends) else 0.0
     noise_m = max(noise_m, cloud.z_step_m * np.sqrt(2.0 / 12.0))
     # the distance of neighbours across the view at the nearest tenth of it
     steps = np.hypot(np.diff(points[::4, :, 0], axis=1), np.diff(points[::4, :, 1], axis=1))
     steps = steps[np.isfinite(steps) & (steps > 0)]
-    pitch_m = float(np.quantile(steps, 0.1)) if len(steps) else 0.0
+    pitch_m = quantile_of(steps, 0.1) if len(steps) else 0.0
     window, half = smooth_px, max(smooth_px // 2, 1)
     if pitch_m:
         # a central difference of the mean of n x n pixels has noise_m / (sqrt(2) n^1.5 pitch)
@@ -78,7 +80,7 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
     smooth = cv2.blur(np.where(valid[..., None], points, 0.0), size, borderType=cv2.BORDER_REFLECT)
     smooth = np.asarray(smooth / np.maximum(weight, 1e-12)[..., None])
     # whether the grid samples rays through the origin, as a camera does
-    central = cloud.projection == "central" and _before_lens(cloud.points_m[np.isfinite(z)])
+    central = cloud.projection == "central" and _before_lens(points)
     if noise_m <= pitch_m:
         right, down = links(points, MAX_SURFACE_TILT, STEP_SIGMAS * noise_m, central)
     else:
@@ -108,32 +110,60 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
 
 
 def _before_lens(points: np.ndarray) -> bool:
-    """Return whether all points (n, 3), one or more, may be seen by a camera in the origin."""
-    if not len(points) or not points[:, 2].min() > 0:
-        return False
-    return float(np.abs(points[:, :2] / points[:, 2:]).max()) < WIDEST_SLOPE
+    """Return whether there are finite points (..., 3), and a camera in the origin may see all of them."""
+    x, y, z = np.moveaxis(points, -1, 0)
+    beyond = (z <= 0) | (np.maximum(np.abs(x), np.abs(y)) >= WIDEST_SLOPE * z)
+    return bool(np.isfinite(z).any() and not beyond.any())
 
 
+@numba.njit(**PLAIN)
 def links(points_m: np.ndarray, tilt: float, noise_m: float, central: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return whether each of the pixels (h, w, 3) lies on one surface with its right (h, w) and its lower neighbour (h,
     w). ``central``: the way across is measured between the two rays at the nearer depth."""
-    (x, y, z), linked = np.ascontiguousarray(np.moveaxis(points_m, 2, 0)), np.zeros((2, *points_m.shape[:2]), bool)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        x, y = (x / z, y / z) if central else (x, y)
-        for found, axis, low, high in ((0, 1, np.s_[:, :-1], np.s_[:, 1:]), (1, 0, np.s_[:-1], np.s_[1:])):
-            near = np.minimum(z[low], z[high]) if central else 1.0
-            dx, dy = (np.diff(each, axis=axis) * near for each in (x, y))
-            linked[found][low] = np.abs(np.diff(z, axis=axis)) <= tilt * np.sqrt(dx * dx + dy * dy) + noise_m
+    h, w, _ = points_m.shape
+    linked = np.zeros((2, h, w), np.bool_)
+    for v in range(h):
+        for u in range(w):
+            for way in range(2):
+                row, column = v + way, u + 1 - way
+                if row < h and column < w:
+                    x, y, z = points_m[v, u, 0], points_m[v, u, 1], points_m[v, u, 2]
+                    other_x, other_y, other_z = (
+                        points_m[row, column, 0],
+                        points_m[row, column, 1],
+                        points_m[row, column, 2],
+                    )
+                    near = 1.0
+                    if central:
+                        near, x, y, other_x, other_y = (
+                            min(z, other_z),
+                            x / z,
+                            y / z,
+                            other_x / other_z,
+                            other_y / other_z,
+                        )
+                    dx, dy = (other_x - x) * near, (other_y - y) * near
+                    linked[way, v, u] = abs(other_z - z) <= tilt * math.sqrt(dx * dx + dy * dy) + noise_m
     return linked[0], linked[1]
 
 
+@numba.njit(**PLAIN)
 def unit_normals(surface_m: np.ndarray) -> np.ndarray:
     """Return the normals (h, w, 3) of a surface's points (h, w, 3), by central differences; 0 where it has no area."""
-    if min(surface_m.shape[:2]) < 2:
-        return np.zeros(surface_m.shape)
-    (dx, dy, dz), (ax, ay, az) = (np.gradient(np.moveaxis(surface_m, 2, 0).copy(), axis=axis) for axis in (1, 2))
-    normals = np.stack([ay * dz - az * dy, az * dx - ax * dz, ax * dy - ay * dx], axis=-1)
-    return np.asarray(normals / np.maximum(np.sqrt(np.einsum("ijk,ijk->ij", normals, normals)), 1e-15)[..., None])
+    h, w, _ = surface_m.shape
+    normals, along, down = np.zeros((h, w, 3)), np.empty(3), np.empty(3)
+    for v in range(h):
+        above, below = max(v - 1, 0), min(v + 1, h - 1)
+        for u in range(w):
+            left, right = max(u - 1, 0), min(u + 1, w - 1)
+            for k in range(3):
+                along[k] = (surface_m[v, right, k] - surface_m[v, left, k]) / max(right - left, 1)
+                down[k] = (surface_m[below, u, k] - surface_m[above, u, k]) / max(below - above, 1)
+            x, y = along[1] * down[2] - along[2] * down[1], along[2] * down[0] - along[0] * down[2]
+            z = along[0] * down[1] - along[1] * down[0]
+            length = max(math.sqrt(x * x + y * y + z * z), 1e-15)
+            normals[v, u, 0], normals[v, u, 1], normals[v, u, 2] = x / length, y / length, z / length
+    return normals
 
 
 def turns(normals: np.ndarray, half: int, least_cosine: float) -> np.ndarray:
@@ -158,9 +188,14 @@ class _Smooth(NamedTuple):
     def misses_m(self, pixels: np.ndarray, seeds: np.ndarray) -> np.ndarray:
         """Return the distances in depth (n,) of the points at ``pixels`` from the planes at ``seeds``."""
         points, normals = self.points_m[pixels], self.normals[seeds]
-        height = ((self.means_m[seeds] - points) * normals).sum(axis=1)
+        height = _products(self.means_m[seeds] - points, normals)
         way = points / points[:, 2:] if self.central else np.array([[0.0, 0.0, 1.0]])
-        return np.abs(height) / np.maximum(np.abs((normals * way).sum(axis=1)), 1e-3)
+        return np.abs(height) / np.maximum(np.abs(_products(normals, way)), 1e-3)
+
+
+def _products(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the scalar products (n,) of vectors (n, 3)."""
+    return np.asarray(np.einsum("ij,ij->i", a, b))
 
 
 def _keep_large(cores: np.ndarray, sizes: np.ndarray, window: int) -> int:
@@ -170,7 +205,7 @@ def _keep_large(cores: np.ndarray, sizes: np.ndarray, window: int) -> int:
     for number in range(1, min(large, 4 * MOST_SURFACES) + 1):
         core = cores == number
         u, v, width, height = cv2.boundingRect(core.view(np.uint8))
-        whole = np.pad(holes_filled(core[v : v + height, u : u + width]), 1)
+        whole = holes_filled(core[v : v + height, u : u + width], rim_px=1)
         if np.count_nonzero(shrunk(whole, window)) >= WIDE_PART * np.count_nonzero(whole):
             kept.append(number)
     if not kept and len(sizes):
@@ -192,7 +227,7 @@ def _joined(own: np.ndarray, cores: np.ndarray, smooth: _Smooth, apart_m: float,
                 continue
             seeds = [nearest_pixel(cores == number + 1)[1].reshape(-1)[pixels] for number in (i, j)]
             misses = np.maximum(*(smooth.misses_m(pixels, each) for each in seeds))
-            cosines = (smooth.normals[seeds[0]] * smooth.normals[seeds[1]]).sum(axis=1)
+            cosines = _products(smooth.normals[seeds[0]], smooth.normals[seeds[1]])
             if np.median(misses) <= apart_m and np.median(cosines) >= math.cos(turn):
                 stays[stays == stays[j]] = stays[i]
     kept = np.unique(stays)
@@ -225,27 +260,39 @@ def _trim_rims(
     points, means, normals, _ = smooth
     for number in range(len(own)):
         # the picture's edge is a rim too: what is cut off there may be a strip of background
-        whole = np.pad(holes_filled(own[number] & valid), 1)
+        whole = holes_filled(own[number] & valid, rim_px=1)
         rim = own[number] & ~shrunk(whole, 2 * reach + 1)[1:-1, 1:-1]
         inner = shrunk(whole, 2 * reach + window)[1:-1, 1:-1] & shrunk(cores == number + 1, window)
         if not inner.any():
             continue
         apart, nearest = nearest_pixel(inner)
         pixels = np.flatnonzero(rim & (apart <= 3 * reach))
-        seeds = nearest.reshape(-1)[pixels]
-        way = points[pixels] - means[seeds]
-        off, distance = np.abs((way * normals[seeds]).sum(axis=1)), np.linalg.norm(way, axis=1)
-        # the bend of the surface over as many pixels inwards, radians per metre
-        start = np.stack(np.unravel_index(seeds, valid.shape), axis=1)
-        inwards = start - np.stack(np.unravel_index(pixels, valid.shape), axis=1)
-        step = inwards * (reach / np.maximum(np.hypot(*inwards.T), 1.0))[:, None]
-        end = np.ravel_multi_index(np.rint(start + step).astype(np.intp).T, valid.shape, mode="clip")
-        cosine = np.clip((normals[seeds] * normals[end]).sum(axis=1), 0.0, 1.0)
-        bend = np.arccos(cosine) / np.maximum(np.linalg.norm(means[seeds] - means[end], axis=1), 1e-9)
-        turn = np.minimum(math.radians(RIM_TURN_DEG) + bend * distance / 2.0, np.pi / 2)
-        leaves = (off > apart_m) & (off > np.sin(turn) * distance)
+        leaves = _leaves(pixels, nearest.reshape(-1)[pixels], points, means, normals, *valid.shape, reach, apart_m)
         own[number].reshape(-1)[pixels[leaves]] = False
         own[number] = parts_with(own[number], inner, connectivity=4)
+
+
+@numba.njit(**PLAIN)
+def _leaves(pixels, seeds, points, means, normals, h, w, reach, apart_m):  # type: ignore[no-untyped-def]
+    """Return whether each of the pixels (n,) leaves the surface at its seed (n,) farther inside."""
+    found = np.zeros(len(pixels), np.bool_)
+    for i in range(len(pixels)):
+        pixel, seed = pixels[i], seeds[i]
+        row, column = seed // w, seed % w
+        down, across = row - pixel // w, column - pixel % w
+        step = reach / max(math.sqrt(down**2 + across**2), 1.0)
+        # the bend of the surface over as many pixels inwards, radians per metre
+        end = min(max(round(row + down * step), 0), h - 1) * w + min(max(round(column + across * step), 0), w - 1)
+        off = distance = cosine = span = 0.0
+        for k in range(3):
+            off += (points[pixel, k] - means[seed, k]) * normals[seed, k]
+            distance += (points[pixel, k] - means[seed, k]) ** 2
+            cosine += normals[seed, k] * normals[end, k]
+            span += (means[seed, k] - means[end, k]) ** 2
+        bend = math.acos(min(max(cosine, 0.0), 1.0)) / max(math.sqrt(span), 1e-9)
+        turn = min(math.radians(RIM_TURN_DEG) + bend * math.sqrt(distance) / 2.0, math.pi / 2.0)
+        found[i] = abs(off) > max(apart_m, math.sin(turn) * math.sqrt(distance))
+    return found
 
 
 def raster(points: np.ndarray, cloud: Cloud) -> tuple[Cloud, np.ndarray, np.ndarray, float]:

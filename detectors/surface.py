@@ -14,11 +14,12 @@ from typing import Annotated, Literal, Self
 
 import numba
 import numpy as np
-from numpy.polynomial.chebyshev import chebvander
 from pydantic import Field, model_validator
-from scipy.linalg import cho_solve, eigh
+from scipy.linalg import eigh
+from scipy.linalg.lapack import dpotrf, dpotrs
 
 from detectors.clusters import PLAIN
+from detectors.noise import median_of
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.meshes import FILES, FileUnit, FrontAxis
@@ -87,14 +88,20 @@ class Chebyshev:
 
     def _orders(self, xy_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return T_0, T_1, ... (d + 1, n) of u and of v at places (n, 2)."""
-        columns = zip(np.asarray(xy_m, np.float64).T, self.middle_m, self.half_m, strict=True)
-        u, v = (chebvander((x - middle) / half, int(self.powers.max())).T for x, middle, half in columns)
-        return u, v
+        found = np.ones((2, max(int(self.powers.max()), 1) + 1, len(xy_m)))
+        for orders, x, middle, half in zip(found, xy_m.T, self.middle_m, self.half_m, strict=True):
+            orders[1] = (x - middle) / half
+            twice = 2.0 * orders[1]
+            for order in range(2, len(orders)):
+                orders[order] = twice * orders[order - 1] - orders[order - 2]
+        return found[0], found[1]
 
     def basis(self, xy_m: np.ndarray) -> np.ndarray:
         """Return the products (p, n) at places (n, 2)."""
-        u, v = self._orders(xy_m)
-        return np.stack([u[a] * v[b] for a, b in self.powers])
+        (u, v), products = self._orders(xy_m), np.empty((len(self.powers), len(xy_m)))
+        for product, (a, b) in zip(products, self.powers, strict=True):
+            np.multiply(u[a], v[b], out=product)
+        return products
 
     def summed(self, coefficients: np.ndarray, xy_m: np.ndarray) -> np.ndarray:
         """Return the products' sum (n,) by coefficients (p,)."""
@@ -139,7 +146,7 @@ def fit_surface(x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray, config: Surfa
     xy = np.column_stack([x_m, y_m]).astype(np.float64)
     chebyshev = Chebyshev.over(xy, config.degree, not config.drop_cross_terms)
     basis = chebyshev.basis(xy)
-    middle = float(np.median(z_m[:: max(1, len(z_m) // SAMPLE_POINTS)]))
+    middle = median_of(z_m[:: max(1, len(z_m) // SAMPLE_POINTS)])
     z = np.asarray(z_m, dtype=np.float64) - middle
     plain = _solved(basis, z) if config.method == "least_squares" else _solved(*_thinned(basis, z, SAMPLE_POINTS))
     if plain is None:
@@ -163,17 +170,14 @@ def _solved(basis: np.ndarray, z: np.ndarray, weight: np.ndarray | None = None) 
     """Return the weighted least-squares solution (p,) of a basis (p, n) and Cholesky's factor (p, p), or None."""
     weighted = basis if weight is None else basis * weight
     factor = _factor(weighted @ basis.T)
-    return None if factor is None else (cho_solve((factor, True), weighted @ z, check_finite=False), factor)
+    return None if factor is None else (dpotrs(factor, weighted @ z, lower=True)[0], factor)
 
 
 def _factor(gram: np.ndarray) -> np.ndarray | None:
     """Return Cholesky's factor, lower; None where the matrix is singular to working precision."""
-    try:
-        factor = np.linalg.cholesky(gram)
-    except np.linalg.LinAlgError:
-        return None
+    factor, failed = dpotrf(gram, lower=True)
     size = factor.diagonal()
-    return factor if size.min() > 1e-7 * size.max() else None
+    return None if failed or not size.min() > 1e-7 * size.max() else factor
 
 
 def _thinned(basis: np.ndarray, z: np.ndarray, points: int) -> tuple[np.ndarray, np.ndarray]:
@@ -194,7 +198,7 @@ def _lar(basis: np.ndarray, z: np.ndarray, start: np.ndarray, knees: np.ndarray 
         # 5 standard errors of the thinned L1 solution, in units of the median |r|
         margin = 5.0 * 1.25 / 0.6745 * np.sqrt(len(basis) / len(few_z))
     r = z - c @ basis
-    scale = max(float(np.median(np.abs(r[:: max(1, len(r) // SAMPLE_POINTS)]))), TINY_M)
+    scale = max(median_of(np.abs(r[:: max(1, len(r) // SAMPLE_POINTS)])), TINY_M)
     for knee in scale * knees:
         enough = 0.001 * GAP_CONVERGED * float(np.abs(r).sum())
         reach = max(margin * scale, 10.0 * knee)
@@ -258,7 +262,7 @@ def _smoothed_descent(
     for _ in range(LAR_STEPS):
         factor, moved = _factor(inside), None
         if factor is not None:
-            way = knee * cho_solve((factor, True), pull, check_finite=False)
+            way = knee * dpotrs(factor, pull, lower=True)[0]
             if way @ pull < enough:
                 return c
             moved = lower(way)

@@ -48,7 +48,7 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
         mask = crop(cloud, self.settings.crop)
         if self.settings.surface.shape != "polynomial":
             return self._before_background(cloud, mask)
-        x, y, z = np.ascontiguousarray(cloud.points_m[mask].T)
+        x, y, z = (cloud.points_m[..., axis][mask] for axis in range(3))
         surface = fit_surface(x, y, z, self.settings.surface)
         fitted = surface.evaluate(x, y)
         residual = z - fitted

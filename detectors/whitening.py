@@ -312,7 +312,11 @@ def noise_factor(
 
 def correlated_products(columns: np.ndarray, across: int, down: int) -> np.ndarray:
     """Return S' S (p, p) with S the columns (p, h, w), zero outside, summed over ``down`` x ``across`` windows."""
-    padded = np.pad(np.moveaxis(columns, 0, -1), ((down - 1, down - 1), (across - 1, across - 1), (0, 0)))
-    summed = cv2.boxFilter(padded, -1, (across, down), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    flat = summed.reshape(-1, len(columns))
-    return np.asarray(flat.T @ flat)
+    count, h, w = columns.shape
+    padded = np.zeros((count, h + down - 1, w + across - 1))
+    padded[:, :h, :w] = columns
+    # windows end at their pixel
+    window = {"ksize": (across, down), "anchor": (across - 1, down - 1), "normalize": False}
+    summed = [cv2.boxFilter(one, -1, borderType=cv2.BORDER_CONSTANT, **window) for one in padded]
+    flat = np.array(summed).reshape(count, -1)
+    return np.asarray(flat @ flat.T)

@@ -144,9 +144,9 @@ def matched_places(
         if overlap is None:
             matches.append((closest_pairs(near, radius_m), 0))
             continue
-        sizes = np.bincount(found.labels, minlength=count)
-        on = [np.bincount(found.labels[area[found.pixels]], minlength=count) for area in areas]
-        lies = np.array(on).reshape(len(areas), count) >= overlap * sizes
+        masks = (np.ones(len(found.labels), bool), *(area[found.pixels] for area in areas))
+        sizes = np.array([np.bincount(found.labels[mask] + 1, minlength=count + 1)[1:] for mask in masks])
+        lies = sizes[1:] >= overlap * sizes[0]
         pairs = closest_pairs(np.where(lies, np.fmin(near, radius_m), near), radius_m)
         matches.append((pairs, len(set(np.flatnonzero(lies.any(axis=0)).tolist()) - set(pairs.values()))))
     return matches
