@@ -315,8 +315,7 @@ def correlated_products(columns: np.ndarray, across: int, down: int) -> np.ndarr
     count, h, w = columns.shape
     padded = np.zeros((count, h + down - 1, w + across - 1))
     padded[:, :h, :w] = columns
-    # windows end at their pixel
-    window = {"ksize": (across, down), "anchor": (across - 1, down - 1), "normalize": False}
-    summed = [cv2.boxFilter(one, -1, borderType=cv2.BORDER_CONSTANT, **window) for one in padded]
+    size, last, border = (across, down), (across - 1, down - 1), cv2.BORDER_CONSTANT  # windows end at their pixel
+    summed = [cv2.boxFilter(one, -1, size, anchor=last, normalize=False, borderType=border) for one in padded]
     flat = np.array(summed).reshape(count, -1)
     return np.asarray(flat @ flat.T)
