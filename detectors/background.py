@@ -233,9 +233,24 @@ def _group_medians(values: np.ndarray, group: np.ndarray, groups: int) -> tuple[
     for g in range(groups):
         if starts[g + 1] > starts[g]:
             some = held[starts[g] : starts[g + 1]]
-            medians[g] = np.median(some)
-            deviations[g] = np.median(np.abs(some - medians[g])) / 0.6745
+            medians[g] = _median(some)
+            deviations[g] = _median(np.abs(some - medians[g])) / 0.6745
     return medians, deviations
+
+
+@numba.njit(cache=True, nogil=True)
+def _median(values: np.ndarray) -> float:
+    """Return the median of values (n,), which it sorts (Shell 1959): numba's own takes 2 s longer to compile."""
+    gap = len(values) // 2
+    while gap > 0:
+        for i in range(gap, len(values)):
+            value, j = values[i], i
+            while j >= gap and values[j - gap] > value:
+                values[j] = values[j - gap]
+                j -= gap
+            values[j] = value
+        gap //= 2
+    return 0.5 * (values[(len(values) - 1) // 2] + values[len(values) // 2])
 
 
 def _cell_noise(image: np.ndarray) -> tuple[float, float]:

@@ -47,8 +47,11 @@ def nested_clusters(
     by_cell = np.argsort(key, kind="stable")
     starts = np.flatnonzero(np.diff(key[by_cell], prepend=-1))
     order = falling[by_cell]  # the points of a cell, one cell after another, the highest score first
-    places = points_m, scores, falling, order, np.append(starts, len(order)), key[by_cell[starts]]
-    return _nested(*places, distance_m**2, min_points, thresholds)
+    found = np.full((len(thresholds), len(falling)), -1, np.int64), np.zeros((len(thresholds), len(starts)))
+    near, ends = np.empty((2 * NEAR_CELLS + 1) ** 3 * len(starts), np.int64), np.append(starts, len(order))
+    places = points_m, scores, falling, order, ends, key[by_cell[starts]], near
+    _nested(*places, distance_m**2, min_points, thresholds, *found)
+    return found
 
 
 @numba.njit(**PLAIN)
@@ -62,28 +65,27 @@ def root_of(parent: np.ndarray, i: int) -> int:
 
 @numba.njit(**PLAIN)
 def _nested(  # type: ignore[no-untyped-def]
-    points, scores, falling, order, starts, keys, limit, least, thresholds
+    points, scores, falling, order, starts, keys, near, limit, least, thresholds, labels, strengths
 ):
-    """`nested_clusters` of points of which each cell c, with the ascending ``keys``, holds those at
+    """Fill in the results of `nested_clusters`, of points of which each cell c, by ascending ``keys``, holds those at
     ``order[starts[c]:starts[c + 1]]``. ``limit``: the distance squared. ``falling``: the points by score."""
     n, cells, side = len(falling), len(keys), 2 * NEAR_CELLS + 1
-    parent, cell = np.arange(cells), np.empty(n, np.int64)
-    sizes, held = np.zeros(cells, np.int64), np.zeros(cells, np.int64)
-    completed, strengths = np.full(cells, -np.inf), np.zeros((len(thresholds), cells))
-    labels = np.full((len(thresholds), n), -1, np.int64)
+    parent, sizes, held = np.zeros(cells, np.int64), np.zeros(cells, np.int64), np.zeros(cells, np.int64)
+    cell, stops, count = np.zeros(n, np.int64), np.zeros(cells + 1, np.int64), 0
     # near to cell c are near[stops[c]:stops[c + 1]]: by each column of cells along z those from the first to the last
-    near, stops, count = np.empty(side**3 * cells, np.int32), np.zeros(cells + 1, np.int64), 0
-    first, end = np.zeros(side**2, np.int64), np.zeros(side**2, np.int64)
+    first, last = np.zeros(side**2, np.int64), np.zeros(side**2, np.int64)
+    completed = np.zeros(cells)
     for c in range(cells):
-        for i in order[starts[c] : starts[c + 1]]:
-            cell[i] = c
+        parent[c], completed[c] = c, -np.inf
+        for k in range(starts[c], starts[c + 1]):
+            cell[order[k]] = c
         for column in range(side**2):
             key = keys[c] + ((((column // side - NEAR_CELLS) << AXIS_BITS) + column % side - NEAR_CELLS) << AXIS_BITS)
             while first[column] < cells and keys[first[column]] < key - NEAR_CELLS:
                 first[column] += 1
-            while end[column] < cells and keys[end[column]] <= key + NEAR_CELLS:
-                end[column] += 1
-            for other in range(first[column], end[column]):
+            while last[column] < cells and keys[last[column]] <= key + NEAR_CELLS:
+                last[column] += 1
+            for other in range(first[column], last[column]):
                 near[count] = other
                 count += 1
         stops[c + 1] = count
@@ -105,21 +107,22 @@ def _nested(  # type: ignore[no-untyped-def]
                     completed[root] = max(completed[root], completed[other])
             if sizes[root] >= least:
                 completed[root] = max(completed[root], scores[i])
-        names, count = np.full(len(parent), -1, np.int64), 0
+        # clusters are numbered from 1 here
+        names, count = np.zeros(cells, np.int64), 0
         for i in range(n):
             if scores[i] > thresholds[level]:
                 root = root_of(parent, cell[i])
-                if names[root] < 0 and sizes[root] >= least:
-                    names[root] = count
+                if names[root] == 0 and sizes[root] >= least:
                     strengths[level, count] = completed[root]
                     count += 1
-                labels[level, i] = names[root]
-    return labels, strengths
+                    names[root] = count
+                labels[level, i] = names[root] - 1
 
 
 @numba.njit(**PLAIN)
 def _touches(points: np.ndarray, i: int, order: np.ndarray, start: int, held: int, limit: float) -> bool:
-    for j in order[start : start + held]:
+    for k in range(start, start + held):
+        j = order[k]
         dx, dy, dz = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
         if dx * dx + dy * dy + dz * dz <= limit:
             return True

@@ -240,24 +240,26 @@ def fit_hole(patch: HolePatch, u: float, v: float, radius_m: float, depth_m: flo
 def _descent(  # type: ignore[no-untyped-def]
     data, places, factor, weight, start, sights, metric, blur_u, blur_v, h, w
 ):
-    """Return the best hole (5,), its offset, rows (7, n) and whether the descent from ``start`` (6,) has converged. The
-    rows are derivatives of the used pixels, at flat ``places`` (n,), by (u, v, radius, depth, offset, wall), and what
-    is left of their ``data`` (n,); whitened by the noise's ``factor`` (n, n), upper, where it is not empty. ``weight``:
-    of the prior."""
-    n, step, q, square, damping, converged = len(data), np.zeros(6), start, np.inf, 10.0 * DAMPING, False
-    rows, left, products, promised = np.empty((7, n)), np.empty((1, n)), np.empty((7, 7)), np.inf
-    best, holes, sizes = np.empty(5), np.empty((6, 5)), np.array([STEP, STEP, STEP, STEP, 1.0, STEP])
+    """Return the best hole (5,), its offset, rows (8, n) and whether the descent from ``start`` (6,) has converged. The
+    first rows are derivatives of the used pixels, at flat ``places`` (n,), by (u, v, radius, depth, offset, wall); the
+    seventh is what the hole leaves of their ``data`` (n,). The noise's ``factor`` (n, n), upper, whitens them where it
+    is not empty. ``weight``: of the prior."""
+    n, q, step, damping, converged = len(data), start, np.zeros(6), 10.0 * DAMPING, False
+    square = promised = np.inf
+    rows, products, best, holes, sizes = np.zeros((8, n)), np.zeros((7, 7)), np.zeros(5), np.zeros((6, 5)), np.zeros(6)
+    left, slope = rows[7:], np.zeros(7)
     # keeps a wild trial step finite: no disc is larger than ten patches
     widest = math.log(10.0 * (h + w) * math.sqrt(max(metric[0, 0], metric[1, 1])))
     for trial in range(MOST_STEPS + 1):
         at = q + step
+        radius = math.exp(min(max(at[2], -20.0), widest))
         for k in range(6):
             holes[k, 0], holes[k, 1] = min(max(at[0], -10.0 * w), 10.0 * w), min(max(at[1], -10.0 * h), 10.0 * h)
-            holes[k, 2] = math.exp(min(max(at[2], -20.0), widest))
-            holes[k, 3], holes[k, 4] = at[3] / holes[k, 2] ** 2, math.sin(0.5 * math.pi * at[5]) ** 2
-        image = _painted(holes[:1], sights, metric, blur_u, blur_v, h, w).reshape(1, h * w)
+            holes[k, 2], holes[k, 3] = radius, at[3] / radius**2
+            holes[k, 4] = math.sin(0.5 * math.pi * at[5]) ** 2
+        image = _painted(holes[:1], sights, metric, blur_u, blur_v, h, w).ravel()
         for i in range(n):
-            left[0, i] = image[0, places[i]] + at[4] - data[i]
+            left[0, i] = image[places[i]] + at[4] - data[i]
         _whiten(factor, left)
         prior = weight * (holes[0, 4] - WALL_PRIOR[0])
         new_square, enough = prior**2, TOLERANCE * square + SMALLEST
@@ -268,26 +270,33 @@ def _descent(  # type: ignore[no-untyped-def]
             q, square, damping = at, new_square, 0.1 * damping
             for k in range(5):
                 best[k] = holes[0, k]
-            radius, depth, bend = best[2], best[3], 0.5 * math.pi * math.sin(math.pi * at[5])
+            depth, bend = best[3], 0.5 * math.pi * math.sin(math.pi * at[5])
+            sizes[0] = sizes[1] = STEP
             sizes[2], sizes[3] = STEP * radius, STEP * (depth if depth != 0.0 else STEP)
             sizes[5] = -STEP if best[4] >= 0.5 else STEP
             for k in range(5):
                 holes[k + 1, MOVED[k]] += sizes[ROWS[k]]
-            images = _painted(holes, sights, metric, blur_u, blur_v, h, w).reshape(6, h * w)
+            images = _painted(holes, sights, metric, blur_u, blur_v, h, w).ravel()
             for k in range(5):
+                row, per_step = ROWS[k], 1.0 / sizes[ROWS[k]]
                 for i in range(n):
-                    rows[ROWS[k], i] = (images[k + 1, places[i]] - images[0, places[i]]) / sizes[ROWS[k]]
+                    rows[row, i] = (images[(k + 1) * h * w + places[i]] - images[places[i]]) * per_step
             for i in range(n):
                 rows[4, i], rows[6, i] = 1.0, left[0, i]
             _whiten(factor, rows[:6])
-            products = np.dot(rows, rows.T)
-            # derivatives by q from those by the hole's numbers
-            for _ in range(2):
+            for j in range(7):
+                for k in range(7):
+                    products[j, k] = 0.0
+            for i in range(n):
                 for j in range(7):
-                    products[j, 2] = radius * products[j, 2] - 2.0 * depth * products[j, 3]
-                    products[j, 3] /= radius**2
-                    products[j, 5] *= bend
-                products = products.T.copy()
+                    slope[j] = rows[j, i]
+                # derivatives by q from those by the hole's numbers
+                slope[2] = radius * slope[2] - 2.0 * depth * slope[3]
+                slope[3] *= radius**-2.0
+                slope[5] *= bend
+                for j in range(7):
+                    for k in range(j, 7):
+                        products[j, k] += slope[j] * slope[k]
             products[5, 5] += (weight * bend) ** 2
             products[5, 6] += weight * bend * prior
         else:
@@ -302,10 +311,11 @@ def _descent(  # type: ignore[no-untyped-def]
 def _whiten(upper: np.ndarray, rows: np.ndarray) -> None:
     """Replace each of the rows (k, n) by the inverse of the transpose of an upper factor (n, n) times it, if any."""
     for j in range(len(upper)):
-        for row in rows:
-            row[j] /= upper[j, j]
+        for k in range(len(rows)):
+            rows[k, j] /= upper[j, j]
+            value = rows[k, j]
             for i in range(j + 1, len(upper)):
-                row[i] -= row[j] * upper[j, i]
+                rows[k, i] -= value * upper[j, i]
 
 
 @numba.njit(**PLAIN)
