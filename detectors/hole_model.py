@@ -12,13 +12,13 @@ out up to 16 % too deep at 33 mm).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
 
 from detectors.clusters import PLAIN
-from detectors.whitening import correlated_products, noise_factor
+from detectors.whitening import correlated_products, whitener
 
 STRIPS = 64
 """Strips that stand for the disc: the coverage is exact in total, and in each pixel within 0.001 for a blur of 3."""
@@ -82,7 +82,7 @@ def straight_sight(per_px_m: np.ndarray) -> np.ndarray:
 class HolePatch:
     """Residuals around one detection. ``metric_m2`` (2, 2): squared length of a pixel offset (du, dv) is its quadratic
     form. ``noise_m``: deviation beside the hole. ``blur_px`` (along u, along v): sides of the rectangle over which the
-    image is averaged. ``sights`` (s, 8). ``correlation`` (odd, odd): of the noise by lag, where it is known."""
+    image is averaged. ``sights`` (s, 8). ``whitener`` (n, n): of the used pixels' errors, where it is known."""
 
     residual_m: np.ndarray
     used: np.ndarray
@@ -90,7 +90,7 @@ class HolePatch:
     blur_px: tuple[float, float]
     noise_m: float
     sights: np.ndarray
-    correlation: np.ndarray | None = None
+    whitener: np.ndarray | None = None
 
     @property
     def prior_weight(self) -> float:
@@ -208,24 +208,30 @@ class HoleFit:
     misfit: float
 
 
+def whitened(patch: HolePatch, by_lag: np.ndarray | None, offset_m: float) -> HolePatch:
+    """Return the patch with the whitener of noise with this correlation ``by_lag`` (odd, odd), and of the model's own
+    errors, which are shares of the depth beyond ``offset_m``."""
+    error_m = MODEL_ERROR * np.abs(patch.residual_m - offset_m)
+    return replace(patch, whitener=whitener(patch.used, by_lag, max(patch.noise_m, LEAST_M), error_m))
+
+
 def fit_hole(patch: HolePatch, u: float, v: float, radius_m: float, depth_m: float, offset_m: float) -> HoleFit:
     """Fit by least squares (Levenberg and Marquardt) from a start, to six used pixels and more: the likelihood's
-    maximum where the patch knows the noise's covariance, else with `sandwich_covariance`.
+    maximum where the patch has a whitener, else with `sandwich_covariance`.
 
     Fitted are (u, v, ln radius, depth * radius^2, offset, x) with the wall sin^2(pi x / 2), which has `WALL_PRIOR`. The
     fourth is the hole's volume, which the blur keeps, so that of a small hole only the radius is ill determined.
     """
-    used, data, error_m = patch.used, patch.residual_m[patch.used], MODEL_ERROR * np.abs(patch.residual_m - offset_m)
-    factor = noise_factor(used, patch.correlation, max(patch.noise_m, LEAST_M), error_m)
-    weight = patch.prior_weight if factor is None else 1.0 / WALL_PRIOR[1]
+    used, data, known = patch.used, patch.residual_m[patch.used], patch.whitener is not None
+    weight = 1.0 / WALL_PRIOR[1] if known else patch.prior_weight
     start = np.array([u, v, math.log(radius_m), depth_m * radius_m**2, offset_m, WALL_PRIOR[0]])
-    upper = np.zeros((0, 0)) if factor is None else np.ascontiguousarray(factor.T)
     optics = patch.sights, patch.metric_m2, *patch.blur_px, *used.shape
-    hole, offset, rows, converged = _descent(data, np.flatnonzero(used), upper, weight, start, *optics)
+    whitening = patch.whitener if known else np.zeros((0, 0))
+    hole, offset, rows, converged = _descent(data, np.flatnonzero(used), whitening, weight, start, *optics)
     by, left = rows[:6], rows[6]
     u, v, radius, depth, wall = hole.tolist()
     square = float(left @ left)
-    if factor is None:
+    if not known:
         return HoleFit(u, v, radius, depth, offset, wall, sandwich_covariance(patch, by, square), converged, 0.0)
     # the information's inverse times the variance of what is left, and the model's own errors
     variance, information = square / max(len(data) - 6, 1), by @ by.T
@@ -238,12 +244,12 @@ def fit_hole(patch: HolePatch, u: float, v: float, radius_m: float, depth_m: flo
 
 @numba.njit(**PLAIN)
 def _descent(  # type: ignore[no-untyped-def]
-    data, places, factor, weight, start, sights, metric, blur_u, blur_v, h, w
+    data, places, whitening, weight, start, sights, metric, blur_u, blur_v, h, w
 ):
     """Return the best hole (5,), its offset, rows (8, n) and whether the descent from ``start`` (6,) has converged. The
     first rows are derivatives of the used pixels, at flat ``places`` (n,), by (u, v, radius, depth, offset, wall); the
-    seventh is what the hole leaves of their ``data`` (n,). The noise's ``factor`` (n, n), upper, whitens them where it
-    is not empty. ``weight``: of the prior."""
+    seventh is what the hole leaves of their ``data`` (n,). They are multiplied by ``whitening`` (n, n)
+    where it is not empty. ``weight``: of the prior."""
     n, q, step, damping, converged = len(data), start, np.zeros(6), 10.0 * DAMPING, False
     square = promised = np.inf
     rows, products, best, holes, sizes = np.zeros((8, n)), np.zeros((7, 7)), np.zeros(5), np.zeros((6, 5)), np.zeros(6)
@@ -260,7 +266,8 @@ def _descent(  # type: ignore[no-untyped-def]
         image = _painted(holes[:1], sights, metric, blur_u, blur_v, h, w).ravel()
         for i in range(n):
             left[0, i] = image[places[i]] + at[4] - data[i]
-        _whiten(factor, left)
+        if len(whitening):
+            left[:] = np.dot(left, whitening)
         prior = weight * (holes[0, 4] - WALL_PRIOR[0])
         new_square, enough = prior**2, TOLERANCE * square + SMALLEST
         for i in range(n):
@@ -283,7 +290,8 @@ def _descent(  # type: ignore[no-untyped-def]
                     rows[row, i] = (images[(k + 1) * h * w + places[i]] - images[places[i]]) * per_step
             for i in range(n):
                 rows[4, i], rows[6, i] = 1.0, left[0, i]
-            _whiten(factor, rows[:6])
+            if len(whitening):
+                rows[:6] = np.dot(rows[:6], whitening)
             for j in range(7):
                 for k in range(7):
                     products[j, k] = 0.0
@@ -305,17 +313,6 @@ def _descent(  # type: ignore[no-untyped-def]
             break
         step, promised = _damped(products, damping)
     return best, q[4], rows, converged
-
-
-@numba.njit(**PLAIN)
-def _whiten(upper: np.ndarray, rows: np.ndarray) -> None:
-    """Replace each of the rows (k, n) by the inverse of the transpose of an upper factor (n, n) times it, if any."""
-    for j in range(len(upper)):
-        for k in range(len(rows)):
-            rows[k, j] /= upper[j, j]
-            value = rows[k, j]
-            for i in range(j + 1, len(upper)):
-                rows[k, i] -= value * upper[j, i]
 
 
 @numba.njit(**PLAIN)

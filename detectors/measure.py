@@ -12,7 +12,17 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from detectors.clusters import PLAIN
-from detectors.hole_model import MOST_MISFIT, HoleFit, HolePatch, fit_hole, normal_of, pictures, sight, straight_sight
+from detectors.hole_model import (
+    MOST_MISFIT,
+    HoleFit,
+    HolePatch,
+    fit_hole,
+    normal_of,
+    pictures,
+    sight,
+    straight_sight,
+    whitened,
+)
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.masks import grown, parts_with
 from detectors.noise import median_of, quantile_of, sigma_of
@@ -121,8 +131,7 @@ def measure_detection(
     volume = float((around.patch.residual_m[near] - around.offset_m).sum()) * float(abs(ax * by - ay * bx))
     length_m, width_m, along = _sides(around, near)
     placed = replace(placed, volume_m3=volume, length_m=length_m, width_m=width_m, along=along)
-    around = replace(around, patch=replace(around.patch, correlation=by_lag))
-    fit, doubt = _modelled(around, config)
+    fit, doubt = _modelled(around, config, by_lag)
     if fit is None:
         return _by_contour(placed, around, doubt)
     errors = np.sqrt(np.diag(fit.covariance))
@@ -258,7 +267,7 @@ def local_plane(
     return centre, per_px
 
 
-def _modelled(around: _Surroundings, config: HoleModelConfig) -> tuple[HoleFit | None, str]:
+def _modelled(around: _Surroundings, config: HoleModelConfig, by_lag: np.ndarray | None) -> tuple[HoleFit | None, str]:
     """Return the fitted hole; None with the reason where the model is to be doubted."""
     own, invalid, patch = around.own, around.invalid, around.patch
     dark = "part of the hole has no range"
@@ -278,6 +287,7 @@ def _modelled(around: _Surroundings, config: HoleModelConfig) -> tuple[HoleFit |
     if patch.used.sum() < 6:
         return None, "the model of a blurred hole does not fit"
     start = (u0, v0, radius, around.sign * around.peak_m, around.offset_m)
+    patch = whitened(patch, by_lag, around.offset_m)
     fit, seen_by, pixels = fit_hole(patch, *start), patch, int(patch.used.sum())
     for side in around.sharper_px if fit.misfit else ():
         narrower = replace(patch, blur_px=(side, side))

@@ -285,12 +285,12 @@ def bank(window_px: int) -> tuple[Template, ...]:
     return tuple(sorted(found, key=lambda template: template.coarse))
 
 
-def noise_factor(
+def whitener(
     used: np.ndarray, correlation: np.ndarray | None, deviation: float, model_error: np.ndarray
 ) -> np.ndarray | None:
-    """Return Cholesky's lower factor (n, n) of the covariance of the ``used`` pixels (r, c), whose inverse times values
-    has independent errors of deviation 1; None where there are too many pixels, or the correlation is not known or
-    none. Errors are noise of one ``deviation`` and the model's own (r, c), both correlated by lag (odd, odd)."""
+    """Return the matrix (n, n) by which rows (k, n) of errors at the ``used`` pixels (r, c) are multiplied to become
+    independent errors of deviation 1; None where there are too many pixels, or the correlation is not known or none.
+    Errors are noise of one ``deviation`` and the model's own (r, c), both correlated by lag (odd, odd)."""
     count, (h, w) = int(used.sum()), used.shape
     if correlation is None or count > MOST_WHITENED:
         return None
@@ -305,9 +305,10 @@ def noise_factor(
     covariance = lags.ravel()[places[:, None] - places + (h - 1) * lags.shape[1] + w - 1]
     covariance *= deviation**2 + np.outer(error, error)
     try:
-        return np.asarray(scipy.linalg.cholesky(covariance.T, lower=True, overwrite_a=True, check_finite=False))
+        lower = scipy.linalg.cholesky(covariance.T, lower=True, overwrite_a=True, check_finite=False)
     except np.linalg.LinAlgError:
         return None
+    return np.ascontiguousarray(scipy.linalg.lapack.dtrtri(lower, lower=1)[0].T)
 
 
 def correlated_products(columns: np.ndarray, across: int, down: int) -> np.ndarray:

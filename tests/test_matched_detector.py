@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from detectors.hole_model import HoleFit, HolePatch, fit_hole, pictures, straight_sight
+from detectors.hole_model import HoleFit, HolePatch, fit_hole, pictures, straight_sight, whitened
 from detectors.interface import Detection
 from detectors.local import LocalDetector
 from detectors.matched import MatchedDetector
@@ -21,11 +21,11 @@ from detectors.whitening import (
     halved,
     inverse_times,
     noise_covariance,
-    noise_factor,
     response,
     spectra,
     spectrum,
     transformed,
+    whitener,
     window_of,
     worths,
 )
@@ -87,15 +87,14 @@ def test_whitened_values_have_the_inverse_covariance() -> None:
     lags = np.abs(np.arange(-8, 9))
     correlation = np.outer(0.6**lags, 0.6**lags)
     error = np.where(used, 2e-4, 0.0)
-    factor = noise_factor(used, correlation, 3e-4, error)
-    assert factor is not None
+    matrix = whitener(used, correlation, 3e-4, error)
+    assert matrix is not None
     places = np.argwhere(used)
     dense = 0.6 ** np.abs(places[:, None] - places).sum(axis=-1) * (3e-4**2 + 2e-4**2)
     reach = (np.abs(places[:, None] - places) <= 8).all(axis=-1)
-    white = np.linalg.inv(factor)
     inverse = np.linalg.inv(np.where(reach, dense, 0.0))
-    np.testing.assert_allclose(white.T @ white, inverse, atol=1e-9 * np.abs(inverse).max())
-    assert noise_factor(used, None, 3e-4, error) is None
+    np.testing.assert_allclose(matrix @ matrix.T, inverse, atol=1e-9 * np.abs(inverse).max())
+    assert whitener(used, None, 3e-4, error) is None
 
 
 def test_sizes_under_correlated_noise_scatter_as_the_bound_says() -> None:
@@ -117,7 +116,7 @@ def test_sizes_under_correlated_noise_scatter_as_the_bound_says() -> None:
         for seed in range(24):
             rough = 0.3 * np.random.default_rng(100 + seed).standard_normal(shape)
             seen = image + noise_m * (blurred(seed, shape) + rough)
-            patch = replace(blank, residual_m=seen, correlation=given)
+            patch = whitened(replace(blank, residual_m=seen), given, 0.0)
             fits[name].append(fit_hole(patch, 15.0, 15.0, 4e-3, 5e-3, 0.0))
     scatter = {name: np.std([each.radius_m for each in some]) for name, some in fits.items()}
     assert scatter["likelihood"] < 0.7 * scatter["plain"]
