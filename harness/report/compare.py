@@ -96,10 +96,10 @@ def rule(comparison: Comparison) -> str:
     """Return the meaning of the marks."""
     return (
         f"Worse (+): a90, the rate of false calls, or the threshold over the signals has grown by more than "
-        f"{100 * (MARGIN - 1):.0f} %, and a test shows that this is not by chance (p < {comparison.alpha:g}, "
-        "adjusted by Holm's method over all set-ups and questions). Better (-): the opposite for a90. ~: beyond that margin, but "
-        "possibly by chance. !: the limit is lost, or more trials failed. *: a limit for the first time. x: not "
-        "comparable. < and >: only in the first study, only in the second."
+        f"{100 * (MARGIN - 1):.0f} %, and a test shows that this is not by chance (p < {comparison.alpha:g}, adjusted "
+        "by Holm's method over all set-ups). Better (-): the opposite for a90. ~: beyond that margin, but possibly by "
+        "chance. !: the limit is lost, or more trials failed. *: a limit for the first time. x: not comparable. < and "
+        ">: only in the first study, only in the second."
     )
 
 
