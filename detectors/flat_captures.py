@@ -2,7 +2,7 @@
 
 Each capture's average is a smooth fit, the pattern P at each pixel, the surface's own shape S at each place, and noise.
 Where the captures' poses are known, P and S are solved for together by least squares, with the noise's variances and
-the variance of S, which the captures' disagreement tells. Without poses each capture sees an S of its own, which counts
+the variance of S, which follows from the captures' disagreement. Without poses each capture has its own S, which counts
 as noise and averages out; a camera that did not move sees the same S each time, and nothing can separate it from P.
 
 The smooth fit is a polynomial in 1/z over the rays' slopes, in which a plane is exact; it absorbs structure wider than

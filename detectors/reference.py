@@ -2,8 +2,8 @@
 
 The part's front axis is turned to the camera, upright or rolled by quarters; closest points, then closest planes, move
 it onto the cloud (Besl and McKay 1992; Chen and Medioni 1992), points off it counting less (Tukey). Triangles that face
-away are left out. Not found: a part that is turned by more than about 30 degrees. Where the mesh fixes no place, as of
-a plane along itself, none is found, and nothing depends on it."""
+away are left out. Not found: a part that is turned by more than about 30 degrees. A direction that the mesh does not
+fix, such as that of a plane along itself, is not determined, and nothing depends on it."""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ SHARE_SIGMA = 0.1
 ALIKE = 0.35
 """A pixel has a blob's colour where its distance to it is less than this part of that to the surroundings' colour."""
 CUT_SHARE = 0.05
-"""Share of the pixels around a blob: so many of its own colour, but off the target, mean that it goes on there."""
+"""Share of the pixels around a blob: so many of its own colour, but off the target, mean that it continues."""
 SHIFTS = 12  # of the lattice along each axis, over which the error of a centroid is averaged
 RECTANGULAR = 0.85
 """Least share of its smallest rectangle that a rectangle's pixels fill; an ellipse's fill 0.79."""
@@ -242,7 +242,7 @@ def centroid_covariance_px2(polygon_px: np.ndarray) -> np.ndarray:
 
 def region_covariance_px2(pixels: np.ndarray) -> np.ndarray:
     """Return the covariance (2, 2) of the centroid of a region known by its pixel positions (m, 2) alone, which are on
-    no line. Their convex outline stands for it, or their smallest rectangle where they fill that. Its size and slope
+    no line. Their convex outline represents it, or their smallest rectangle if they fill that. Its size and slope
     are known to part of a pixel, and decide whether the errors of opposite edges add or cancel: the covariance is the
     mean over outlines up to a pixel larger and turned by up to that."""
     hull = cv2.convexHull(pixels.astype(np.float32))

@@ -201,7 +201,7 @@ BEHIND_M = 2.0 * MM
 """A mark may seem to lie so far behind its surroundings: cameras range dark and bright surfaces differently."""
 BEHIND_SIGMAS = 5.0
 RAISED_SHARE = 0.25
-"""A mark may stand before its surroundings by this part of its breadth: a tag on board, but no object."""
+"""Largest height of a mark over its surroundings, as a share of its breadth: a tag on board, but no object."""
 SAME_COLOUR = 0.35
 """Two spots have one colour where their contrasts to their surroundings differ by less than this part of them."""
 WEAK_SHARE = 1 / 3

@@ -87,7 +87,7 @@ def load_picture(path: Path) -> dict[str, np.ndarray]:
     import cv2
 
     level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what it would print is told once, below
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # a message below replaces its output
     try:
         with damage_told(f"{path}: cannot be read", LEGAL_PICTURES):
             is_read, pages = cv2.imreadmulti(str(path), flags=cv2.IMREAD_UNCHANGED)
@@ -114,7 +114,7 @@ NEIGHBOURS = 0.1
 @dataclass(frozen=True)
 class RawLoader:
     """Whole frames of ``width`` x ``height`` numbers, row by row, from a byte of a file on. ``step``: bytes from pixel
-    to pixel, more than a number's where brightness and confidence stand between."""
+    to pixel, more than a number's if brightness and confidence lie between."""
 
     width: int
     height: int

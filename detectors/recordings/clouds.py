@@ -3,7 +3,7 @@
 Open3D drops the grid and fills a cut PLY up with zeros, so the header is read here: a PCD is organised where HEIGHT >
 1, a PLY where it states num_cols and num_rows. A list has a point a line: x y z, then an intensity, or red green blue,
 or both; a line of names may say otherwise. Its grid is stated by a comment or a first line of two whole numbers, or
-told by a lens with as many pixels, or a sensor's usual size on which x/z and y/z rise evenly."""
+determined by a lens with as many pixels, or a sensor's usual size on which x/z and y/z rise evenly."""
 
 from __future__ import annotations
 
@@ -85,8 +85,8 @@ PLY_BYTES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4
 HEADER_BYTES = 65536
 COUNT = re.compile(r"\d{1,15}", re.ASCII)
 """A count in a header: more digits are no file's, and Python refuses to read thousands of them."""
-PCD_NUMBERS = 10_000  # numbers in one point: descriptors of some hundred stand in published clouds
-LZF_STRONGEST = 100  # factor by which LZF can shorten at most: three bytes stand for at most 264
+PCD_NUMBERS = 10_000  # numbers in one point; published clouds have descriptors with some hundred
+LZF_STRONGEST = 100  # largest compression factor of LZF: three bytes represent at most 264
 
 
 def _read_cloud(path: Path, _: Lens | None) -> tuple[np.ndarray, tuple[int, int], np.ndarray | None, np.ndarray | None]:
@@ -101,7 +101,7 @@ def _read_cloud(path: Path, _: Lens | None) -> tuple[np.ndarray, tuple[int, int]
     if (found := path.stat().st_size) < data_bytes:
         what = f"{path}: is truncated: {found} of at least {data_bytes} bytes"
         raise UserError(what, legal="a whole file", fix="copy or export it again")
-    # Open3D's complaints go to the terminal; what they say is checked here and told once.
+    # Open3D prints warnings to the terminal; their causes are checked here and reported once
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         cloud = o3d.t.io.read_point_cloud(str(path), remove_nan_points=False, remove_infinite_points=False)
     read = len(cloud.point.positions) if "positions" in cloud.point else 0
@@ -142,7 +142,7 @@ def _ply_header(path: Path, content: bytes) -> tuple[int, int, int]:
 
 
 def _pcd_header(path: Path, content: bytes) -> tuple[int, int, int]:
-    """Return the same of a PCD."""
+    """Return the same values as `_ply_header` for a PCD."""
     end = re.search(rb"^DATA\s+(\w+)\s*?\r?\n", content, re.MULTILINE)
     if end is None:
         raise UserError(f"{path}: is not a PCD file, or its header is cut off", legal=LEGAL_CLOUD)
@@ -214,7 +214,7 @@ def _read_list(path: Path, lens: Lens | None) -> tuple[np.ndarray, tuple[int, in
 
 
 def _numbers(line: str) -> list[float] | None:
-    """Return the numbers of a line; None where something else stands there."""
+    """Return the numbers of a line; None if it holds anything else."""
     try:
         return [float(word) for word in re.split(r"[,;\s]+", line.strip(" \t\r,;")) if word]
     except ValueError:
@@ -238,7 +238,7 @@ def _table(path: Path, content: bytes, skipped: int, line: str) -> np.ndarray:
 
 
 def _columns(path: Path, values: np.ndarray, line: str) -> dict[str, np.ndarray]:
-    """Return columns by name: x, y, z, i, r, g, b. ``line`` stands before the numbers and may name them."""
+    """Return columns by name: x, y, z, i, r, g, b. ``line`` precedes the numbers and may name them."""
     bare = re.sub(r"\([^)]*\)|\[[^]]*\]", " ", line).strip(" #/\t\r,;").lower()
     names = [COLUMNS.get(word, "") for word in re.split(r"[,;\s]+", bare)]
     count = values.shape[1]

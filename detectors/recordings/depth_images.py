@@ -1,8 +1,8 @@
 """Folders and lists of 16-bit depth PNGs: Open3D's recorder, Azure SDK exports, TUM RGB-D, or bare pictures.
 
-What decides the layout: a sub-folder ``depth`` (with ``color`` or ``rgb`` beside it), names that hold "depth", names
-that are numbers, else every 16-bit grey PNG. A ``depth.txt`` beside marks TUM RGB-D. A picture's kind is told by its
-first bytes, and Pillow reads its header: OpenCV would decode a header of 30,000 x 30,000 pixels into gigabytes."""
+The layout is recognised by a sub-folder ``depth`` (with ``color`` or ``rgb`` beside it), by names that hold "depth", or
+by names that are numbers; else every 16-bit grey PNG counts. A ``depth.txt`` marks TUM RGB-D. A picture's first bytes
+show its kind, and Pillow reads its header: OpenCV would decode a header of 30,000 x 30,000 pixels into gigabytes."""
 
 from __future__ import annotations
 

@@ -237,7 +237,7 @@ def is_stray(folder: Path) -> bool:
 
 
 def open_stray(folder: Path, given: Given) -> Recording:
-    """Open Stray Scanner's folder. Raises UserError where a file is broken or the lens' resolution cannot be told."""
+    """Open Stray Scanner's folder. Raises UserError if a file is broken or the lens's resolution is unknown."""
     depths = depth_files(folder / "depth")
     height, width = read_depth_png(depths[0]).shape
     beside = [folder / "confidence" / path.name for path in depths]

@@ -142,7 +142,7 @@ NEAR_M = (0.8, 1.8)
 NEAR_LIMIT_M, FAR_FLOOR = 0.15, 0.05
 """Any distance above the first keeps at least the second as its part of the commonest distance's weight."""
 SURE, LIKELY, SHOWN = 0.98, 0.75, 0.003
-"""Probabilities: above the first a unit is told, below the second asked for; the third hides a reading."""
+"""Probabilities: from the first on, no warning; below the second, the user must decide; below the third, not listed."""
 MILLIMETRE_SIZES = {
     **{(640, 576): 4.5, (320, 288): 6.0, (512, 512): 3.5, (1024, 1024): 3.0, (512, 424): 8.0, (256, 192): 8.0}
 }  # image sizes of cameras that all store 1 mm and the median distance in metres that they can reach
@@ -184,9 +184,9 @@ def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int,
     """Decide the unit of numbers (n,) that nothing states; ``size``: width and height of the image.
 
     Each of `READINGS` is weighed by how common it is and by how far it puts the nearest tenth of the points, which is
-    where targets are (`NEAR_M`). A common divisor of all numbers speaks for the unit in which they are whole
-    millimetres; sizes that only cameras with 1 mm have speak for it (`MILLIMETRE_SIZES`), and against distances beyond
-    their reach. Raises UserError where no reading is clearly the likeliest, with the distance that each gives."""
+    where targets are (`NEAR_M`). A common divisor of all numbers supports the unit in which they are whole
+    millimetres. Image sizes that only cameras with 1 mm have support that unit (`MILLIMETRE_SIZES`), and exclude it
+    beyond their reach. Raises UserError if no reading is clearly the likeliest, with the distance that each gives."""
     near, median = (float(q) for q in np.quantile(stored[:: max(1, stored.size // 50_000)], (0.1, 0.5)))
     integers = usual_m == UNITS_M["mm"]
     divisor = int(np.gcd.reduce(stored.astype(np.int64))) if integers else 1
@@ -239,7 +239,7 @@ def rounding_step_m(z_m: np.ndarray) -> float:
 
 
 def refuse_implausible(frame: Frame, scale_m: float) -> None:
-    """Raise UserError where the median distance of a frame with a valid pixel speaks for a wrong unit."""
+    """Raise UserError if the median distance of a frame with a valid pixel indicates a wrong unit."""
     valid = frame.z_m[np.isfinite(frame.z_m)]
     median_m = float(np.median(valid[:: max(1, valid.size // 50_000)]))
     if NEAREST_M <= median_m <= FARTHEST_M:

@@ -115,7 +115,7 @@ FOUND_BESIDE = (
 BARE_MATRICES = (
     *("intrinsics.txt", "intrinsic.txt", "camera-intrinsics.txt", "intrinsic_depth.txt", "K.txt", "cam_K.txt"),
 )
-"""Names of text files likewise: other text beside frames is mostly something else."""
+"""The same for text files: other text beside frames is mostly something else."""
 SPELLINGS = {
     **{"fx": ("fx", "fl_x", "focal_x"), "fy": ("fy", "fl_y", "focal_y")},
     **{"cx": ("cx", "ppx", "c_x"), "cy": ("cy", "ppy", "c_y")},

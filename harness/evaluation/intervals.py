@@ -1,4 +1,4 @@
-"""Intervals, two-sided at `CONFIDENCE` unless told otherwise; false calls per area, and the threshold for a rate.
+"""Intervals, two-sided at `CONFIDENCE` unless stated otherwise; false calls per area, and the threshold for a rate.
 
 Sources: Wilson 1927 and Clopper and Pearson 1934 (proportions), Garwood 1936 (Poisson), Student and Welch (means),
 Efron and Tibshirani 1993 (percentile bootstrap). Not covered: repeats of one set-up are repeats of the noise."""

@@ -118,7 +118,7 @@ FIXED = ("name", "title", "repeats", "study", "sweep", "draws", SWITCHES, "sensi
 
 @dataclass(frozen=True)
 class Setting:
-    """One path set to one value, where in the source that value is written, and what to call it (empty: as it is)."""
+    """One path set to one value, where in the source that value is written, and its name (empty: ``path=value``)."""
 
     path: str
     value: Any

@@ -275,8 +275,8 @@ def _merged(
     views: Sequence[View],
     choices: Sequence[Choice | None],
 ) -> tuple[Mapped, dict[str, Any]]:
-    """Find targets and marks, told at once as they explain later failures, then register and merge; return also the
-    data of registrations.json. Raises UserError where a view has no target, or for each view that cannot be placed."""
+    """Find targets and marks (printed at once, because they explain later failures), register and merge; return also the
+    data of registrations.json. Raises UserError if a view has no target, or for each view that cannot be placed."""
     from detectors.mapping.merge import Mapped, merge, prepare
     from detectors.registration.by_marks import register_by_marks
     from detectors.registration.register import register
@@ -360,7 +360,7 @@ def _registration_data(mapped: Mapped) -> dict[str, Any]:
 def _print(run: Inspection) -> None:
     cloud, evidence, crop, choice = run.result.cloud, run.result.evidence, run.arguments.crop, run.choices[0]
     recorded = [warning for recording in run.recordings for warning in recording.warnings]
-    # of several views the doubts about their targets were told before they were registered
+    # with several views, doubts about their targets were printed before the registration
     doubts = choice.warnings if run.mapped is None and choice else ()
     of_gauge = run.seen.warnings if run.seen else ()
     told.print_warnings((*recorded, *doubts, *evidence.warnings, *of_gauge))

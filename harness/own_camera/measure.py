@@ -45,7 +45,7 @@ JUMP_M, JUMP_SIGMAS = 3 * MM, 6.0
 ASSUMED = np.array([0.0, 2.0, -0.5])
 """Exponents where captures do not tell them: of range (read noise, a disparity's error), of brightness (shot noise)."""
 UNSURE = 0.5
-"""Standard error beyond which an exponent is not told."""
+"""Largest standard error of an exponent that is reported."""
 SLOW, WIDE_PX, COARSE = 0.15, 6.5, 0.35
 """Correlation of successive frames, reach of neighbours' correlation, and noise by rounding steps, beyond which the
 recording was averaged, smoothed or rounded before it was stored."""

@@ -167,7 +167,7 @@ def ply_bytes(cloud: Cloud, detections: Sequence[Detection]) -> bytes:
 MODELLED = ("diameter", "diameter_se", "depth", "depth_se", "centre", "centre_se")
 WIDTH_IN, DPI = 11.0, 150
 TAKEN, OTHERS = "#ff00ff", ("#ff9f1c", "#2ec4b6", "#ffee32", "#4cc9f0", "#f94144", "#90be6d", "#bdb2ff")
-"""Colours that stand apart from grey and from one another, also for people who see red and green alike."""
+"""Colours that differ from grey and from one another, also with red-green blindness."""
 Box = tuple[float, float, float, float]
 
 

@@ -59,8 +59,8 @@ def record(command: str) -> dict[str, Any]:
     return {"command": command, "commit": commit, "dirty": dirty, "versions": versions(), "machine": machine}
 
 
-RESULTS_VERSION = 1  # Of files without a version of their own; raised when the tables' meaning changes
-GENERATOR = f"tofpod results {RESULTS_VERSION}"  # Stands in pages
+RESULTS_VERSION = 1  # of files without their own version; increased when the tables' meaning changes
+GENERATOR = f"tofpod results {RESULTS_VERSION}"  # written into pages
 STAMP = re.compile(r"#\s*tofpod (\w+)(.*)")
 
 

@@ -26,7 +26,7 @@ SAME = 1e-9
 """Share of the largest signal within which signals differ by rounding alone; scatter below this share of the signals'
 largest deviation is a line drawn by rounding, with no likelihood."""
 LEVEL = 0.05
-"""p-value below which a diagnostic speaks against an assumption."""
+"""p-value below which a diagnostic contradicts an assumption."""
 LEAST = 8
 """Signals between the limits below which Anderson and Darling's approximation of p does not hold."""
 

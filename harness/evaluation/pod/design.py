@@ -104,7 +104,7 @@ def hole_free(rate_per_m2: float, board_m2: float, confidence: float = 0.95) -> 
         raise UserError(f"{rate_per_m2:g} false calls per m2 on boards of {board_m2:g} m2", legal="both above 0")
     calling = -float(np.expm1(-rate_per_m2 * board_m2))
     fewest = max(int(np.ceil(1 / calling * (1 - 1e-12))) - 1, 1)
-    # Any distinct scores: what the rule says of its rates does not depend on them.
+    # any distinct scores: the rule's rates do not depend on them
     threshold = threshold_for_rate(np.arange(float(fewest)), board_m2, rate_per_m2, confidence)
     area_m2 = float(stats.chi2.ppf(confidence, 2) / 2 / rate_per_m2)
     silent = area_m2, int(np.ceil(area_m2 / board_m2 * (1 - 1e-12)))

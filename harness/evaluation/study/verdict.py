@@ -131,7 +131,7 @@ def holm(p_values: Iterable[float]) -> np.ndarray:
 
 def paired_set_ups(first: StudyRecord, second: StudyRecord) -> tuple[Pair, ...]:
     """Pair set-ups by variant and frames; those left by place on the axes and frames; a single one of each is a pair.
-    In the order of ``first``; what only one study has stands with None, the second's at the end."""
+    In the order of ``first``; set-ups of only one study are paired with None, those of the second at the end."""
     if len(first.set_ups) == len(second.set_ups) == 1:
         return ((first.set_ups[0], second.set_ups[0]),)
     partner: dict[int, SetUpRecord] = {}
