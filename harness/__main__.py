@@ -43,7 +43,7 @@ def main(arguments: list[str] | None = None) -> int:
     if name in programs():
         sys.argv[1:] = rest
         return int(importlib.import_module(f"harness.{name}").main(rest if arguments is not None else None))
-    return exit_code_of(lambda: _told(name, rest))
+    return exit_code_of(lambda: _run(name, rest))
 
 
 @lru_cache
@@ -59,7 +59,7 @@ def programs() -> dict[str, str]:
     return found
 
 
-def _told(name: str, rest: list[str]) -> int:
+def _run(name: str, rest: list[str]) -> int:
     if name in ("", "-h", "--help"):
         wide = max(map(len, programs()))
         print("How small a damage can a time-of-flight depth camera detect?\n")

@@ -20,7 +20,7 @@ import numpy as np
 
 from detectors.recordings.distances import UNITS_M, default_metres, frame_of, refuse_narrow
 from detectors.recordings.intrinsics import lens_for
-from detectors.recordings.recording import Given, Recording, damage_told
+from detectors.recordings.recording import Given, Recording, read_errors
 from harness.vocabulary import files
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import RAISE, refuse_bytes, refuse_pixels
@@ -43,13 +43,13 @@ ArraysLoader = Callable[[Path], Arrays]
 
 def load_npy(path: Path) -> dict[str, np.ndarray]:
     """Map an ``.npy`` file. Raises UserError where it is broken or holds objects."""
-    with damage_told(f"{path}: cannot be read as arrays", LEGAL_ARRAYS):
+    with read_errors(f"{path}: cannot be read as arrays", LEGAL_ARRAYS):
         return {"": np.lib.format.open_memmap(path, mode="r")}
 
 
 def load_npz(path: Path) -> dict[str, np.ndarray]:
     """Return the arrays of an ``.npz`` file by name. Raises UserError where it is broken, too large, or has objects."""
-    with damage_told(f"{path}: cannot be read as arrays", LEGAL_ARRAYS):
+    with read_errors(f"{path}: cannot be read as arrays", LEGAL_ARRAYS):
         with zipfile.ZipFile(path) as archive:
             stated = sum(entry.file_size for entry in archive.infolist())
         fix = f"save its frames as .npy, which is not unpacked; {RAISE}"
@@ -64,7 +64,7 @@ def load_mat(path: Path) -> dict[str, np.ndarray]:
     import scipy.io
 
     fix = f"save it with '-v7', not '-v7.3'; save the arrays of a point cloud pc: {EXPORT}"
-    with damage_told(f"{path}: cannot be read as a MATLAB file", LEGAL_MAT, fix):
+    with read_errors(f"{path}: cannot be read as a MATLAB file", LEGAL_MAT, fix):
         try:
             # cells and structs hold no frames, and nested deeply enough they end the process without a word
             flat = [name for name, _, kind in scipy.io.whosmat(path) if kind not in ("cell", "struct")]
@@ -89,7 +89,7 @@ def load_picture(path: Path) -> dict[str, np.ndarray]:
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # a message below replaces its output
     try:
-        with damage_told(f"{path}: cannot be read", LEGAL_PICTURES):
+        with read_errors(f"{path}: cannot be read", LEGAL_PICTURES):
             is_read, pages = cv2.imreadmulti(str(path), flags=cv2.IMREAD_UNCHANGED)
             if not is_read or not pages:
                 raise ValueError("it is damaged, or its type does not match its name")

@@ -22,7 +22,7 @@ import numpy as np
 from detectors.open3d_library import load_open3d
 from detectors.recordings.arrays import SENSOR_SIZES
 from detectors.recordings.distances import UNITS_M, frame_of
-from detectors.recordings.recording import NO_GRID, Given, Recording, damage_told
+from detectors.recordings.recording import NO_GRID, Given, Recording, read_errors
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import TABLE_BYTES, bounded_bytes, refuse_pixels
 from harness.vocabulary.geometry import Frame, Lens
@@ -92,7 +92,7 @@ LZF_STRONGEST = 100  # largest compression factor of LZF: three bytes represent 
 def _read_cloud(path: Path, _: Lens | None) -> tuple[np.ndarray, tuple[int, int], np.ndarray | None, np.ndarray | None]:
     """Read one PLY or PCD. Raises UserError where it has no header, holds no points, or is cut off."""
     o3d = load_open3d()
-    with damage_told(f"{path}: cannot be read", LEGAL_CLOUD), path.open("rb") as file:
+    with read_errors(f"{path}: cannot be read", LEGAL_CLOUD), path.open("rb") as file:
         content = file.read(HEADER_BYTES)
     width, height, data_bytes = (_ply_header if path.suffix.lower() == ".ply" else _pcd_header)(path, content)
     if width * height < 1:
@@ -154,7 +154,7 @@ def _pcd_header(path: Path, content: bytes) -> tuple[int, int, int]:
             raise ValueError(f"{text[:20]!r} is not a count")
         return int(text)
 
-    with damage_told(f"{path}: its PCD header cannot be read", LEGAL_CLOUD):
+    with read_errors(f"{path}: its PCD header cannot be read", LEGAL_CLOUD):
         width, height = count(fields["WIDTH"][0]), count(fields["HEIGHT"][0])
         points = count(fields["POINTS"][0]) if "POINTS" in fields else width * height
         sizes = [count(text) for text in fields["SIZE"]]
@@ -190,7 +190,7 @@ COLUMNS = {
 
 def _read_list(path: Path, lens: Lens | None) -> tuple[np.ndarray, tuple[int, int], np.ndarray | None, Any]:
     """Read one list of points. Raises UserError where it cannot be read as numbers."""
-    with damage_told(f"{path}: cannot be read", LEGAL_LIST):
+    with read_errors(f"{path}: cannot be read", LEGAL_LIST):
         content = bounded_bytes(path, TABLE_BYTES).removeprefix(codecs.BOM_UTF8)
     lines = content[:65536].decode("latin1").splitlines()[:HEAD_LINES]
     head = [bool(re.match(r"\s*(#|//|;|$)", line)) or _numbers(line) is None for line in lines]
@@ -228,7 +228,7 @@ def _table(path: Path, content: bytes, skipped: int, line: str) -> np.ndarray:
     is_decimal_comma = "," in line and "." not in line and re.search(r"[;\t]", line)
     content = content.translate(bytes.maketrans(b",;", b". " if is_decimal_comma else b"  "))
     options: Any = {"sep": r"\s+", "header": None, "comment": "#", "dtype": np.float64, "encoding": "latin1"}
-    with damage_told(f"{path}: cannot be read as points", LEGAL_LIST):
+    with read_errors(f"{path}: cannot be read as points", LEGAL_LIST):
         values: np.ndarray = pandas.read_csv(io.BytesIO(content), skiprows=skipped, **options).to_numpy()
     if 3 <= values.shape[1] <= MOST_COLUMNS:
         return values

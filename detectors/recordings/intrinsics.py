@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from detectors.recordings.recording import Given, damage_told
+from detectors.recordings.recording import Given, read_errors
 from harness.vocabulary.declaration.yaml_source import MAX_BYTES, DeclarationError, parse_yaml
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, refuse_bytes, strict_json
@@ -40,7 +40,7 @@ def parse_calibration(name: str, content: bytes) -> dict[str, Any]:
     """Parse the calibration's JSON (a trailing zero byte is the recorder's). Raises UserError for any other content."""
     refuse_bytes(name, len(content), TEXT_BYTES)
     legal = "the JSON that k4arecorder attaches: CalibrationInformation with its Cameras"
-    with damage_told(f"{name}: is not an Azure Kinect calibration", legal, OWN_LENS):
+    with read_errors(f"{name}: is not an Azure Kinect calibration", legal, OWN_LENS):
         cameras = strict_json(content.rstrip(b"\0"))["CalibrationInformation"]["Cameras"]
         return {camera["Purpose"].removeprefix("CALIBRATION_CameraPurpose"): camera for camera in cameras}
 
@@ -71,7 +71,7 @@ def colour_camera(name: str, cameras: dict[str, Any], width: int, height: int) -
         parameters[1] = (parameters[1] * 2304 + 384) / 3072
         parameters[3] = parameters[3] * 2304 / 3072
     T_colour_depth = np.eye(4)
-    with damage_told(f"{name}: the colour camera's place cannot be read", "Rt with Rotation and Translation", OWN_LENS):
+    with read_errors(f"{name}: the colour camera's place cannot be read", "Rt with Rotation and Translation", OWN_LENS):
         T_colour_depth[:3, :3] = np.reshape(np.array(camera["Rt"]["Rotation"], float), (3, 3))
         T_colour_depth[:3, 3] = np.reshape(np.array(camera["Rt"]["Translation"], float), 3)
     mode = ((width, rows), (0, (rows - height) // 2), (width, height))
@@ -84,7 +84,7 @@ def _camera(name: str, cameras: dict[str, Any], purpose: str) -> tuple[dict[str,
         raise UserError(f"{name}: the calibration has no camera for {purpose}", legal="cameras Depth and PhotoVideo")
     camera: dict[str, Any] = cameras[purpose]
     legal = f"SensorWidth and SensorHeight, {MODEL} with 14 finite parameters"
-    with damage_told(f"{name}: the calibration's intrinsics cannot be read", legal, OWN_LENS):
+    with read_errors(f"{name}: the calibration's intrinsics cannot be read", legal, OWN_LENS):
         is_sized = all(isinstance(camera[key], int) for key in ("SensorWidth", "SensorHeight"))
         model, numbers = camera["Intrinsics"]["ModelType"], [float(x) for x in camera["Intrinsics"]["ModelParameters"]]
     known = is_sized and model == MODEL and len(numbers) == 14 and np.isfinite(numbers).all()
@@ -212,7 +212,7 @@ def parsed_lens(path: Path) -> dict[str, Any]:
     """Return the file's mapping; of bare numbers, these by name. Raises UserError where it is neither JSON nor YAML."""
     if not path.exists():
         raise UserError(f"{path}: no such file", legal=LEGAL_LENS)
-    with damage_told(f"{path}: cannot be read", LEGAL_LENS, "give another file"):
+    with read_errors(f"{path}: cannot be read", LEGAL_LENS, "give another file"):
         text = bounded_bytes(path, TEXT_BYTES).decode("utf-8-sig")
         words = re.sub(r"[\[\](),;]|#.*", " ", text).split() if len(text) < MAX_MATRIX_TEXT else []
         if len(words) in (4, 9, 12, 16) and all(re.fullmatch(NUMBER, word) for word in words):

@@ -23,7 +23,7 @@ NO_GRID = "the cloud has no pixel grid; it is treated as unorganised points"
 
 
 @contextmanager
-def damage_told(what: str, legal: str, fix: str = "copy or export it again") -> Iterator[None]:
+def read_errors(what: str, legal: str, fix: str = "copy or export it again") -> Iterator[None]:
     """Turn a library's exception on a damaged file into a UserError that begins with ``what``; limit its memory."""
     try:
         with limited_memory():

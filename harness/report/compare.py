@@ -16,7 +16,7 @@ from harness.tables.text import Grid, Tone, mm, p_value
 from harness.vocabulary.files import jsonable
 
 COMPARISON_VERSION = 1
-SAID: tuple[Mark, ...] = ("newly failing", "newly working", "no limit", "not comparable")
+EXPLAINED: tuple[Mark, ...] = ("newly failing", "newly working", "no limit", "not comparable")
 TONES: dict[Mark, Tone] = {"worse": "bad", "newly failing": "bad", "better": "good", "newly working": "good"}
 TONES |= {"only in first": "open", "not comparable": "open"}
 
@@ -116,8 +116,8 @@ def answer(comparison: Comparison) -> str:
 
 
 def remarks(comparison: Comparison) -> list[str]:
-    """Return the reasons for the marks in `SAID`, and the differences between the studies."""
-    reasons = [f"{row.label}: {row.mark}, {row.why}" for row in comparison.rows if row.mark in SAID and row.why]
+    """Return the reasons for the marks in `EXPLAINED`, and the differences between the studies."""
+    reasons = [f"{row.label}: {row.mark}, {row.why}" for row in comparison.rows if row.mark in EXPLAINED and row.why]
     pairs = [row for row in comparison.rows if row.first is not None and row.second is not None]
     by_change: dict[str, list[str]] = {}
     for row in pairs:

@@ -206,7 +206,7 @@ def axis_figure(axis: study.AxisGroup, name: str) -> str:
             axes.set_xscale("log")
             axes.minorticks_off()
         labels = [f"{value:g}" for value in axis.values] if axis.numeric else [
-            plain(fill(shorten(axis.told(value), 60, placeholder=" …"), 18, break_long_words=False))
+            plain(fill(shorten(axis.words(value), 60, placeholder=" …"), 18, break_long_words=False))
             for value in axis.values
         ]  # fmt: skip
         axes.set_xticks(places, labels)

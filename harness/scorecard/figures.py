@@ -35,7 +35,7 @@ from scenes.sensor.camera import camera_names
 FIGURES_FILE = Path(__file__).with_name("figures.yaml")
 NEAR = 0.25
 """A figure of reality passes within this share of a published value; a bound must hold."""
-SAID_EVERY_S = 10.0
+PROGRESS_EVERY_S = 10.0
 Request = tuple[str, str, Config]
 """A camera, a quantity, and its conditions."""
 
@@ -204,7 +204,7 @@ def measured(requests: Iterable[Request], effort: Effort, jobs: int) -> dict[Req
         found = mapped(measure_group, groups, [effort] * len(groups))
         for group, readings in zip(groups, found, strict=True):
             results |= zip(group, readings, strict=True)
-            if time.monotonic() - last_s > SAID_EVERY_S:
+            if time.monotonic() - last_s > PROGRESS_EVERY_S:
                 last_s = time.monotonic()
                 print(f"measured {len(results)} of {sum(map(len, groups))} numbers", file=sys.stderr, flush=True)
     return results
