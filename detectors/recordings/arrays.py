@@ -1,10 +1,10 @@
-"""Captures in files of arrays: which array holds the distances, and the meaning of its axes. Height maps and bare
-numbers too.
+"""Captures in files of arrays: which array holds the distances, and the meaning of its axes; also height maps and bare
+numbers.
 
 The libraries that read them run within `files.limited_memory`. Arrays of objects, which would need pickle, are refused.
 A height map's pixels lie a stated pitch apart, and it is a cloud in parallel projection: x and y count from its middle,
-and z, which points away from the viewer, is `DISTANCE_M` at the median height. Without a stated unit, micrometres,
-millimetres or metres are taken, whichever gives the relief a plausible part of the extent."""
+and z, which points away from the viewer, is `DISTANCE_M` at the median height. If no unit is stated, the program takes
+micrometres, millimetres or metres, whichever gives the relief a plausible part of the extent."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ EXPORT = "Location = pc.Location; Color = pc.Color; save('cloud.mat','Location',
 
 Arrays = Mapping[str, np.ndarray]
 ArraysLoader = Callable[[Path], Arrays]
-"""Loads a file's arrays by name; the only array of a file without names is called ""."""
+"""Function that loads a file's arrays by name; the only array of a file without names is called ""."""
 
 
 def load_npy(path: Path) -> dict[str, np.ndarray]:
@@ -106,9 +106,9 @@ SENSOR_SIZES = (
     *((256, 192), (160, 120), (240, 180), (1024, 768), (1280, 720), (848, 480), (1280, 960), (1280, 1024)),
 )  # (width, height) of the depth images of usual cameras
 SAME_SCENE, SEVERAL = 0.05, 8
-"""Part of its distance by which the median pixel of two successive frames differs at most, and frames looked at."""
+"""Most relative difference of the median pixel between successive frames, and number of frames examined."""
 NEIGHBOURS = 0.1
-"""The same of neighbouring pixels: rows of a floor seen flat differ by 1 %, noise by less; a wrong layout by 100 %."""
+"""The same between neighbouring pixels: rows of a flat floor differ by 1 %, noise by less; a wrong layout by 100 %."""
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ DISTANCE_NAMES = ("depth", "z", "z_mm", "depth_mm", "xyz", "points", "location")
 COLOUR_NAMES = ("rgb", "color", "colour", "colors")
 AMPLITUDE_NAMES = ("amplitude", "ir", "intensity")
 LEGAL_AXES = "depth (h, w) or (n, h, w); points (h, w, 3), (n, h, w, 3) or, without a pixel grid, (n_points, 3)"
-FEWEST_ROWS = 8  # of an image: fewer are the columns of a table of points
+FEWEST_ROWS = 8  # of an image: fewer are columns of a table of points
 FRAMES_OF_POINTS = 20
 """(a, b, 3) is taken for a frames of b points, not for a grid, from b = 20 a on: no sensor is that wide."""
 

@@ -150,7 +150,7 @@ INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 UNIT_TYPE = "std_msgs/msg/Float32"
 USUAL_TOPIC = "points2"
 RAY_TOLERANCE_PX = 0.01
-"""A lens counts where each point lies within this of its pixel's ray: far more than float32 leaves of it."""
+"""A lens counts if each point lies within this of its pixel's ray: far more than the error of float32."""
 
 
 def open_bag(path: Path, given: Given) -> Recording:

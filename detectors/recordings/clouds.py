@@ -250,6 +250,6 @@ def _columns(path: Path, values: np.ndarray, line: str) -> dict[str, np.ndarray]
     colour = {6: "rgb", 7: "irgb"}.get(count, "i" if count in (4, 5) else "")
     found = {name: values[:, i] for i, name in enumerate("xyz" + colour)}
     if "r" in found and ((beyond := values[:, count - 3 :]).min() < 0 or beyond.max() > 255 or (beyond % 1).any()):
-        # normals, or another thing: no colour
+        # normals or something else, but no colour
         return {name: found[name] for name in found if name not in "rgb"}
     return found

@@ -36,7 +36,7 @@ TITLES = ("DEPTH", "IR", "COLOR")
 LEGAL_MKV = "a recording of k4arecorder with its DEPTH track"
 SEGMENT_ID = bytes.fromhex("18538067")
 WAITING = 4
-"""Captures held while their other pictures may still come; the recorder interleaves its tracks within one frame."""
+"""Most captures held while their other pictures may still follow; the recorder interleaves tracks within one frame."""
 
 
 def open_mkv(path: Path, given: Given) -> Recording:
@@ -166,7 +166,7 @@ def _refuse_truncated(path: Path) -> None:
 LEGAL_STRAY = "Stray Scanner's folder: depth/*.png, confidence/*.png, camera_matrix.csv, odometry.csv"
 LEGAL_R3D = "Record3D's .r3d: metadata and rgbd/*.depth"
 COLOUR_WIDTHS = (1920, 1280, 640, 3840)
-"""Widths of the pictures that ARKit's lens may be of; all are 4 : 3, as its depth is."""
+"""Widths of the pictures to which ARKit's lens may refer; all are 4 : 3, as its depth is."""
 BLUR_PX = 0.5  # motion over this much of a pixel spreads an edge further than the sensor itself does
 
 

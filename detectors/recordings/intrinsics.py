@@ -17,7 +17,7 @@ from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, refuse_bytes, st
 from harness.vocabulary.geometry import Lens, OtherLens
 
 Mode = tuple[tuple[int, int], tuple[int, int], tuple[int, int]]
-"""A read-out of the sensor: the binned sensor, the offset of the crop in it, and the image; (x, y) pixels."""
+"""A read-out of the sensor: the binned sensor, the crop's offset in it, and the image; (x, y) in pixels."""
 DEPTH_MODES: dict[str, Mode] = {
     "NFOV_2X2BINNED": ((512, 512), (96, 90), (320, 288)),
     "NFOV_UNBINNED": ((1024, 1024), (192, 180), (640, 576)),
@@ -115,7 +115,7 @@ FOUND_BESIDE = (
 BARE_MATRICES = (
     *("intrinsics.txt", "intrinsic.txt", "camera-intrinsics.txt", "intrinsic_depth.txt", "K.txt", "cam_K.txt"),
 )
-"""The same for text files: other text beside frames is mostly something else."""
+"""The same for text files: other text beside frames is mostly something different."""
 SPELLINGS = {
     **{"fx": ("fx", "fl_x", "focal_x"), "fy": ("fy", "fl_y", "focal_y")},
     **{"cx": ("cx", "ppx", "c_x"), "cy": ("cy", "ppy", "c_y")},
@@ -124,9 +124,9 @@ MATRICES = ("intrinsic_matrix", "camera_matrix", "cam_K", "K", "k")
 SIZES = (("width", "height"), ("image_width", "image_height"), ("width_px", "height_px"), ("w", "h"))
 COEFFICIENTS = ("distortion", "distortion_coefficients", "D", "d", "coeffs", "dist_coeffs")
 MODELS = ("distortion_model", "model", "camera_model")
-"""Keys by which programs name focal lengths and centre, the matrix, size, and distortion."""
+"""Keys by which programs name focal lengths and centre, the matrix, the size, and the distortion."""
 FAR_OFF = 0.2
-"""Part of the image by which a principal point may lie off its middle before the lens is doubted."""
+"""Part of the image by which a principal point may lie off the middle before the lens is doubted."""
 NUMBER, MAX_MATRIX_TEXT = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", 2000
 NESTED = 3  # levels of mappings in a file in which a lens is looked for
 DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -287,7 +287,7 @@ def _focal_and_centre(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
     key = _matrix_key(data)
     assert key is not None
     m = _numbers(path, key, data[key], 9)
-    # the last row is 0 0 1: what stands elsewhere tells whether it is by rows, or by columns as Open3D's
+    # the last row is 0 0 1: anything else there shows whether it is by rows, or by columns as Open3D's
     return (m[0], m[4], m[6], m[7]) if m[6] or m[7] else (m[0], m[4], m[2], m[5])
 
 
@@ -322,7 +322,7 @@ def _numbers(path: Path, key: str, value: Any, count: int | None) -> tuple[float
 
 
 def _number(path: Path, key: str, value: Any) -> float:
-    # Python's integers have no largest one, and lists may be endless to print.
+    # Python's integers have no largest value, and lists may be too long to print
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < LARGEST:
         shown = repr(value)[:40] if isinstance(value, str | bool | float | None) else type(value).__name__
         raise UserError(f"{path}: {key} is {shown}", legal=f"a number within {LARGEST:g}")

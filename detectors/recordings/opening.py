@@ -28,10 +28,10 @@ LEGAL_FORMATS = (
 )
 FILES = {".mkv": open_mkv, ".r3d": open_r3d, **dict.fromkeys(LOADERS, open_arrays)}
 FILES |= dict.fromkeys((*BAG_SUFFIXES, ROS1_SUFFIX), open_bag)
-"""Suffixes of files of which each is a capture, and what opens it."""
+"""Suffixes of files of which each is a capture, and the function that opens it."""
 ListOpener = Callable[[Sequence[Path], Given, str], Recording]
 LISTS: dict[str, ListOpener] = {".png": open_depth_list, **dict.fromkeys((*CLOUDS, *POINT_LISTS), open_clouds)}
-"""Suffixes of files of which several, all of one suffix, are one capture."""
+"""Suffixes of files of which several, all with the same suffix, form one capture."""
 SAVE = "python -c \"import numpy, {}; numpy.save('depth.npy', {})\", then name depth.npy"
 PICTURE, HDF5 = SAVE.format("cv2", "cv2.imread('FILE', -1)"), SAVE.format("h5py", "h5py.File('FILE')['NAME'][:]")
 CONVERT = {

@@ -98,7 +98,7 @@ class Recording:
 
     @cached_property
     def slopes(self) -> np.ndarray | None:
-        """(h, w, 2) x/z and y/z per pixel; NaN where the distortion has no inverse. None where frames carry points."""
+        """Slopes x/z, y/z (h, w, 2) of pixels; NaN where the distortion has no inverse. None if frames carry points."""
         return None if self.lens is None else _returning_slopes(self.lens, self.region)
 
     def selected(self) -> Iterator[Frame]:

@@ -45,11 +45,11 @@ from scenes.sensor.unit import taps_of
 
 SEED = 1
 UNIT = CameraConfig(effects=EffectsConfig().model_copy(update={"unit_offset": False, "warm_up_drift": False}))
-"""A simulated unit with the effects that captures of a real one show too."""
+"""Effects of a simulated unit that captures of a real unit show too."""
 STEPS, CLOSE, FARTHEST, FEW_FRAMES = 5, 0.01, 100.0, 12
-"""Steps of the gain's fit, the relative error at which it ends, the largest change, and frames of a step."""
+"""Most steps of the gain's fit, the relative error at which it ends, its largest change, and frames per step."""
 EDGE_SHARE = 2.56
-"""Width of a blurred edge between a tenth and nine tenths of its step, in deviations of the Gaussian."""
+"""Width of a blurred edge between a tenth and nine tenths of its step, in standard deviations of the Gaussian."""
 UNKNOWN = "not determined by the captures"
 
 

@@ -75,12 +75,12 @@ class Image:
 
     @cached_property
     def rays(self) -> np.ndarray:
-        """Rays (h, w, 3) of the pixels, with z = 1."""
+        """The rays (h, w, 3) of the pixels, with z = 1."""
         return np.concatenate([self.lens.region_slopes(self.lens.whole), np.ones((*self.lens.whole.shape, 1))], axis=-1)
 
     @cached_property
     def plan_mm(self) -> np.ndarray:
-        """Points (h, w, 2) where each pixel's ray meets the board's plane, board frame."""
+        """The points (h, w, 2) where each pixel's ray meets the board's plane, in the board's frame."""
         T_board_image = invert(self.T_image_board)
         rays, start = self.rays @ T_board_image[:3, :3].T, T_board_image[:3, 3]
         return np.asarray((start[:2] - rays[..., :2] * (start[2] / rays[..., 2:])) / MM)

@@ -30,9 +30,9 @@ from harness.tables.text import Grid
 from harness.vocabulary.path_names import camera_title, differing, names_of, on_one_line, unit_of, value_text
 
 BLOB_PX = 5.0
-"""Distance on the sensor up to which two highest scores belong to one blob: the width of a camera's filter."""
+"""Distance on the sensor within which two highest scores belong to one blob: the width of a camera's filter."""
 HIGH_THRESHOLD = 10.0
-"""Deviations: the highest of a hole-free board is 4 with Gaussian noise, 5 to 6 with a fixed pattern."""
+"""Standard deviations: a hole-free board's highest score is 4 with Gaussian noise, 5 to 6 with a fixed pattern."""
 OFF_BOARD = "off the board"
 SHOWN_ROWS = 60
 BOUND = "upper bound of a90 at 95 % confidence; empty where not demonstrated"
