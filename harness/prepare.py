@@ -13,8 +13,7 @@ from harness.vocabulary.program import program
 
 @program(lambda parser: None, "Compile the inner loops once.")
 def main(options: argparse.Namespace, command: str) -> int:
-    """Run the loops of single views on small captures, in two processes; those of maps compile when first used. Returns
-    0."""
+    """Run the loops of single views on small captures, in two processes; map loops compile at first use. Returns 0."""
     from harness.engine.processes import PROCESSES
 
     began = time.perf_counter()

@@ -1,5 +1,4 @@
-"""Fiducial marks for a registration: their data, settings of the rules that find them, and conditions on a set of
-marks."""
+"""Fiducial marks for a registration: their data, settings of the rules that find them, conditions on a set of marks."""
 
 from __future__ import annotations
 

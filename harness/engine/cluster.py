@@ -204,8 +204,7 @@ class ClusterEngine:
                 self._heed(*self._events.get_nowait())
 
     def _look_for_nodes(self) -> None:
-        """Ask new nodes to describe themselves, and give up those that are gone. Raises UserError without a
-        scheduler."""
+        """Ask new nodes to describe themselves, give up those that are gone. Raises UserError without a scheduler."""
         there = None
         if self._client.status == "running":
             with contextlib.suppress(OSError):

@@ -44,8 +44,7 @@ MOST_FAILURES, FAILURE = 200, ("what", "state", "why")  # failures to list; the 
 
 
 def run_study(experiment: Experiment, out: Path, options: EngineOptions, command: str) -> int:
-    """Run an experiment, write tables and report, print a summary; for a shard, only the journal. Returns 0, 1 or
-    130."""
+    """Run an experiment, write tables and report, print a summary; of a shard only the journal. Returns 0, 1, 130."""
     began = time.monotonic()
     origin = record(command)  # recorded now: a commit during the sweep does not change the code that runs
     origin["started"] = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")

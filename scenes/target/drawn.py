@@ -154,8 +154,7 @@ else:
 
 class DrawnTargetConfig(Config):
     """A family of random boards. Offsets, tilts, roll and jitter of the pose are drawn uniformly between plus and minus
-    the given value. ``drawn`` returns the full declaration of any board, ``declare`` that of the first damaged
-    board."""
+    the given value. ``drawn`` returns the full declaration of a board, ``declare`` that of the first damaged one."""
 
     name: Literal["drawn"] = "drawn"
     seed: flaws.Seed = Field(1, description="draws the boards; the experiment's own seed draws the noise")
