@@ -1,5 +1,6 @@
-"""Streamed averages that make one cloud of frames; frames that do not belong are left out and named. Frames are judged
-by the first `REFERENCE_FRAMES`: a source whose first frames are mostly bad, or a camera that moves, is not healed."""
+"""Averages streamed frames into one cloud; frames that do not belong are left out and reported. The first
+`REFERENCE_FRAMES` are the reference: a source whose first frames are mostly bad, or a moving camera, is not
+repaired."""
 
 from __future__ import annotations
 
@@ -17,23 +18,23 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, Frame, FrameSource, LeftOut, Reason
 
 REFERENCE_FRAMES = 5
-"""The median of five survives two bad frames, wherever they stand, and needs no more memory than five frames."""
+"""The median of five frames survives two bad ones, wherever they are, and needs no more memory than five frames."""
 SAMPLED_PIXELS = 4096
-"""Pixels on which a frame is judged: a changed fraction of 5 % is then known to 0.35 %, a shift to 0.02 sigma."""
-CORRELATED_PIXELS = 25  # pixels that share one noise value in the worst case: a depth engine that filters over 5x5
+"""Pixels on which a frame is judged: they show a changed fraction of 5 % to 0.35 %, and a shift to 0.02 sigma."""
+CORRELATED_PIXELS = 25  # pixels that share one noise value in the worst case: a depth engine with a 5x5 filter
 
 NOT_FINITE = int(Reason.NOT_FINITE)
 
 
 class AverageConfig(Config):
-    """Settings that say how frames become one cloud, and when a frame is left out.
+    """Settings for averaging frames into one cloud, and for leaving frames out.
 
-    ``method``: ``mean`` as in the thesis; ``median`` per pixel (holds all frames' z in memory); ``clipped``: mean of
-    the samples within ``clip_sigmas`` of the pixel's median over the first five frames. ``frames``: use the first so
-    many. A frame *jumps* if the median over pixels of its difference to the reference exceeds the larger of
+    ``method``: ``mean`` as in the thesis; ``median`` per pixel (holds z of all frames in memory); ``clipped``: mean of
+    the samples within ``clip_sigmas`` of the pixel's median over the first five frames. ``frames``: use only the first
+    so many. A frame *jumps* if the median over pixels of its difference from the reference exceeds the larger of
     ``jump_sigmas`` standard errors and ``jump_mm`` (ten times the wander of a static Azure Kinect). It is *disturbed*
-    if more than ``disturbed_fraction`` of its pixels (beyond 1.5 times what the reference frames show) lost their range
-    or changed by more than the larger of ``changed_sigmas`` of one frame's noise and ``changed_mm``."""
+    if more than ``disturbed_fraction`` of its pixels (beyond 1.5 times what the reference frames show) lost their
+    range, or changed by more than the larger of ``changed_sigmas`` of one frame's noise and ``changed_mm``."""
 
     method: Literal["mean", "median", "clipped"] = "mean"
     frames: int | None = Field(default=None, ge=1)
@@ -47,28 +48,28 @@ class AverageConfig(Config):
     median_memory_mb: float = Field(default=2000.0, gt=0, description="most memory that the median may use")
 
 
-MOST_LEFT_OUT = 0.25  # share of the frames from which on more than an accident disturbed a recording
+MOST_LEFT_OUT = 0.25  # largest share of frames left out that an accident explains
 RECORDED = AverageConfig(disturbed_fraction=0.01)
 """Settings for recordings, in which a camera may be knocked: a shift by 2 % of the picture's width changes some 2 % of
-the pixels, and frames of static real cameras differ from the first by 0.3 % beyond what those show."""
+the pixels; frames of static real cameras differ from the first by 0.3 % beyond what the reference frames show."""
 
 
 def unsteadiness(cloud: Cloud) -> str:
-    """Return a warning where an average leaves out so many frames that the recording was not steady, else ""."""
+    """Return a warning if so many frames are left out that the recording was not steady, else ""."""
     out, frames = len(cloud.left_out), cloud.n_frames + len(cloud.left_out)
     what = f"{out} of {frames} frames differ from the others and are left out: the camera or the scene moved"
     return what if out > MOST_LEFT_OUT * frames else ""
 
 
 def average(source: FrameSource, config: AverageConfig) -> Cloud:
-    """Average a source's frames. Raises UserError where it has too few frames, frames of different sizes, no valid
-    pixel at all, or more frames than the median's memory allows."""
+    """Average a source's frames. Raises UserError if it has too few frames, frames of different sizes, no valid pixel,
+    or more frames than the median's memory allows."""
     (cloud,) = _averages(source, None if config.frames is None else [config.frames], config).values()
     return cloud
 
 
 def prefix_averages(source: FrameSource, counts: Sequence[int], config: AverageConfig) -> dict[int, Cloud]:
-    """Average the first ``n`` frames for each of ``counts`` in one pass, bit by bit as `average`. Raises UserError."""
+    """Average the first ``n`` frames for each of ``counts`` in one pass, exactly like `average`. Raises UserError."""
     wanted = sorted(set(counts))
     if not wanted or wanted[0] < 1:
         raise UserError(f"numbers of frames to average: {list(counts)}", legal="one or more whole numbers from 1")
@@ -76,7 +77,7 @@ def prefix_averages(source: FrameSource, counts: Sequence[int], config: AverageC
 
 
 def _averages(source: FrameSource, wanted: list[int] | None, config: AverageConfig) -> dict[int, Cloud]:
-    """Return the averages of so many frames, ascending; of all where none is wanted."""
+    """Return the averages at these numbers of frames, ascending; if None, the average of all frames."""
     frames = _of_one_size(source, islice(source.frames(), wanted[-1] if wanted else None))
     held = list(islice(frames, REFERENCE_FRAMES))
     offered, clouds = len(held), {}
@@ -111,12 +112,12 @@ def _of_one_size(source: FrameSource, frames: Iterator[Frame]) -> Iterator[Frame
 
 
 class FrameSums:
-    """Sums of frames that belong, from which the mean cloud follows: float64 of z less a per-pixel offset. A good frame
-    is what the first frames show: the median of those that agree; ``sample`` are the flat indices of the judged pixels,
-    all valid in it. The clipped mean uses no larger deviation from the offset than ``gate``."""
+    """Sums over the frames that belong, from which the mean cloud follows: float64 of z minus a per-pixel offset. The
+    first frames define a good frame: the median of those that agree. ``sample``: flat indices of the judged pixels, all
+    valid in it. The clipped mean uses no larger deviation from the offset than ``gate``."""
 
     def __init__(self, source: FrameSource, frames: list[Frame], config: AverageConfig) -> None:
-        """Sum the ``frames``, at most `REFERENCE_FRAMES`, which are the reference too."""
+        """Sum the ``frames``, at most `REFERENCE_FRAMES`, which are also the reference."""
         self.source, self.config, self.shape, self.reference_frames = source, config, frames[0].z_m.shape, len(frames)
         n = self._refer(np.stack([frame.z_m.ravel() for frame in frames]).astype(np.float32, copy=False))
         self.count, self.total, self.squares = np.zeros(n, dtype=np.int32), np.zeros(n), np.zeros(n)
@@ -131,35 +132,35 @@ class FrameSums:
             self.take(frame)
 
     def _refer(self, stack: np.ndarray) -> int:
-        """Set what a good frame is by the first frames (r, n); returns n."""
+        """Define a good frame from the first frames (r, n); returns n."""
         config, finite = self.config, np.isfinite(stack)
         usable = np.flatnonzero(2 * finite.sum(axis=0) > finite.any(axis=1).sum())
         self.sample = usable[:: max(1, -(-len(usable) // SAMPLED_PIXELS))]
         sampled = stack[:, self.sample]
-        # the frame nearest to the others in range (the earliest on a tie), and each frame's shift against it
+        # the frame closest in range to the others (the earliest on a tie), and each frame's shift against it
         between = np.array([[_median_finite(a - b) for b in sampled] for a in sampled])
         distances = np.sort(np.where(np.isfinite(between), np.abs(between), np.inf), axis=1)
         middle = int(np.argmin(distances[:, len(sampled) // 2]))
-        # robust standard deviation of one frame's z, at least that of the rounding
+        # robust standard deviation of one frame's z, at least that of rounding
         deviations = [row - sampled[middle] for i, row in enumerate(sampled) if i != middle]
         spreads = [_median_finite(np.abs(d - _median_finite(d))) / 0.6745 / np.sqrt(2.0) for d in deviations]
         sigma = max(_median_finite(np.array(spreads)) if spreads else 0.0, self.source.z_step_m / np.sqrt(12.0), 1e-9)
-        # standard error of a median is 1.25 that of a mean; two frames are compared
+        # the standard error of a median is 1.25 times that of a mean; two frames are compared
         shared = CORRELATED_PIXELS / max(len(self.sample), CORRELATED_PIXELS)
         self.jump_m = max(config.jump_sigmas * 1.2533 * sigma * np.sqrt(2.0 * shared), config.jump_mm * MM)
         self.change_m = max(config.changed_sigmas * sigma, config.changed_mm * MM)
         agreeing = stack[np.abs(between[:, middle]) <= self.jump_m]
-        # the median of two frames is their mean, which a fault in either spoils
+        # the median of two frames is their mean, which a fault in either one spoils
         z = pixel_medians(agreeing) if len(agreeing) > 2 else stack[middle]
         self.sampled_z_m, self.offset = z[self.sample], z.astype(np.float64)
-        # the reference frames look better than others, because they chose the pixels that are judged
+        # the reference frames look better than others, because they determined the judged pixels
         usual = [self._change(row)[1] for row in agreeing]
         self.fraction = min(config.disturbed_fraction + 1.5 * float(np.median(usual)) if usual else 1.0, 1.0)
         self.gate: np.ndarray | None = None
         if config.method == "clipped":
             self.gate = np.full(z.shape, np.inf, dtype=np.float32)
             if len(agreeing) > 2:
-                # some sigmas of the frame or, where larger, of the pixel itself
+                # some sigmas of the frame or, if larger, of the pixel itself
                 own = pixel_medians(np.abs(agreeing - z)) / np.float32(0.6745)
                 self.gate = (config.clip_sigmas * np.fmax(own, np.float32(sigma))).astype(np.float32)
         return z.size
@@ -175,7 +176,7 @@ class FrameSums:
         return float(shift), changed / len(self.sample)
 
     def _fault(self, frame: Frame) -> str | None:
-        """Return why this frame does not belong, None if it does."""
+        """Return why this frame does not belong; None if it does."""
         if len(self.sample) == 0:
             return None
         shift, fraction = self._change(frame.z_m.ravel())
@@ -191,14 +192,14 @@ class FrameSums:
         return None
 
     def take(self, frame: Frame) -> None:
-        """Add one frame (h, w), or leave it out. Raises UserError where the median's memory is too small."""
+        """Add one frame (h, w), or leave it out. Raises UserError if the median's memory is too small."""
         fault = self._fault(frame) if self.config.judge_frames else None
         if fault is not None:
             self.left_out.append(LeftOut(frame.name, fault))
             return
         z = frame.z_m.ravel()
         if self.config.method == "median":
-            # the stack is copied once into one block when the median is taken
+            # when the median is taken, the stack is copied once into one block
             kept, allowed = len(self.stack), int(self.config.median_memory_mb * 1e6)
             needed = 2 * 4 * z.size * (kept + 1)
             if needed > allowed:
@@ -211,7 +212,7 @@ class FrameSums:
         gate = np.full(1, np.nan, np.float32) if self.gate is None else self.gate
         sums = self.offset, self.count, self.total, self.squares, self.reasons
         used = _added(z, frame.reason.ravel(), gate, *sums)
-        # further channels over the samples that the depth used
+        # further channels, over the samples that depth uses
         for name, values, width in (("xy", frame.xy_m, 2), ("amplitude", frame.amplitude, 1)):
             if values is not None:
                 empty = np.zeros((z.size, width)), np.zeros((z.size, width), dtype=np.int32)
@@ -222,7 +223,7 @@ class FrameSums:
             self.rgb_frames += 1
 
     def cloud(self) -> Cloud:
-        """Return the average of the frames so far; NaN where no sample was used. Raises UserError where none was."""
+        """Return the average of the frames so far; NaN where no sample was used. Raises UserError if none was."""
         source, count = self.source, self.count
         if not count.any():
             named = "; ".join(f"{left.name}: {left.why}" for left in self.left_out[:3])
@@ -262,8 +263,8 @@ class FrameSums:
 def _added(  # type: ignore[no-untyped-def]
     z, reason, gate, offset, count, total, squares, reasons
 ):
-    """Add a frame's z (n,) less the ``offset`` to the sums, and return (n,) bool where it counts: not where it is
-    farther off than the ``gate`` (n,), of which NaN, for a pixel or for all, is none."""
+    """Add a frame's z (n,) minus the ``offset`` to the sums. Return (n,) bool where it counts: within the ``gate``
+    (n,); NaN, for a pixel or for all, means no gate."""
     used = np.zeros(len(z), np.bool_)
     for i in range(len(z)):
         if not np.isfinite(z[i]):

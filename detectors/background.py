@@ -1,9 +1,9 @@
 """The undamaged surface behind a cloud: its shape is chosen by evidence, and its goodness of fit is judged.
 
-Each shape, fitted to the medians of cells of some 16 pixels or more, predicts tiles of cells that it was not fitted to;
-the simplest whose errors are not significantly larger than the best shape's is taken. Where neighbouring cells still
-depart together, smooth free forms of ever shorter wavelength are tried. Not modelled: creases, several sheets, surfaces
-with real structure as small as damage."""
+Each shape is fitted to the medians of cells of some 16 pixels or more, and predicts tiles of cells that were left out
+of the fit; the simplest shape whose errors are not significantly larger than the best shape's is taken. If neighbouring
+cells still depart together, smooth free forms of ever shorter wavelength are tried. Not modelled: creases, several
+sheets, surfaces with real structure as small as damage."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud
 
 MOST_CELLS, CELL_POINTS, EVEN_CELL_POINTS, ENOUGH_CELLS, FEW_CELLS = 3600, 16, 64, 600, 40
-"""Cells at most, points in each at least, in each where there are enough; with few the shape is not questioned."""
+"""Most cells; points per cell, at least and where there are enough; enough cells; fewest to question the shape."""
 TILE_CELLS, FOLDS = 3, 5
-"""Side of what is predicted together, in cells, and the number of parts that these tiles are dealt to."""
+"""Side, in cells, of a tile that is predicted as a whole, and the number of folds into which the tiles are dealt."""
 LEAST_SCALE_M = 0.04
-"""Damage is taken to be narrower, unless the settings say otherwise: no free form is chosen that follows it."""
+"""Damage is taken to be narrower than this unless the settings differ: no free form that could follow it is chosen."""
 WORTH = 0.1
-"""A shape is as good as the best whose error of prediction is above by this share of a pixel's noise."""
+"""A shape is as good as the best if its error of prediction is larger by at most this share of a pixel's noise."""
 NOISIER = 1.25
-"""Five standard errors of the median of 49 deviations of 16 pixels each: below it noise is taken to be even."""
+"""Five standard errors of the median of 49 deviations of 16 pixels each; below it noise is taken to be even."""
 STEEPEST_DEG = 75.0
-"""Incidence beyond which a surface is not judged: a pixel sees 4 times its width there, and its noise grows."""
+"""Incidence beyond which a surface is not judged: a pixel covers 4 times its width there, and its noise grows."""
 FREE_FORM_FROM, MISFIT_FROM = 0.02, 0.1
-"""Share with structure from which on a free form is tried, and from which on the surface is said not to fit."""
+"""Share of the area with structure from which a free form is tried, and from which a warning of a misfit is given."""
 STATED = ("polynomial", "mesh")
 """Shapes that are not chosen by evidence."""
 STRUCTURE_CELLS, STRUCTURE_SIGMAS, SEEN = 5, 4.0, 0.5
-"""Side of what is averaged to see structure, its least significance, and the share of a pixel's noise."""
+"""Side of the block averaged to see structure, least significance of structure, and share of a pixel's noise."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class _Cells:
 
     @property
     def pixel_noise(self) -> float:
-        """Standard deviation of a pixel: about its cell's median, and of that median."""
+        """Return the standard deviation of a pixel: about its cell's median, combined with that of the median."""
         return float(np.hypot(median_of(self.noise[np.isfinite(self.noise)]), self.level_noise))
 
     def refreshed(self, residuals: np.ndarray, fit: Fit) -> _Cells:
@@ -281,7 +281,7 @@ def _chosen(cells: _Cells, config: SurfaceConfig) -> _Shape:
         if shape is not None:
             shapes.append(shape)
             errors.append(_prediction_errors(cells, shape))
-        # two more that predict no better end the search
+        # the search ends after two more that predict no better
         if len(shapes) > 2 and _simplest(errors, worth) <= len(shapes) - 3:
             break
     best = shapes[_simplest(errors, worth)]
@@ -303,7 +303,7 @@ def _chosen(cells: _Cells, config: SurfaceConfig) -> _Shape:
 
 
 def _fitted(cells: _Cells, name: str, fit_to: Any, wavelength: float | None, widened: bool = False) -> _Shape | None:
-    """Fit by bisquare weights, ``widened`` by the flanks of dents; None where a cell in fifty is missed."""
+    """Fit with bisquare weights, ``widened`` by the flanks of dents; None if a fiftieth of the cells are missed."""
     weights, floor = cells.weights, 0.2 * cells.pixel_noise / np.sqrt(CELL_POINTS)
     for _ in range(6):
         fit = fit_to(cells.points, weights)
@@ -316,7 +316,7 @@ def _fitted(cells: _Cells, name: str, fit_to: Any, wavelength: float | None, wid
         scale, before = max(sigma_of(error[known]), floor), weights
         robust = bisquare_weights(np.where(known, error, np.inf), BISQUARE_TUNING * scale)
         if widened:
-            # cells without weight together with another beside them, and the neighbours of such pairs
+            # cells that have no weight, together with such a neighbour, and the neighbours of such pairs
             image = cells.image((robust == 0).astype(float), 0.0) > 0
             pairs = cv2.filter2D(image.astype(np.uint8), -1, np.ones((3, 3)), borderType=cv2.BORDER_CONSTANT) >= 3
             robust = robust * ~grown(image & pairs, 1)[cells.row, cells.column]
@@ -352,7 +352,7 @@ def _simplest(errors: list[np.ndarray], worth: float) -> int:
 
 
 def _misfit(cells: _Cells, fit: Fit, name: str) -> tuple[str, dict[str, Any]]:
-    """Return a warning where structure is left that would pass for damage, else ""."""
+    """Return a warning where structure remains that would pass for damage, else ""."""
     error = cells.points[:, 2] - fit(cells.points)
     image = cells.image(np.where(np.isfinite(error) & (cells.weights > 0), error, np.nan))
     (noise, shared), pixel = _cell_noise(image), cells.pixel_noise

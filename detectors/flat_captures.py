@@ -1,9 +1,9 @@
-"""A unit's fixed pattern from captures of a flat surface: parts fixed to the pixels and to the surface.
+"""A unit's fixed pattern from captures of a flat surface, divided into parts fixed to the pixels and to the surface.
 
-Each capture's average is a smooth fit, the pattern P at each pixel, the surface's own shape S at each place, and noise.
-Where the captures' poses are known, P and S are solved for together by least squares, with the noise's variances and
-the variance of S, which the captures' disagreement tells. Without poses each capture sees an S of its own, which counts
-as noise and averages out; a camera that did not move sees the same S each time, and nothing can separate it from P.
+Each capture's average is the sum of a smooth fit, the pattern P at each pixel, the surface's own shape S at each place,
+and noise. If the captures' poses are known, P and S are found together by least squares, from the noise's variances and
+that of S, which follows from the captures' disagreement. Without poses each capture has its own S, which counts as
+noise and averages out; a camera that did not move sees the same S each time, and nothing can separate it from P.
 
 The smooth fit is a polynomial in 1/z over the rays' slopes, in which a plane is exact; it absorbs structure wider than
 about a sixth of the image. Not modelled: errors of the stated poses, and the correlation of noise."""
@@ -23,14 +23,14 @@ from harness.vocabulary.geometry import MM, Cloud, Lens, transform_points
 
 SMOOTH = SurfaceConfig(degree=5, method="bisquare")
 OUTLIER_SIGMAS = 6.0
-"""Residuals beyond it are no flat surface's: marks, dirt, flying pixels."""
+"""Larger residuals do not belong to a flat surface: they are marks, dirt or flying pixels."""
 STABLE_SHARE = 0.2
-"""Part of the pattern's rms by which two parts of the captures may differ beyond their noise: 4 % of its variance are
-then left. Where the surface's shape is solved for, it takes up to half of such a change."""
+"""Part of the pattern's rms by which two parts of the captures may differ beyond their noise: 4 % of its variance then
+remain. Where the surface's shape is solved for, it takes up to half of such a change."""
 SURE = 1.1
-"""Ratio of a difference to its noise from which on it is one: shared noise over 30,000 pixels makes 3 % of it."""
+"""Ratio to its noise from which a difference counts: noise that 30,000 pixels share makes 3 % of it."""
 SAME_PLACE_M, SAME_TURN = 2 * MM, 0.003
-"""Change of distance and of the plane's normal (rad) below which nothing shows that a camera was moved by hand: ten
+"""Change of distance and of the plane's normal (rad) below which nothing shows that somebody moved the camera: ten
 times the wander of a static Azure Kinect, and what that wander makes over an image."""
 LEAST_SHIFT_M = 30 * MM
 MOST_STEPS, SOLVED = 200, 1e-5  # of the least squares
@@ -68,7 +68,7 @@ class FlatCapture:
 
     @property
     def residual_rms_m(self) -> float:
-        """Root mean square of pattern, shape and noise."""
+        """Root mean square of pattern, shape and noise together."""
         return _rms(self.residual_m[np.isfinite(self.residual_m)])
 
 
@@ -223,7 +223,7 @@ def _on_one_plane(captures: Sequence[FlatCapture]) -> tuple[FlatCapture, ...]:
 
 
 def _groups(distances: Sequence[float]) -> Iterator[list[int]]:
-    """Yield the numbers of captures at like distances, nearest first, each in their own order."""
+    """Yield the numbers of captures at similar distances, nearest first, each group in its own order."""
     waiting = sorted(range(len(distances)), key=lambda number: distances[number])
     while waiting:
         near = [number for number in waiting if distances[number] <= NEAR_ENOUGH * distances[waiting[0]]]
@@ -243,7 +243,7 @@ def _change(rests: np.ndarray, variances: np.ndarray, one: Sequence[int], other:
 
 
 def _with_doubts(found: Separated) -> Separated:
-    """Return the same with warnings, and a variance that holds for a pattern that is not stable."""
+    """Return the pattern with warnings, and with a variance that holds for a pattern that is not stable."""
     notes, captures, field, rms_m = [], found.captures, found.field, found.field.rms_m
     if len(captures) == 1 or not _moved(captures):
         why = "one capture" if len(captures) == 1 else "nothing shows that the camera moved between the captures"
@@ -252,7 +252,7 @@ def _with_doubts(found: Separated) -> Separated:
     parts = ((found.in_time, "from the first captures to the last"), (found.in_range, "with distance"))
     known = [(part, apart) for part, apart in parts if part is not None and part.difference_m > SURE * part.noise_m]
     changes = [(part, apart) for part, apart in known if part.excess_m > STABLE_SHARE * rms_m]
-    # of two parts that scatter by t each, the mean is off a third one by 3/2 t^2, and their difference is 2 t^2
+    # of two parts that scatter by t each, the mean is off a third part by 3/2 t^2, and their difference is 2 t^2
     variance_m2 = field.variance_m2 + 0.75 * max((part.excess_m for part, _ in changes), default=0.0) ** 2
     if changes:
         why = " and ".join(f"{apart} by {part.excess_m / MM:.2g} mm" for part, apart in changes)

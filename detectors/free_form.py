@@ -14,7 +14,7 @@ from detectors.surface import RIDGE, Fit
 
 KNOTS_PER_WAVELENGTH = 4.0
 """Cubic splines with knots at a quarter of the shortest wave that the penalty lets pass leave the penalty in charge."""
-MOST_KNOTS = 64  # most knots along one side: a limit to time and memory; the free form is then smoother than asked for
+MOST_KNOTS = 64  # most knots along one side: limits time and memory; the free form may then be smoother than requested
 
 
 def free_form(points: np.ndarray, weights: np.ndarray, base: Fit, wavelength: float, cell: float, central: bool) -> Fit:

@@ -13,14 +13,14 @@ from harness.vocabulary.geometry import Cloud
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """A detector's result for each pixel of a cloud before any threshold is applied.
+    """A detector's result for each pixel of a cloud, before any threshold is applied.
 
-    ``score`` (h, w): the threshold below which the pixel counts as damage; NaN where the detector has no opinion.
+    ``score`` (h, w): the threshold below which the pixel counts as damage; NaN where the detector does not judge.
     ``residual_m`` (h, w): distance along the viewing axis behind (+) or before (-) the fitted surface, ``surface_z_m``
-    (h, w). ``scale_m``: the standard deviation that one unit of score is. ``warnings``: full sentences on reasons why
-    these numbers are unreliable; every program shows them first. ``behind`` (h, w) bool: whether the score speaks for
-    something behind the surface; None: by the residual's sign. ``unit``: what a unit of score is, in words, where
-    scores are not residuals over a deviation; ``scale_m`` is then the least that it is at a typical point."""
+    (h, w). ``scale_m``: standard deviation that corresponds to one unit of score. ``warnings``: full sentences on
+    reasons why these numbers are unreliable; every program shows them first. ``behind`` (h, w) bool: whether the score
+    indicates something behind the surface; None: the residual's sign does. ``unit``: the unit of score in words, if
+    scores are not residuals over a deviation; ``scale_m`` is then its least value at a typical point."""
 
     score: np.ndarray
     residual_m: np.ndarray
@@ -35,9 +35,9 @@ class Evidence:
 @dataclass(frozen=True)
 class Detection:
     """A finding. ``score``: the lowest threshold at which it is no longer found. ``pixels`` (n,): flat indices into the
-    cloud's (h, w) grid, ascending; ``centre_m`` (3,): its place in the cloud's frame, which decides for which damage it
-    counts. ``kind``: "depth" for points that depart from the surface, "no return" for connected pixels (then invalid)
-    inside the target's outline that returned nothing, "object" for an object that lies on the target."""
+    cloud's (h, w) grid, ascending. ``centre_m`` (3,): its place in the cloud's frame, by which it is matched with
+    damage. ``kind``: "depth" for points that depart from the surface; "no return" for connected pixels without return
+    (then invalid) inside the target's outline; "object" for an object on the target."""
 
     score: float
     pixels: np.ndarray
@@ -49,11 +49,11 @@ class Detection:
 class MissingReturns:
     """Pixels without a return inside the target's ``outline`` (h, w) bool.
 
-    ``unseen`` (h, w): share of the frames (of a map 0 or 1) in which a pixel returned nothing. ``blind``: share of the
-    outline's pixels without any return. ``dropouts``: rate of scattered missing pixels. ``least_points``: size from
-    which on a cluster is a finding, ``expected`` the number of such chance clusters. ``detections``: kind "no return",
-    largest first; the score is the Gaussian deviation as improbable as the expected number of chance clusters as large,
-    at most 37."""
+    ``unseen`` (h, w): share of the frames (of a map: 0 or 1) in which a pixel returned nothing. ``blind``: share of the
+    outline's pixels without any return. ``dropouts``: rate of scattered missing pixels. ``least_points``: smallest
+    cluster that is a finding; ``expected``: number of such clusters by chance. ``detections``: kind "no return",
+    largest first. Their score is the Gaussian deviation with the same probability as the expected number of chance
+    clusters of that size, at most 37."""
 
     outline: np.ndarray
     unseen: np.ndarray
@@ -65,7 +65,7 @@ class MissingReturns:
 
     @property
     def blind_text(self) -> str:
-        """A sentence on how much of the target is blind, and how much of that chance explains."""
+        """Return a sentence on the blind share of the target, and the part of it that chance explains."""
         places = f"{len(self.detections)} place{'' if len(self.detections) == 1 else 's'}"
         chance = f"{self.expected:.1g} expected by chance; scattered dropouts {100 * self.dropouts:.2g} %"
         places += f" of {self.least_points} connected pixels and more ({chance})"
@@ -73,19 +73,19 @@ class MissingReturns:
 
     @property
     def facts(self) -> dict[str, float]:
-        """Figures as plain data."""
+        """Return these figures as plain data."""
         facts = {"blind_share": self.blind, "scattered_dropouts": self.dropouts}
         return {**facts, "least_points": self.least_points, "expected_by_chance": self.expected}
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """Size and place of one detection, camera frame, metres; NaN where an estimate could not be made (``model_note``).
+    """Size and place of one detection, camera frame, metres; NaN where an estimate is impossible (``model_note``).
 
-    ``length_m``, ``width_m``, ``along`` (3,): sides of a rectangle with the second moments of the residual, less the
-    camera's blur, and the direction of the longer one; of a slot its size, of a round hole of diameter d 0.87 d each.
-    ``extent_*``: the thesis' measure from the extreme points. ``model_*``: from the model of a blurred hole, with
-    standard errors. ``depth_m`` is measured along the viewing axis from the fitted surface, positive behind it."""
+    ``length_m``, ``width_m``, ``along`` (3,): sides of the rectangle with the second moments of the residual, less the
+    camera's blur, and the direction of the longer one. For a slot these are its sides; for a round hole of diameter d,
+    0.87 d each. ``extent_*``: the thesis' measure, from the extreme points. ``model_*``: from the model of a blurred
+    hole, with standard errors. ``depth_m``: along the viewing axis from the fitted surface, positive behind it."""
 
     u_px: float
     v_px: float
@@ -108,8 +108,8 @@ class Measurement:
 
 @dataclass(frozen=True)
 class TrueDamage:
-    """A true damage, as given to a detector that tests the harness: centre (3,) on the face in the cloud's frame,
-    diameter, and the flat indices of the pixels that see into it."""
+    """A true damage, given to detectors that test the harness: centre (3,) on the face in the cloud's frame, diameter,
+    and the flat indices of the pixels that see into it."""
 
     centre_m: np.ndarray
     diameter_m: float
@@ -118,7 +118,7 @@ class TrueDamage:
 
 @runtime_checkable
 class ToldTheTruth(Protocol):
-    """A detector that receives the truth, to test the harness; no detector of damage implements this."""
+    """A detector that receives the truth in order to test the harness; no real detector implements this."""
 
     def told(self, truth: tuple[TrueDamage, ...]) -> Detector:
         """Return the detector for one cloud with this truth; empty on a hole-free board."""
@@ -127,13 +127,13 @@ class ToldTheTruth(Protocol):
 
 @runtime_checkable
 class Calibratable(Protocol):
-    """A detector that learns from hole-free clouds before it judges: the noise's spectrum, its tails, a memory of the
-    undamaged face. The result is plain arrays, so that it can be stored and sent; names are identifiers."""
+    """A detector that learns from hole-free clouds before it judges, such as the noise's spectrum, its tails, or a
+    memory of the undamaged face. The result is plain arrays named by identifiers, so that it can be stored and sent."""
 
     def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
-        """Return what was learned from the clouds, as arrays without objects; empty where there is nothing to learn.
-        The clouds were taken as those that will be judged (camera, frames, average), of targets without damage. Changes
-        neither the detector nor the clouds. Raises UserError where they cannot be judged or are too few."""
+        """Return what was learned from the clouds, as arrays without objects; empty if there is nothing to learn. The
+        clouds show targets without damage and were taken like those to be judged (camera, frames, average). Neither the
+        detector nor the clouds change. Raises UserError if clouds cannot be judged or are too few."""
         ...
 
     def calibrated(self, learned: Mapping[str, np.ndarray]) -> Detector:
@@ -142,17 +142,17 @@ class Calibratable(Protocol):
 
 
 class Detector(Protocol):
-    """A detector sees a cloud and never the truth. Its settings are a `harness.vocabulary.config.Config`."""
+    """A detector receives a cloud and never the truth. Its settings are a `harness.vocabulary.config.Config`."""
 
     @property
     def name(self) -> str: ...
     @property
     def version(self) -> int:
-        """Version number; every change that can change a result raises it."""
+        """Version number; increased with every change that can change a result."""
         ...
 
     def analyse(self, cloud: Cloud) -> Evidence:
-        """Score every pixel. Raises UserError where the cloud cannot be judged (empty crop, too few points)."""
+        """Score every pixel. Raises UserError if the cloud cannot be judged (empty crop, too few points)."""
         ...
 
     def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:

@@ -1,11 +1,11 @@
-"""Holes, dents and bumps against the surface around them: filters of several widths, each on its own local noise.
+"""Detects holes, dents and bumps by filters of several widths, each relative to its surroundings and its local noise.
 
-A pixel is judged by means over windows of several widths against the mean of the surroundings of each. One unit of
-score is the standard deviation of that difference as it is measured round about, so that correlated noise, a fixed
-pattern and texture raise the threshold where they are. Findings are peaks of the score.
+A pixel is judged by means over windows of several widths, each compared with the mean of its surroundings. One unit of
+score is the standard deviation of that difference as measured nearby, so that correlated noise, a fixed pattern and
+texture raise the threshold where they are. Findings are peaks of the score.
 
-Not modelled: the noise's spectrum, damage that is narrower than a pixel or wider than the widest filter, texture that
-resembles damage, and steps of the noise within a window."""
+Not modelled: the noise's spectrum, damage narrower than a pixel or wider than the widest filter, texture that resembles
+damage, and steps of the noise within a window."""
 
 from __future__ import annotations
 
@@ -32,26 +32,26 @@ from harness.vocabulary.geometry import Cloud
 
 HALF_WIDTHS = (1, 2, 3, 5, 8, 12, 18, 27, 40, 60, 90)
 """Half-widths of the filters in pixels: a tent of half-width h is as wide at half of its height as a hole of 2 h + 1
-pixels. The ratio of 1.5 keeps nine tenths of the signal of a width between two."""
+pixels. The ratio of 1.5 keeps nine tenths of the signal of a width between two of them."""
 SURROUNDINGS, WIDEST_SHARE = 3, 6.0
-"""The filter so many steps wider is a filter's surroundings; and the target's least width in widest filters."""
+"""A filter's surroundings are the filter so many steps wider; and the target's least width in widest filters."""
 FAINT = 0.02
-"""Weight that 0 has in every mean."""
+"""Weight of the value 0 in every mean."""
 CLIP_SIGMAS, LEVEL_SIGMAS = 6.0, 2.0
-"""Deviations of the local noise beyond which no single pixel counts for more: a flying pixel alone is no finding; and
-the same for the local level and for surroundings, which damage must not draw."""
+"""Clipping of single pixels in deviations of the local noise, because a flying pixel alone is no finding; and the same
+for the local level and for surroundings, which damage must not shift."""
 STRONG = 4.0
-"""Pixels with such scores are kept out of surroundings and noise; with twice as much, out of others' wider means."""
+"""Pixels with such scores are excluded from surroundings and noise; with twice as much, from others' wider means."""
 GATE_SHARE, GATE_SIGMAS = 0.5, 1.5
-"""Share of a wider filter's signal that narrower ones must confirm, and the noise that is granted to them."""
+"""Share of a wider filter's signal that narrower filters must confirm, and the allowance for their noise."""
 WINDOW_WIDTHS, LEAST_WINDOW, SAMPLES_SIDE, LEAST_SAMPLES = 6, 32, 14, 32
-"""Half of the window of the local noise: so many times the filter's half-width, and pixels at least: some 200
-independent means, which give a standard deviation to 8 %; samples from its middle to its edge, as neighbours in a mean
-tell nothing new; and fewest finite samples of a local median."""
+"""Half of the window of the local noise, in half-widths of the filter and at least in pixels: some 200 independent
+means, which give a standard deviation to 8 %; samples from its middle to its edge, because neighbours in a mean add
+nothing new; and the fewest finite samples of a local median."""
 SADDLE, PROMINENCE = 0.75, 1.5
-"""Two peaks are one where the saddle is higher than this share of the lower, or fewer units of score below it."""
+"""Two peaks are one if the saddle is higher than this share of the lower one, or fewer units of score below it."""
 CORE = 0.5
-"""A finding's size is taken of the pixels with this share of its score or more."""
+"""A finding's size is measured on the pixels with at least this share of its score."""
 
 
 class FilterConfig(Config):
@@ -76,15 +76,15 @@ class LocalConfig(FilterConfig):
 
 @dataclass(frozen=True, eq=False)
 class LocalEvidence(Evidence):
-    """``signed`` (r, c): the score of each cell of a picture, negative before the surface. ``cell`` (h, w): the
-    flat index of each point's cell in it, -1 where there is no score."""
+    """``signed`` (r, c): score of each cell of a picture, negative in front of the surface. ``cell`` (h, w): flat index
+    of each point's cell, -1 where there is no score."""
 
     signed: np.ndarray = None  # type: ignore[assignment]
     cell: np.ndarray = None  # type: ignore[assignment]
 
 
 class LocalPicture(NamedTuple):
-    """Input of `LocalDetector.scored`: the surface, each point's cell (h, w), and ``residuals``, its arguments."""
+    """Input of `LocalDetector.scored`: the surface, the cell (h, w) of each point, and the arguments ``residuals``."""
 
     ground: Background
     cell: np.ndarray
@@ -92,7 +92,7 @@ class LocalPicture(NamedTuple):
 
 
 class LocalDetector:
-    """Filters of several widths against their surroundings, on the scale of the local noise; findings are peaks."""
+    """Filters of several widths relative to their surroundings, in units of the local noise; findings are peaks."""
 
     settings_type: ClassVar[type[FilterConfig]] = LocalConfig
     name = "local"
@@ -102,12 +102,12 @@ class LocalDetector:
         self.settings = settings
 
     def picture(self, cloud: Cloud, pixels: int = 1) -> LocalPicture:
-        """Return the residuals of the crop on a grid, of an organised cloud the means over squares of so many
-        ``pixels`` a side. Raises UserError on an empty crop and where no surface can be fitted."""
+        """Return the residuals of the crop on a grid; for an organised cloud, the means over squares of ``pixels`` a
+        side. Raises UserError on an empty crop, or if no surface can be fitted."""
         mask = crop(cloud, self.settings.crop)
         ground = background(cloud, mask, self.settings.surface)
         judged = mask & np.isfinite(ground.residual_m)
-        # the points are filtered on a grid: the cloud's own, cut to its judged part, or a raster where it has none
+        # the points are filtered on a grid: the cloud's own, cut to its judged part, or a raster if it has none
         if cloud.organised:
             rows, columns = np.nonzero(judged)
             rows, columns = (rows - rows.min()) // pixels, (columns - columns.min()) // pixels
@@ -125,7 +125,7 @@ class LocalDetector:
         return LocalPicture(ground, cell, residuals)
 
     def analyse(self, cloud: Cloud) -> LocalEvidence:
-        """Score every pixel of the crop. Raises UserError on an empty crop and where no surface can be fitted."""
+        """Score every pixel of the crop. Raises UserError on an empty crop, or if no surface can be fitted."""
         ground, cell, residuals = self.picture(cloud)
         signed, typical_m, unit = self.scored(*residuals)
         judged = cell >= 0
@@ -145,16 +145,16 @@ class LocalDetector:
         return signed, typical_m, f"{text}, {1e3 * typical_m:.3g} mm for the narrowest at a typical point"
 
     def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
-        """Return peaks of the score with the pixels above the threshold that belong to each, strongest first. The
-        centre is the mean of a finding's core, each pixel weighted by how far its score exceeds the core's least."""
+        """Return peaks of the score, strongest first, each with the pixels above the threshold that belong to it. The
+        centre is the mean of a finding's core, with pixels weighted by how far their score exceeds the core's least."""
         return self.findings(cloud, evidence, [threshold])[0].detections
 
     def findings(self, cloud: Cloud, evidence: Evidence, thresholds: Sequence[float]) -> list[Findings]:
-        """Return what `find` returns at each of the thresholds, which rise."""
+        """Return the results of `find` at each of the thresholds, which ascend."""
         assert isinstance(evidence, LocalEvidence)
         sizes = np.abs(evidence.signed).ravel()
-        # saddles below a threshold part or join peaks as those above it do, or a peak would be two at some thresholds;
-        # the lowest threshold's saddles decide nothing of the peaks above a higher one
+        # saddles below a threshold also part or join peaks; otherwise a peak would be two at some thresholds. The
+        # lowest threshold's saddles do not affect peaks above a higher one
         cells = np.flatnonzero(sizes > max(min(SADDLE * thresholds[0], thresholds[0] - PROMINENCE), 0.0))
         order = cells[np.argsort(-sizes[cells], kind="stable")]
         peak_of = np.full(sizes.size, -1, dtype=np.int64)
@@ -179,19 +179,19 @@ class LocalDetector:
         return float(np.nanmax(evidence.score, initial=0.0))
 
     def measure(self, cloud: Cloud, evidence: Evidence, detection: Detection) -> Measurement:
-        """Measure the thesis' extents, and the model of a blurred hole, of the finding's core."""
+        """Measure the thesis' extents and the model of a blurred hole on the finding's core."""
         scores = evidence.score.reshape(-1)[detection.pixels]
         core = replace(detection, pixels=detection.pixels[scores >= CORE * detection.score])
         return measure_detection(cloud, evidence, core, self.settings.hole_model, self.correlation(evidence))
 
     def correlation(self, evidence: Evidence) -> np.ndarray | None:
-        """Return the noise's correlation (odd, odd) by lag, by which sizes are weighed; None where it is not known."""
+        """Return the noise's correlation (odd, odd) by lag, which weighs sizes; None if unknown."""
         return None
 
 
 def _shares(cloud: Cloud, judged: np.ndarray, residual_m: np.ndarray) -> np.ndarray:
-    """Return the weight (n,) of each judged point: the median variance over its own, 4 at most; 1 where variances are
-    not known. The cloud's maker states them, or the frames' scatter round about and what is fixed in all frames."""
+    """Return the weight (n,) of each judged point: the median variance over its own, at most 4; 1 if variances are
+    unknown. They come from the cloud's maker, or from the scatter of frames nearby plus what is fixed in all frames."""
     if cloud.mean_variance_m2 is not None:
         variances = cloud.mean_variance_m2[judged]
     else:
@@ -210,17 +210,17 @@ def _scored(
     """Return signed scores (r, c) of a picture ``residual`` (r, c) metres with ``weights`` (r, c), 0 where nothing is
     known; the filters' widths in pixels; and the deviation of the narrowest at a typical point, metres.
 
-    From the narrowest filter to the widest: a pixel that is sure in one, by a share from 0 to 1, takes no part in the
-    wider ones of other pixels; a strong pixel takes no part in surroundings and noise. A sure pixel's score still grows
-    with the width, where narrower means confirm it (`_strongest`)."""
+    Filters are applied from the narrowest to the widest. A pixel that is sure in one filter, by a share from 0 to 1, is
+    excluded from the wider means of other pixels; a strong pixel is excluded from surroundings and noise. A sure
+    pixel's score still grows with the width, if narrower means confirm it (`_strongest`)."""
     seen = weights > 0
-    # in units of the typical pixel's noise: single precision is then enough
+    # in units of a typical pixel's noise, so that single precision is enough
     unit_m = max(sigma_of(residual[seen]), float(np.sqrt(sum(rounding_m2))), 1e-9)
     fixed, random = (variance / unit_m**2 for variance in rounding_m2)
     extent = min(int(seen.any(axis=axis).sum()) for axis in (0, 1))
     count = max(1, sum(WIDEST_SHARE * (2 * h + 1) <= extent for h in HALF_WIDTHS[:-SURROUNDINGS]))
 
-    # residuals less their level, no farther from it than the local noise allows filters, and their surroundings
+    # residuals minus their level, clipped to what the local noise allows filters, and minus their surroundings
     widest = HALF_WIDTHS[count + SURROUNDINGS - 1]
     values: np.ndarray = (residual / unit_m).astype(np.float32)
     known, level = _tent(weights, widest) + FAINT, np.zeros_like(values)
@@ -244,7 +244,7 @@ def _scored(
         worth = np.sqrt(_worth((1.0 - sure) * weights, covered, half))
         for _ in range(2):
             around, _ = _mean(modest, quiet * weights, wide)
-            # differences are brought to the noise of a whole window
+            # scale differences to the noise of a whole window
             difference = (mean - around) * worth
             sigma = local_sigma(np.where(seen & (quiet > 0), difference, np.nan), window, floor)
             score = np.where(seen, difference / sigma, 0.0)
@@ -262,24 +262,24 @@ def _scored(
 
 
 def _mean(values: np.ndarray, weights: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weighted mean (r, c) of values, drawn towards 0 where little is known, and that of weights."""
+    """Return the weighted mean (r, c) of values, drawn towards 0 where little is known, and the mean of weights."""
     covered = _tent(weights, half)
     return _tent(values * weights, half) / (covered + FAINT), covered
 
 
 def _tent(image: np.ndarray, half: int) -> np.ndarray:
-    """Average over a square of 2 ``half`` + 1 pixels, twice; what lies beyond the edges counts as 0."""
+    """Average over a square of 2 ``half`` + 1 pixels, twice; values beyond the edges count as 0."""
     size = (2 * half + 1, 2 * half + 1)
     once = cv2.blur(np.ascontiguousarray(image, np.float32), size, borderType=cv2.BORDER_CONSTANT)
     return np.asarray(cv2.blur(once, size, borderType=cv2.BORDER_CONSTANT))
 
 
 def _worth(weights: np.ndarray, covered: np.ndarray, half: int) -> np.ndarray:
-    """Return the variance (r, c) of a tent's mean of white noise where all weights are 1 over that of its mean by
+    """Return the variance (r, c) of a tent's mean of white noise with all weights 1, over that of its mean with
     ``weights``, whose own mean is ``covered``."""
     side = np.convolve(np.ones(2 * half + 1), np.ones(2 * half + 1)) ** 2
     side /= side.sum()
-    # in double precision, so that the order of its sums does not tell which way the picture is turned
+    # in double precision, so that the order of sums does not depend on the orientation of the picture
     squares = cv2.sepFilter2D(weights.astype(np.float64), -1, side, side, borderType=cv2.BORDER_CONSTANT)
     return np.asarray((covered * np.minimum(covered / np.maximum(squares, 1e-6), 1.0)).astype(np.float32))
 
@@ -287,12 +287,12 @@ def _worth(weights: np.ndarray, covered: np.ndarray, half: int) -> np.ndarray:
 def local_sigma(
     values: np.ndarray, half: int = LEAST_WINDOW, floor: float = 0.0, samples: int = SAMPLES_SIDE
 ) -> np.ndarray:
-    """Return the robust standard deviation (r, c) of the values' finite neighbours, so many ``samples`` of them from
-    the window's middle to its edge, interpolated between nodes ``half`` apart."""
+    """Return the robust standard deviation (r, c) of the values' finite neighbours, from so many ``samples`` from the
+    window's middle to its edge, interpolated between nodes ``half`` apart."""
 
     def nodes_of(length: int) -> np.ndarray:
-        """Return the middles of equal parts, where `cv2.resize` takes its samples to lie, moved to pixels such that
-        they lie alike from both ends."""
+        """Return the centres of equal parts, where `cv2.resize` assumes its samples, moved to pixels so that they are
+        symmetric about both ends."""
         count = max(1, round(length / half))
         count += (length - count) % 2 if length % 2 == 0 else 0
         half_pixel = 0.5 if length % 2 == 0 else 0.0
@@ -313,7 +313,7 @@ def local_sigma(
 
 @numba.njit(**PLAIN)
 def _local_medians(values: np.ndarray, rows: np.ndarray, columns: np.ndarray, half: int, stride: int) -> np.ndarray:
-    """Return the medians (r, c) of finite sizes in windows of 2 ``half`` + 1 about nodes, every ``stride``-th."""
+    """Return the medians (r, c) of finite sizes in windows of 2 ``half`` + 1 around nodes, every ``stride``-th."""
     h, w = values.shape
     medians = np.full((len(rows), len(columns)), np.nan)
     side = 2 * (half // stride) + 1
@@ -334,10 +334,10 @@ def _local_medians(values: np.ndarray, rows: np.ndarray, columns: np.ndarray, ha
 
 
 def _strongest(means: np.ndarray, around: np.ndarray, deviation: np.ndarray) -> np.ndarray:
-    """Return the largest (n,) (mean - around) / deviation in size, with its sign, over filters (k, n) from narrow to
-    wide; 0 where no filter has its say. A wide filter, which reaches over what lies beside it, has its full say only
-    where all narrower means depart from the same surroundings by `GATE_SHARE` of what its own does, less `GATE_SIGMAS`
-    of their deviations; and none where one departs by half as much."""
+    """Return the largest (n,) (mean - around) / deviation by size, with its sign, over filters (k, n) from narrow to
+    wide; 0 where no filter counts. A wide filter also covers what lies beside it. So it counts fully only if all
+    narrower means depart from the same surroundings by `GATE_SHARE` of its own departure, minus `GATE_SIGMAS` of their
+    deviations; it does not count if one departs by half as much."""
     best = np.zeros(means.shape[1], np.float32)
     for k in range(len(means)):
         signal = means[k] - around[k]
@@ -351,9 +351,9 @@ def _strongest(means: np.ndarray, around: np.ndarray, deviation: np.ndarray) -> 
 
 @numba.njit(**PLAIN)
 def _peaks(score: np.ndarray, order: np.ndarray, saddle: float, prominence: float) -> np.ndarray:
-    """Return (n,) for each of the pixels ``order`` (n,), flat indices in falling order of size of the score (h, w), the
-    place in ``order`` of the peak that it belongs to. Pixels join the highest neighbouring peak of their sign; two
-    peaks that meet become one as `SADDLE` and `PROMINENCE` say."""
+    """Return (n,), for each of the pixels ``order`` (n,), flat indices in falling size of the score (h, w), the index
+    in ``order`` of the peak that it belongs to. Pixels join the highest neighbouring peak of their sign; two peaks that
+    meet become one by the rules of `SADDLE` and `PROMINENCE`."""
     h, w = score.shape
     place = np.full(h * w, -1, np.int64)
     parents = np.empty(len(order), np.int64)
@@ -373,7 +373,7 @@ def _peaks(score: np.ndarray, order: np.ndarray, saddle: float, prominence: floa
                     count += 1
         if count == 0:
             continue
-        # an earlier place is a higher peak
+        # an earlier index is a higher peak
         highest = met[:count].min()
         parents[n] = highest
         height = abs(flat[pixel])

@@ -1,24 +1,24 @@
-"""Holes, dents and bumps by a bank of matched filters on whitened noise.
+"""Detects holes, dents and bumps by a bank of matched filters on whitened noise.
 
-The residuals' autocovariance, temporal noise and fixed pattern together, is measured on the capture itself, off what
-stands out, or learned from hole-free clouds. Each template t (discs of several radii through a camera's window or lens,
-slots at several angles, dents) is then compared with the residuals r of the known pixels under that covariance C:
+The residuals' autocovariance, temporal noise and fixed pattern together, is measured on the capture itself, without
+strong residuals, or learned from hole-free clouds. Each template t (discs of several radii through a camera's window or
+lens, slots at several angles, dents) is then compared with the residuals r of the known pixels under that covariance C:
 
 score = t' C^-1 r / sqrt(t' C^-1 t)
 
 C^-1 r is solved for by conjugate gradients, so missing pixels and borders add nothing and need no filling. The scores
-of each template are then divided by the deviation that they have, for each distance from the outline on its own. Wide
-templates have few independent places, so their scores are raised (`detectors.whitening.Worth`).
+of each template are then divided by their own deviation, separately for each distance from the outline. Wide templates
+have few independent places, so their scores are raised (`detectors.whitening.Worth`).
 
 Strong findings are removed (their pixels count as unknown) and the rest is judged again, so that no filter sees the
-shoulder of a neighbour's hole. What pixels along the target's outline share beyond those farther in is subtracted.
-Depth that was upsampled is judged on squares of pixels in which its noise reaches no farther than a camera's window.
+shoulder of a neighbouring hole. What pixels along the target's outline share beyond those farther in is subtracted.
+Upsampled depth is judged on squares of pixels in which its noise reaches no farther than a camera's window.
 
-Not modelled: slots that no template fits; slots within `RIM_PX` of outlines and of what was taken out; templates'
-distortion where a surface is steep; missing returns but for the few that are no findings by themselves
-(`detectors.missing`). The denominator takes the share of a template's whitened energy on known pixels for t' C^-1 t, by
-a rectangle that spreads as widely; places where less than `LEAST_SEEN` of it is seen are not judged by that template.
-Scores of slots are taken on every second pixel."""
+Not modelled: slots that no template fits; slots within `RIM_PX` of outlines and of removed findings; distortion of
+templates on steep surfaces; missing returns, except the few that are no findings by themselves (`detectors.missing`).
+The denominator takes the share of a template's whitened energy on known pixels for t' C^-1 t, by a rectangle that
+spreads as widely; a template does not judge places where less than `LEAST_SEEN` of it is visible. Scores of slots are
+taken on every second pixel."""
 
 from __future__ import annotations
 
@@ -53,42 +53,42 @@ from harness.vocabulary.geometry import Cloud
 
 LEAST_SEEN = 0.6
 SHORT_PX = 13
-"""Width over which noise is compared from place to place: what is wider counts there as much as elsewhere."""
+"""Width over which noise is compared between places: wider filters count there as much as elsewhere."""
 QUIET_SIGMAS = 4.0
-"""Pixels beyond it, and their neighbours, do not count for the covariance."""
+"""Residuals beyond it, and their neighbours, do not count for the covariance."""
 CLIP_SIGMAS = 5.0
-"""Deviations beyond which no pixel counts for more than its neighbours: a flying pixel alone is no finding."""
+"""Deviations to which a pixel is clipped if its neighbours are smaller: a flying pixel alone is no finding."""
 STRONG, LOUD_SIGMAS, MARGIN_PX = 6.0, 3.0, 2
-"""A peak of this score, the louder pixels joined to it, and those around are taken out; the rest is judged again."""
+"""A peak with this score, the loud pixels connected to it, and those around are removed; the rest is judged again."""
 LOUD_SHARE = 0.5
 """The loud pixels at a peak fill at least this share of its template's disc."""
 ALONE_PX = 7
 """Half of the square in which a peak is the highest."""
 RIM_PX = 6
-"""Depth of the target's rim: the camera's window and lens reach so far over its edge."""
+"""Depth of the target's rim, to which the camera's window and lens reach over its edge."""
 RIM_ENDS_PX = (1, 2, 3, 5, 8, 12)
-"""Distances from the outline up to which scores are set beside the scatter of their own; all beyond are alike."""
+"""Distances from the outline up to which scores have their own scatter; beyond, all are alike."""
 N_ZONES = len(RIM_ENDS_PX) + 1
 ZONES = np.searchsorted(RIM_ENDS_PX, np.arange(RIM_ENDS_PX[-1] + 2)).astype(np.uint8)
 WINDOW_RADII, PART_PX, UNEVEN = 6, 8, 1.25
-"""Half of the window of the local scatter in radii, the side of its squares, and what chance and damage may explain."""
+"""Half of the window of the local scatter in radii, the side of its squares, and scatter that chance explains."""
 CAP, FEWEST = 2.0, 200
-"""Scores count for no more in their scatter, and fewer do not tell it."""
+"""Largest score that counts in the scatter, and the fewest scores that determine it."""
 DEVIATIONS = np.geomspace(0.2, 50.0, 200)
 CAPPED = DEVIATIONS * np.sqrt(2.0 / np.pi) * (1.0 - np.exp(-0.5 * (CAP / DEVIATIONS) ** 2)) + 2.0 * CAP * special.ndtr(
     -CAP / DEVIATIONS
 )
 CAPPED_UNEVEN = float(np.interp(UNEVEN, DEVIATIONS, CAPPED))
-"""Deviations of a Gaussian, and the mean of its size where more than `CAP` counts as that."""
+"""Deviations of a Gaussian, and the mean of its size if more than `CAP` counts as `CAP`."""
 FAINT = 3.5
-"""Scores below are raised by the same factor: what is counted there is not maxima."""
+"""Scores below are all raised by the same factor, because Worth counts maxima."""
 LOBE_SHARE = 0.5
-"""A score so much smaller than one of the other sign within `RIM_PX` is the lobe that whitening leaves."""
+"""A score that is so much smaller than one of the other sign within `RIM_PX` is a lobe left by whitening."""
 WIDE_PX = 5.0
-"""Radius from which on noise may break a template's finding into several peaks."""
+"""Radius from which on noise may split a template's finding into several peaks."""
 TAIL_PX, TAIL_SHARE, TAIL_SIGMAS = 1.5, 0.0005, 3.29
-"""Radius up to which a template's scores tell their own tail, the share of pixels beyond it on either side, and where
-a Gaussian has it. Wider means are near Gaussian, and too few of them are independent."""
+"""Largest radius at which a template's own scores show their tail; the share of pixels beyond it on either side; and
+where a Gaussian has it. Wider means are near Gaussian, and too few of them are independent."""
 
 
 class MatchedConfig(FilterConfig):
@@ -108,8 +108,8 @@ class MatchedDetector(LocalDetector):
         self._covariance = covariance
 
     def analyse(self, cloud: Cloud) -> LocalEvidence:
-        """Score every pixel of the crop, by its depth and by the missing pixels round about: the logarithms of the two
-        likelihoods add up. Raises UserError on an empty crop and where no surface can be fitted."""
+        """Score every pixel of the crop by its depth and by the missing pixels around: the logarithms of the two
+        likelihoods add up. Raises UserError on an empty crop, or if no surface can be fitted."""
         evidence = super().analyse(cloud)
         lost = missing_evidence(cloud, evidence)
         if lost is None:
@@ -125,7 +125,7 @@ class MatchedDetector(LocalDetector):
     def scored(
         self, residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]
     ) -> tuple[np.ndarray, float, str]:
-        """Return signed scores (r, c), the deviation of the narrowest template's depth (m), and the unit."""
+        """Return signed scores (r, c), the deviation of the narrowest template's depth (m), and the unit of score."""
         values, unit_m, known = _in_deviations(residual_m, weights, rounding_m2)
         signed, narrowest = _judged(values, known, self._covariance)
         depth_m = narrowest * float(np.median(unit_m[known]))
@@ -133,7 +133,7 @@ class MatchedDetector(LocalDetector):
         return signed, depth_m, text
 
     def correlation(self, evidence: Evidence) -> np.ndarray:
-        """Return the learned correlation of the noise by lag, or that of the residuals."""
+        """Return the correlation of the noise by lag, learned or from the residuals."""
         covariance = _own_covariance(evidence) if self._covariance is None else self._covariance
         reach = np.arange(-whitening.LONGEST_LAG_PX, whitening.LONGEST_LAG_PX + 1)
         grid = (whitening.GRID, whitening.GRID)
@@ -141,25 +141,25 @@ class MatchedDetector(LocalDetector):
         return np.asarray(lags / lags[whitening.LONGEST_LAG_PX, whitening.LONGEST_LAG_PX], np.float64)
 
     def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
-        """Return the mean covariance of the clouds' residuals, in squared deviations of the local noise, by lag."""
+        """Return the mean covariance of the clouds' residuals by lag, in squared deviations of the local noise."""
         pictures = (self.picture(cloud) for cloud in hole_free)
         seen = [_covariance(*_in_deviations(*one.residuals)[::2]) for one in pictures]
         return {"covariance": np.mean(seen, axis=0)} if seen else {}
 
     def calibrated(self, learned: Mapping[str, np.ndarray]) -> MatchedDetector:
-        """Return the detector that whitens by the learned covariance instead of the capture's own."""
+        """Return the detector that whitens with the learned covariance instead of the capture's own."""
         return type(self)(self.settings, learned.get("covariance"))
 
 
 def _in_deviations(
     residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return residuals (r, c) in units of the noise round about, louder where a point's own variance says so, and less
-    what they share along the outline; that unit (r, c) in metres; and (r, c) bool, what is known."""
+    """Return residuals (r, c) in units of the noise nearby, increased where a point's own variance is larger, and minus
+    what they share along the outline; that unit (r, c) in metres; and (r, c) bool, the known pixels."""
     known = weights > 0
     floor_m = max(float(np.sqrt(sum(rounding_m2))), 1e-9)
     values = np.where(known, residual_m * np.sqrt(weights), 0.0).astype(np.float32)
-    # what is wider than a filter's window, objects and the surface's misfit, is no noise of pixels
+    # structure wider than a filter's window, objects and the surface's misfit are not noise of pixels
     side = (SHORT_PX, SHORT_PX)
     around = (cv2.blur(each, side, borderType=cv2.BORDER_REFLECT) for each in (values, known.astype(np.float32)))
     short = np.where(known, values - next(around) / np.maximum(next(around), 1e-6), np.nan)
@@ -177,7 +177,7 @@ def _own_covariance(evidence: Evidence) -> np.ndarray:
 
 
 def _covariance(noise: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return the covariance of the residuals that do not stand out, off the rim unless most pixels lie there."""
+    """Return the covariance of weak residuals, away from the rim unless most pixels lie there."""
     inner = known & (_depth_px(known) > RIM_PX)
     inner = inner if 2 * inner.sum() > known.sum() else known
     loud = cv2.dilate((np.abs(noise) > QUIET_SIGMAS).astype(np.uint8), np.ones((5, 5), np.uint8))
@@ -185,7 +185,7 @@ def _covariance(noise: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 class _Noise(NamedTuple):
-    """The bank before a picture's noise: ``grid`` of its transforms, ``power`` there, and each template's `Worth`."""
+    """The bank for a picture's noise: ``grid`` of its transforms, ``power`` there, and each template's `Worth`."""
 
     grid: tuple[int, ...]
     power: np.ndarray
@@ -201,7 +201,7 @@ def _judged(values: np.ndarray, known: np.ndarray, covariance: np.ndarray | None
     worth_of = whitening.worths(whitening.spectrum(covariance, (whitening.GRID, whitening.GRID)), window_px)
     noise = _Noise(grid, whitening.spectrum(covariance, grid), window_px, worth_of)
     tamed = _tamed(values)
-    # what stands out strongly, as round templates see it
+    # strong residuals, as seen by round templates
     signed, by, solved = _scored(tamed, known, noise, rough=True)
     radius_px = np.array([each.radius_px for each in whitening.bank(window_px)], np.float32)
     size = np.abs(signed)
@@ -218,7 +218,7 @@ def _judged(values: np.ndarray, known: np.ndarray, covariance: np.ndarray | None
 
 
 def _tamed(values: np.ndarray) -> np.ndarray:
-    """Return values (r, c) of which none exceeds both `CLIP_SIGMAS` and its eight neighbours."""
+    """Return values (r, c) clipped so that none exceeds both `CLIP_SIGMAS` and its eight neighbours."""
     ring = np.ones((3, 3), np.uint8)
     ring[1, 1] = 0
     low, high = (np.asarray(of(values, ring)) for of in (cv2.erode, cv2.dilate))
@@ -228,9 +228,9 @@ def _tamed(values: np.ndarray) -> np.ndarray:
 def _scored(
     values: np.ndarray, seen: np.ndarray, noise: _Noise, start: np.ndarray | None = None, rough: bool = False
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return each pixel's strongest score (r, c) with its sign, the template that it is by, and C^-1 r, from the pixels
-    ``seen`` (r, c); ``start`` is near to that. ``rough``: by round templates in the middles of pixels
-    alone, without the scatter of scores, which what stands out would spoil."""
+    """Return each pixel's strongest score (r, c) with its sign, the index of its template, and C^-1 r, from the pixels
+    ``seen`` (r, c). ``start``: an approximate solution. ``rough``: only round templates at the centres of pixels,
+    without the scatter of scores, which strong residuals would spoil."""
     solved = whitening.inverse_times(values, seen, noise.power, noise.grid, start)
     (h, w), depth_px = seen.shape, _depth_px(seen)
     views, best, shares, tail = [], [], {}, 1.0
@@ -248,7 +248,7 @@ def _scored(
         key = template.coarse, template.slot, worth.sides
         if key not in shares:
             share = cv2.blur(there, worth.sides, borderType=cv2.BORDER_CONSTANT)
-            # what light and flying pixels leave along outlines looks like a slot
+            # errors along outlines, from light and flying pixels, look like slots
             enough = (share > LEAST_SEEN) & (there > 0) & (inner if template.slot else True)
             shares[key] = enough / np.sqrt(np.maximum(share, np.float32(LEAST_SEEN)))
         score = whitening.response(spectrum_of, templates[number], there.shape, not any(template.halves))
@@ -282,8 +282,8 @@ def _halved(image: np.ndarray) -> np.ndarray:
 
 
 def _deviations(score: np.ndarray, zone: np.ndarray, reach_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the deviation (z,) of the scores (r, c) in each ``zone`` (r, c), by sizes up to `CAP`, no less than the
-    last; and (r, c) bool, the scores within ``reach_px`` of some that stand out, which do not tell it."""
+    """Return the deviation (z,) of the scores (r, c) in each ``zone`` (r, c), from sizes up to `CAP`, at least that of
+    the last zone; and (r, c) bool, the scores within ``reach_px`` of strong ones, which are excluded."""
     loud = np.zeros(score.shape, np.bool_)
     found, count = _scatter(score, zone, loud)
     if reach_px:
@@ -294,8 +294,8 @@ def _deviations(score: np.ndarray, zone: np.ndarray, reach_px: int) -> tuple[np.
 
 
 def _calm(score: np.ndarray, loud: np.ndarray, deviation: float, half_px: float) -> None:
-    """Divide the scores (r, c) where the others than ``loud`` ones (r, c) within a square of ``half_px`` scatter by
-    more than `UNEVEN` deviations: the noise there is not as elsewhere."""
+    """Divide the scores (r, c) where scores other than ``loud`` ones (r, c) within a square of ``half_px`` scatter by
+    more than `UNEVEN` deviations: the noise there differs from elsewhere."""
     window = (2 * round(half_px / PART_PX) + 1,) * 2
     sums, counts = (cv2.blur(each, window) for each in _parts(score, loud, CAP * deviation))
     size = sums / np.maximum(counts, 0.05 * PART_PX**2) / deviation
@@ -306,7 +306,7 @@ def _calm(score: np.ndarray, loud: np.ndarray, deviation: float, half_px: float)
 
 @numba.njit(**PLAIN)
 def _parts(score: np.ndarray, loud: np.ndarray, cap: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sums of the sizes, ``cap`` at most, of quiet scores in squares of `PART_PX`, and their number."""
+    """Return the sums of the sizes, at most ``cap``, of quiet scores in squares of `PART_PX`, and their number."""
     h, w = score.shape
     rows, columns = max(1, h // PART_PX), max(1, w // PART_PX)
     sums, counts = np.zeros((rows, columns)), np.zeros((rows, columns))
@@ -333,10 +333,10 @@ def _scatter(score: np.ndarray, zone: np.ndarray, loud: np.ndarray) -> tuple[np.
 
 @numba.njit(**PLAIN)
 def _capped(score: np.ndarray, zone: np.ndarray, loud: np.ndarray, zones: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sums of the sizes, `CAP` at most, of quiet scores in each zone, and their number."""
+    """Return the sums of the sizes, at most `CAP`, of quiet scores in each zone, and their number."""
     sums, counts = np.zeros(zones), np.zeros(zones, np.int64)
     for i in range(score.shape[0]):
-        total, number = 0.0, 0  # of the last zone, where most pixels lie
+        total, number = 0.0, 0  # those of the last zone, which has most pixels
         for j in range(score.shape[1]):
             if score[i, j] != 0 and not loud[i, j]:
                 size = min(abs(score[i, j]), CAP)
@@ -355,10 +355,10 @@ def _capped(score: np.ndarray, zone: np.ndarray, loud: np.ndarray, zones: int) -
 def _keep_stronger(  # type: ignore[no-untyped-def]
     signed, by, score, zone, per_deviation, raised, down, right, number
 ):
-    """Keep of each pixel's scores (r, c) the larger in size, and that template's ``number``. Scores are brought to
+    """Keep the larger of each pixel's scores (r, c) by size, and that template's ``number``. Scores are scaled to
     deviations of their ``zone`` (r, c) by the factors ``per_deviation`` (z,), and raised: their squares grow by
-    ``raised``, below `FAINT` in proportion. Those of a template between pixels, ``down`` or to the ``right``, belong to
-    all pixels round about."""
+    ``raised``, in proportion below `FAINT`. Scores of a template between pixels, ``down`` or to the ``right``, belong
+    to all pixels around."""
     faint = per_deviation * np.float32(np.sqrt(1.0 + raised / FAINT**2))
     height, width = score.shape
     for y in range(down + 1):
@@ -374,7 +374,7 @@ def _keep_stronger(  # type: ignore[no-untyped-def]
 
 
 def _tail(scores: np.ndarray) -> float:
-    """Return how much farther the tail of scores (r, c) reaches than a Gaussian's, on its shorter side; 1 at least."""
+    """Return how much farther the tail of scores (r, c) reaches than a Gaussian's, on its shorter side; at least 1."""
     count = int(TAIL_SHARE * np.count_nonzero(scores))
     sides = [np.sort(np.abs(scores[beyond])) for beyond in (scores > TAIL_SIGMAS, scores < -TAIL_SIGMAS)]
     if count == 0 or min(map(len, sides)) < count:
@@ -395,16 +395,16 @@ def _fill_discs(signed: np.ndarray, radius_px: np.ndarray) -> None:
 
 
 def _highest(size: np.ndarray) -> np.ndarray:
-    """Return (r, c) bool: pixels than which none is larger within `ALONE_PX`."""
+    """Return (r, c) bool: pixels that are the largest within `ALONE_PX`."""
     return np.asarray(size >= cv2.dilate(size, np.ones((2 * ALONE_PX + 1,) * 2, np.uint8)))
 
 
 def _cores(
     peaks: np.ndarray, size: np.ndarray, radius_px: np.ndarray, values: np.ndarray, known: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (r, c) bool: the loud pixels, and what lies between them, that ``peaks`` (n, 2) of the scores' ``size``
-    stand on, where they fill a disc of the template's ``radius_px`` (r, c). Further their signed scores (r, c), in
-    proportion to the values over 3 x 3 pixels, so that two holes that touch keep two peaks."""
+    """Return (r, c) bool: the loud pixels under ``peaks`` (n, 2) of the scores' ``size``, and what lies between them,
+    where they fill a disc of the template's ``radius_px`` (r, c). Also return their signed scores (r, c), in proportion
+    to the values over 3 x 3 pixels, so that two holes that touch keep two peaks."""
     core, signed = np.zeros(size.shape, bool), np.zeros(size.shape)
     loud = known & (np.abs(values) > LOUD_SIGMAS)
     around = (cv2.blur(each, (3, 3)) for each in (values, known.astype(np.float32)))
@@ -421,7 +421,7 @@ def _cores(
         cut = np.s_[top : top + height, left : left + width]
         part = (parts[cut] == number) & known[cut]
         heights = smooth[cut][part].astype(np.float64)
-        # quiet pixels between loud ones are no finding of the other sign
+        # quiet pixels between loud ones are not a finding of the other sign
         side = np.sign(heights[np.abs(heights).argmax()])
         heights = np.where(np.abs(heights) > LOUD_SIGMAS, heights, side * np.maximum(side * heights, 0.0))
         signed[cut][part] = score[number] * heights / np.abs(heights).max()
@@ -430,14 +430,14 @@ def _cores(
 
 
 def _depth_px(known: np.ndarray) -> np.ndarray:
-    """Return the distance (r, c) of each pixel to the outline of what is known; single unknown pixels are no part."""
+    """Return the distance (r, c) of each pixel to the outline of the known pixels, ignoring single unknown pixels."""
     closed = cv2.morphologyEx(np.pad(known.astype(np.uint8), 2), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     return np.asarray(cv2.distanceTransform(closed, cv2.DIST_C, 3)[2:-2, 2:-2])
 
 
 def _without_rim(noise: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return the residuals (r, c) less what they share, along some 65 pixels, with those as near to the outline, beyond
-    what those next to the rim share: a subtracted mean would leave a step there."""
+    """Return the residuals (r, c) minus what they share, along some 65 pixels, with those at the same distance from the
+    outline, beyond what those next to the rim share: subtracting a mean would leave a step there."""
     noise, depth_px = noise.astype(np.float32), _depth_px(known)
     modest = np.clip(noise, -LEVEL_SIGMAS, LEVEL_SIGMAS)
 

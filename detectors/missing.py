@@ -1,9 +1,9 @@
 """Missing returns as evidence: connected pixels inside the target's outline from which no light came back.
 
-Size distinguishes a hole from chance; a place that touches the edge of the outline or image is not a finding. Chance is
-simulated: scattered dropouts are places where white noise averaged over a square of 1 to 5 pixels falls below a level;
-the square gives the share of missing neighbours, the level the local rate, both from clusters that are too small to be
-findings. Not modelled: dropouts that come in equal blobs wider than 3 pixels."""
+Size distinguishes a hole from chance. A place that touches the edge of the outline or image is not a finding. Chance is
+simulated: scattered dropouts are places where white noise, averaged over a square of 1 to 5 pixels, falls below a
+level. The square gives the share of missing neighbours and the level the local rate; both come from clusters that are
+too small to be findings. Not modelled: dropouts in equal blobs wider than 3 pixels."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from detectors.measure import local_plane
 from harness.vocabulary.geometry import Cloud, Reason
 from harness.vocabulary.seeds import random_stream
 
-ALPHA = 0.01  # expected chance findings in one capture: what the least size of a finding is set by
+ALPHA = 0.01  # expected number of chance findings in one capture, which determines the smallest size of a finding
 LEAST_POINTS = 9
-"""Fewer connected pixels are never a finding: 3 x 3, the narrowest filter of depth cameras, makes as many of one."""
+"""Fewer connected pixels are never a finding: 3 x 3, the narrowest filter of depth cameras, makes so many of one."""
 SELDOM = 0.2
-"""A pixel that returned in no more than this share of the frames counts as missing: its depth rests on stray light."""
+"""A pixel that returned in at most this share of the frames counts as missing: its depth comes from stray light."""
 SQUARES = (1, 2, 3, 4, 5)  # sides in pixels of the square that correlates dropouts
 RATE_WINDOW_PX, RATE_PRIOR_PX = 65, 200.0
-"""The local rate of dropouts is that of a window of this side, drawn towards the target's own by so many pixels."""
+"""The local rate of dropouts is that in a window of this side, drawn towards the target's own by so many pixels."""
 SIMULATED_PX, FEWEST_FIELDS, MOST_FIELDS = 1e6, 10, 100
-"""Fields are simulated until they hold so many pixels: enough to reach well under one cluster a target."""
-TAIL_CLUSTERS = 60  # largest simulated clusters from which the fall of their number with size is taken
-SLOWEST_FALL = math.log(2.0)  # fall without simulated clusters to tell: each further pixel halves a cluster's chance
+"""Simulation continues until its fields hold so many pixels: enough to reach well under one cluster per target."""
+TAIL_CLUSTERS = 60  # largest simulated clusters, from which the fall of their number with size is estimated
+SLOWEST_FALL = math.log(2.0)  # without simulated clusters, each further pixel halves a cluster's probability
 DISCS_PX, LOUD_SIGMAS = (1.5, 2.5, 3.5), 3.0
-"""Radii of the discs in which missing pixels are counted, and scores beside which they are not taken for chance."""
+"""Radii of the discs in which missing pixels are counted, and scores next to which they do not count as chance."""
 REACH_PX, APART = 2, 0.8
 """A depth finding within `REACH_PX` of pixels without return (half of a 5 x 5 window) is the same damage, unless its
 centre is `APART` of its radius and 2 `REACH_PX` away: 1 radius for a disc beside them, 0.6 for a disc's other half."""
-RING_PX = 4  # width of the ring of judged pixels that places the surface at a hole
-HIGHEST_SCORE = 37.0  # standard deviations; beyond it float64 knows no probability
+RING_PX = 4  # width of the ring of judged pixels that determines the surface at a hole
+HIGHEST_SCORE = 37.0  # in standard deviations; float64 has no probabilities beyond
 REASONS: dict[int, str] = {
     Reason.SATURATED: "the sensor is saturated",
     Reason.LOW_AMPLITUDE: "too little light came back",
@@ -52,8 +52,8 @@ REASONS: dict[int, str] = {
 
 
 class _Gaps(NamedTuple):
-    """Pixels without a return inside the target's ``outline`` (h, w): ``unseen`` as in `MissingReturns`, ``missing``
-    (h, w) bool; ``labels`` (h, w) and ``sizes`` of their clusters, and which are ``free`` of the outline's edge."""
+    """Pixels without a return inside the target's ``outline`` (h, w). ``unseen``: as in `MissingReturns`. ``missing``:
+    (h, w) bool. ``labels`` (h, w) and ``sizes``: of their clusters; ``free``: which do not touch the outline's edge."""
 
     outline: np.ndarray
     unseen: np.ndarray
@@ -64,7 +64,7 @@ class _Gaps(NamedTuple):
 
 
 def _gaps(cloud: Cloud, evidence: Evidence) -> _Gaps | None:
-    """Return what is missing inside the outline of what was judged. None without a pixel grid."""
+    """Return what is missing inside the outline of the judged area; None without a pixel grid."""
     judged = np.isfinite(evidence.score)
     if not cloud.organised or not judged.any():
         return None
@@ -83,9 +83,9 @@ def _gaps(cloud: Cloud, evidence: Evidence) -> _Gaps | None:
 
 
 def missing_evidence(cloud: Cloud, evidence: Evidence) -> np.ndarray | None:
-    """Return (h, w), 0 and more, what missing pixels about each place add to the square of a score there: twice the
-    logarithm of the likelihood of so many in a disc, the best of several, over that at the local rate of dropouts,
-    which is taken where scores do not stand out. None where nothing is missing. Clusters that may be findings by
+    """Return (h, w), at least 0, what missing pixels around each place add to the square of a score there: twice the
+    logarithm of the likelihood of so many in a disc (the best of several) over that at the local rate of dropouts,
+    which is estimated where scores are not high. None if nothing is missing. Clusters that may be findings by
     themselves do not count, and others little: one bad sample of a filter makes `LEAST_POINTS` missing pixels."""
     gaps = _gaps(cloud, evidence)
     if gaps is None:
@@ -104,7 +104,7 @@ def missing_evidence(cloud: Cloud, evidence: Evidence) -> np.ndarray | None:
         disc = (np.hypot(reach[:, None], reach) <= radius).astype(float)
         expected = np.maximum(_counted(local, disc), 1e-12)
         spread = ((_counted(quiet, disc) - expected) ** 2)[gaps.outline].sum() / expected[gaps.outline].sum()
-        # counts are whole numbers: half of one less, as continuity asks
+        # counts are whole numbers: subtract a half, as a continuity correction
         seen = np.maximum(_counted(scattered, disc) - 0.5, expected)
         likelihood = seen * np.log(seen / expected) - (seen - expected)
         best = np.maximum(best, 2.0 * likelihood / max(float(spread), float(LEAST_POINTS)))
@@ -116,7 +116,7 @@ def _counted(image: np.ndarray, kernel: np.ndarray) -> np.ndarray:
 
 
 def missing_returns(cloud: Cloud, evidence: Evidence) -> MissingReturns | None:
-    """Look for missing returns inside the outline of the judged area. None for a cloud without a pixel grid."""
+    """Look for missing returns inside the outline of the judged area. Return None for a cloud without a pixel grid."""
     gaps = _gaps(cloud, evidence)
     if gaps is None:
         return None
@@ -142,7 +142,7 @@ def one_damage_once(
     shape: tuple[int, int], found: tuple[Detection, ...], missing: tuple[Detection, ...]
 ) -> tuple[Detection, ...]:
     """Return findings by depth and by missing returns (flat indices into a grid of ``shape``) as one list, strongest
-    first; of all that are one damage with a place without return (`REACH_PX`, `APART`) the largest stands for it."""
+    first. Of those that are one damage with a place without return (`REACH_PX`, `APART`), the largest is kept."""
     kept: list[Detection] = []
     depth = list(found)
     for hole in missing:
@@ -167,7 +167,7 @@ def _is_same(apart: np.ndarray, pixels: np.ndarray) -> bool:
 
 def measure_missing(cloud: Cloud, evidence: Evidence, detection: Detection) -> Measurement:
     """Measure place and size of pixels without return, on a plane through the fitted surface around: the diameter of a
-    circle of the same area, and the centre. No depth, no volume; no allowance for the camera's blur."""
+    circle of the same area, and its centre. No depth or volume; the camera's blur is not allowed for."""
     area = _filled(cloud.valid.shape, detection.pixels)
     rows, columns = np.nonzero(area)
     placed = _surface_at(cloud, evidence, area)
@@ -190,14 +190,14 @@ def _clusters(missing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _filled(shape: tuple[int, int], pixels: np.ndarray) -> np.ndarray:
-    """Return (h, w) bool: the pixels and what they enclose."""
+    """Return (h, w) bool: the pixels and the area that they enclose."""
     mask = np.zeros(shape, dtype=bool)
     mask.reshape(-1)[pixels] = True
     return holes_filled(mask)
 
 
 def _surface_at(cloud: Cloud, evidence: Evidence, area: np.ndarray) -> tuple[np.ndarray, float] | None:
-    """Return the surface's point (3,) at an area's centroid and the surface that one pixel covers there, m2."""
+    """Return the surface's point (3,) at an area's centroid, and the area in m2 that one pixel covers there."""
     rows, columns = np.nonzero(area)
     h, w = area.shape
     cut = np.s_[
@@ -215,7 +215,7 @@ def _surface_at(cloud: Cloud, evidence: Evidence, area: np.ndarray) -> tuple[np.
 
 
 class _Chance(NamedTuple):
-    """Scattered dropouts: ``rate``, and a line through (``at``, ``log_at``) of the log number of clusters."""
+    """Scattered dropouts: ``rate``, and a line through (``at``, ``log_at``) of the log number of clusters by size."""
 
     rate: float
     at: int = 1
@@ -223,17 +223,17 @@ class _Chance(NamedTuple):
     fall: float = SLOWEST_FALL
 
     def log_expected(self, points: int) -> float:
-        """Return the logarithm of the expected number of clusters of so many pixels and more on the whole target."""
+        """Return the logarithm of the expected number of clusters of at least so many pixels on the whole target."""
         return self.log_at - self.fall * (points - self.at)
 
     @property
     def least_points(self) -> int:
-        """Least size of a finding: `LEAST_POINTS` or more, such that fewer than `ALPHA` clusters are expected."""
+        """Smallest size of a finding: `LEAST_POINTS`, or more such that fewer than `ALPHA` clusters are expected."""
         return max(LEAST_POINTS, math.ceil(self.at + (self.log_at - math.log(ALPHA)) / self.fall))
 
 
 def _settled(labels: np.ndarray, sizes: np.ndarray, outline: np.ndarray) -> _Chance:
-    """Return chance by the clusters that are no findings, the least size of findings being raised until it stays."""
+    """Return the chance by clusters that are no findings; the smallest size of a finding rises until it is stable."""
     rows, columns = np.nonzero(outline)
     cut = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
     labels, outline = labels[cut], outline[cut]
@@ -271,7 +271,7 @@ def _settled(labels: np.ndarray, sizes: np.ndarray, outline: np.ndarray) -> _Cha
 
 
 def _square(scattered: np.ndarray, known: np.ndarray, rate: float) -> int:
-    """Return the side of the least square whose fields have as many missing neighbours, to two standard errors."""
+    """Return the side of the smallest square whose fields have as many missing neighbours, to two standard errors."""
     pairs = both = 0
     for a, b in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
         pairs += int((scattered[a] & known[b]).sum())
@@ -280,7 +280,7 @@ def _square(scattered: np.ndarray, known: np.ndarray, rate: float) -> int:
     error = np.sqrt(max(measured * (1.0 - measured), 1.0 / max(pairs, 1)) / max(pairs, 1))
     level = ndtri(rate)
     for side in SQUARES:
-        # two normal variables of correlation r below one level: Phi(t) - 2 T(t, sqrt((1 - r) / (1 + r))) (Owen 1956)
+        # two normal variables with correlation r below one level: Phi(t) - 2 T(t, sqrt((1 - r) / (1 + r))) (Owen 1956)
         correlation = 1.0 - 1.0 / side
         likely = 1.0 - 2.0 * owens_t(level, np.sqrt((1.0 - correlation) / (1.0 + correlation))) / rate
         if likely >= measured - 2.0 * error:
@@ -289,13 +289,13 @@ def _square(scattered: np.ndarray, known: np.ndarray, rate: float) -> int:
 
 
 def _tail(rate: float, sizes: np.ndarray, fields: int) -> _Chance:
-    """Return the fall of the number of clusters with size, from the largest of simulated ``sizes``, ascending."""
+    """Return how the number of clusters falls with size, from the largest of simulated ``sizes``, ascending."""
     if len(sizes) < 2:
         return _Chance(rate, log_at=float(np.log(max(len(sizes), 1) / fields)))
     largest = sizes[-min(TAIL_CLUSTERS, len(sizes)) :]
     at = int(largest[0])
     of_size = int((sizes >= at).sum())
     excess = float(sizes[-of_size:].mean() - at) * (1.0 + 2.0 / np.sqrt(of_size))
-    # of a geometric distribution with the mean excess m, m / (1 + m) go on to the next size
+    # in a geometric distribution with mean excess m, the share m / (1 + m) continues to the next size
     fall = float(np.log1p(1.0 / max(excess, 1e-9)))
     return _Chance(rate, at, float(np.log(of_size / fields)), min(fall, SLOWEST_FALL))

@@ -1,4 +1,4 @@
-"""Robust statistics, and the noise of an average: the remainder of rounding, and how far neighbours share it."""
+"""Robust statistics, and the noise of an average: what rounding leaves, and how far neighbours share noise."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import numpy as np
 from harness.vocabulary.geometry import Cloud, Frame
 
 REACH_FRAMES, REACH_WINDOW_PX, REACH_PIXELS, FARTHEST_LAG_PX = 6, 384, 5000, 30
-"""Frames that are looked at, the side of the window about the middle of the valid pixels, and pixels that must be valid
-in two frames: the correlation of so many, of which 25 are alike, is known to 0.07."""
+"""Number of frames used; side of the window at the centre of the valid pixels; and least number of pixels valid in two
+frames: it shows their correlation, with 25 alike, to 0.07."""
 LONE_LEVEL_PX, LONE_SIGMAS, LONE_MOST_PX = 21, 5.0, 7
-"""Side of the square of the local mean in a lone frame; deviations that mark an edge; longest lag that is taken for the
-noise's own, not a pattern's or the surface's."""
+"""Side of the square of the local mean in a single frame; deviations that mark an edge; longest lag that counts as
+noise's own, and not as that of a pattern or the surface."""
 LEAST_FRAMES, SCATTER_PX = 4, 7
-"""Frames from which on their scatter tells noise, averaged over a square: known to 12 % from 49 x 3 differences."""
+"""Fewest frames whose scatter shows noise, averaged over a square: to 12 % from 49 x 3 differences."""
 SHARED = 0.1  # correlation below which pixels share nothing: a box of b pixels falls below it at lag b, up to 9 pixels
 
 
@@ -39,13 +39,13 @@ def quantile_of(values: np.ndarray, share: float) -> float:
 
 
 def sigma_of(values: np.ndarray) -> float:
-    """Return the robust standard deviation of finite values (n,) about 0: the median size over 0.6745."""
+    """Return the robust standard deviation of finite values (n,) about 0: the median magnitude over 0.6745."""
     return median_of(np.abs(values)) / 0.6745
 
 
 def rounding_left_m2(step_m: float, dither_m2: float) -> float:
-    """Return the variance of the fixed pattern that rounding to a step q leaves in the average of endless frames, whose
-    noise before has the variance s^2: (q / pi)^2 / 2 * sum_k exp(-4 pi^2 k^2 s^2 / q^2) / k^2."""
+    """Return the variance of the fixed pattern that rounding to a step q leaves in an average of infinitely many frames
+    whose noise before has the variance s^2: (q / pi)^2 / 2 * sum_k exp(-4 pi^2 k^2 s^2 / q^2) / k^2."""
     k = np.arange(1, 200)
     left = (step_m / np.pi) ** 2 / 2.0 * float((np.exp(-((2.0 * np.pi * k) ** 2) * dither_m2 / step_m**2) / k**2).sum())
     return min(left, step_m**2 / 12.0)
@@ -73,9 +73,9 @@ def rounding_variances(cloud: Cloud, mask: np.ndarray) -> tuple[float, float]:
 
 
 def average_variance_m2(cloud: Cloud, where: np.ndarray) -> np.ndarray | None:
-    """Return the variance (h, w) of the average's z by the scatter of its frames round about, where ``where`` (h, w) is
-    true; the typical one where nothing round about is known. None without a pixel grid, with fewer than `LEAST_FRAMES`
-    frames, and where fewer than half of the pixels have a scatter."""
+    """Return the variance (h, w) of the average's z from the scatter of its frames nearby, where ``where`` (h, w) is
+    true, or the typical variance where nothing nearby is known. None without a pixel grid, with fewer than
+    `LEAST_FRAMES` frames, or if fewer than half of the pixels have a scatter."""
     seen = where & np.isfinite(cloud.variance_m2)
     if not cloud.organised or cloud.n_frames < LEAST_FRAMES or seen.sum() < 0.5 * where.sum():
         return None
@@ -88,14 +88,14 @@ def average_variance_m2(cloud: Cloud, where: np.ndarray) -> np.ndarray | None:
 
 
 def rounding_floor(cloud: Cloud, mask: np.ndarray) -> float:
-    """Return the standard deviation in metres that rounding leaves in the average: the least credible scale."""
+    """Return the standard deviation in metres that rounding leaves in the average: the smallest credible scale."""
     return float(np.sqrt(sum(rounding_variances(cloud, mask))))
 
 
 def noise_reach_px(frames: Sequence[Frame], z_step_m: float) -> float:
-    """Return the lag, in pixels, at which the noise of neighbours along rows and columns stops being alike: the median
-    over pairs of successive frames. A lone frame is judged by its deviations from its local mean, where they exceed the
-    rounding to ``z_step_m``. 0 for unknown (no noise beyond the rounding, movement, or a bent surface in one frame)."""
+    """Return the lag, in pixels, at which neighbours along rows and columns stop sharing noise: the median over pairs
+    of successive frames. A single frame is judged by its deviations from its local mean, if they exceed the rounding to
+    ``z_step_m``. 0 means unknown (no noise beyond rounding, movement, or a curved surface in one frame)."""
     lags: list[int] = []
     lone = len(frames) == 1
     pictures = [frame.z_m.astype(np.float64) for frame in frames]
@@ -108,7 +108,7 @@ def noise_reach_px(frames: Sequence[Frame], z_step_m: float) -> float:
         known = np.isfinite(difference)
         if lone:
             noise = _levelled(difference, known, LONE_LEVEL_PX)
-            if (sigma := sigma_of(noise[known])) < 0.5 * z_step_m:  # steps correlate the rounding of quieter noise
+            if (sigma := sigma_of(noise[known])) < 0.5 * z_step_m:  # steps correlate the rounding of smaller noise
                 continue
             known &= np.abs(noise) < LONE_SIGMAS * sigma
             noise = _levelled(difference, known, LONE_LEVEL_PX)
@@ -121,14 +121,14 @@ def noise_reach_px(frames: Sequence[Frame], z_step_m: float) -> float:
 
 
 def _levelled(values: np.ndarray, known: np.ndarray, side: int) -> np.ndarray:
-    """Return the values (h, w) less their mean over a square of known ones; 0 where unknown."""
+    """Return the values (h, w) minus their mean over a square of known ones; 0 where unknown."""
     weight = cv2.boxFilter(known.astype(np.float64), -1, (side, side))
     level = cv2.boxFilter(np.where(known, values, 0.0), -1, (side, side)) / np.maximum(weight, 1e-9)
     return np.where(known, values - level, 0.0)
 
 
 def _first_unlike_lag(noise: np.ndarray, known: np.ndarray) -> int:
-    """Return the first lag along rows at which the mean product of noises falls below `SHARED`; 0 for none."""
+    """Return the first lag along rows at which the mean product of noise falls below `SHARED`; 0 for none."""
 
     def product(lag: int) -> float:
         width = noise.shape[1] - lag

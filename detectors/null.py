@@ -1,14 +1,14 @@
-"""The threshold that a capture sets itself: noise seen towards the camera tells how often noise looks like damage.
+"""The threshold that a capture determines itself: noise towards the camera shows how often noise looks like damage.
 
-Damage lies behind the surface. Peaks in front of the surface are noise, fixed pattern or texture, once objects on the
-target (regions that stand before the surface as a whole, edges in the colour picture or the amplitude) and a margin are
-left out. The tail of these peaks is extrapolated to the threshold at which the wanted number of false calls is
-expected, bumps and hole-like calls together: exponential in (s^q - 1) / q of the score s, less the logarithm by which
-the maxima of normal noise in two dimensions are more. The data weigh the exponents, starting from `PRIOR`; rates and
-scales are integrated out.
+Damage lies behind the surface. Peaks in front of the surface are noise, fixed pattern or texture, after objects on the
+target (regions that stand before the surface as a whole; edges in the colour picture or the amplitude) and a margin are
+excluded. The tail of these peaks is extrapolated to the threshold at which the wanted number of false calls is
+expected, bumps and hole-like calls together. The tail is exponential in (s^q - 1) / q of the score s, minus the
+logarithm by which maxima of normal noise in two dimensions are more frequent. The data weigh the exponents, starting
+from `PRIOR`; rates and scales are integrated out.
 
-Not modelled: noise that is not symmetric beyond what `skew_of` sees in the core; damage towards the camera that is no
-larger than the noise; objects on clouds without a grid, or that neither stand out nor are seen in a picture."""
+Not modelled: noise that is asymmetric beyond what `skew_of` sees in the core; damage towards the camera that is no
+larger than the noise; objects on clouds without a grid, or that neither stand out nor are visible in a picture."""
 
 from __future__ import annotations
 
@@ -25,38 +25,38 @@ from harness.vocabulary.geometry import Cloud
 
 EXPONENTS = np.array([3.0, 2.0, 1.5, 1.0, 0.5, 0.0])
 PRIOR = np.array([0.40, 0.45, 0.07, 0.04, 0.02, 0.02])
-"""Averages of a camera's noise are near normal. Chosen on simulated hole-free boards of three cameras."""
+"""Prior weights of exponents: averages of a camera's noise are near normal. From simulated boards of three cameras."""
 WANTED_PEAKS, FEWEST_PEAKS = 60, 8
-"""Peaks above the floor: the mean excess of 60 is known to 13 %, that of the fewest to 35 %."""
+"""Numbers of peaks above the floor: the mean excess of 60 is known to 13 %, that of the fewest to 35 %."""
 NORMAL_PEAKS = 10.0
-"""Peaks that the theory counts for: maxima of normal noise with the deviation that a unit of score is meant to be. Ten
-know that deviation to 16 %; robust scales of noise with heavy tails are wrong by as much."""
+"""Number of peaks for which the theory counts: maxima of normal noise with the deviation that a unit of score is meant
+to be. Ten show that deviation to 16 %; robust scales of heavy-tailed noise are wrong by as much."""
 CROWDED, LADDER = 0.6, 1.06
-"""Share of the most findings that any threshold gives, and the ratio of the thresholds that are tried for the floor."""
+"""Share of the largest number of findings at any threshold, and the ratio of thresholds tried for the floor."""
 LEAST = 3.0
-"""Units of score below which no threshold goes: bounded errors end so near that one side says nothing of the other."""
-MOST = 10.0  # units of score above which noise alone needs no threshold: it needs 4 to 7 on all that was recorded
+"""Lowest threshold in units of score: bounded errors end so close that one side says nothing about the other."""
+MOST = 10.0  # thresholds above this are not due to noise alone, which needs 4 to 7 on all recordings
 OBJECT_MARGIN_PX = 6  # margin around an object: its edge is mixed over 3 pixels, and its shadow lies beside it
 PATCH_PX, LEAST_OBJECT_PX = 5, 100
-"""Side of the square that residual and picture are smoothed over, and pixels of an object: four such squares."""
+"""Side of the square that smooths residual and picture, and least pixels of an object: four such squares."""
 PROUD, PROUD_FOOT = 6.0, 3.0
-"""An object stands so many deviations of the smoothed residual before the surface somewhere, and so many everywhere."""
+"""An object is so many deviations of the smoothed residual before the surface somewhere, and so many everywhere."""
 MARKED = 8.0
-"""An edge in the picture is so many times as steep as half of the picture is: a tag, print, another material."""
-MOST_MASKED = 0.5  # share of the judged area that objects may cover before what is left no longer stands for it
+"""An edge in the picture is so many times as steep as the median: a tag, print, another material."""
+MOST_MASKED = 0.5  # largest share of the judged area under objects: what is left must represent the whole
 RIM_PX, RIM_CALLS = 10, 2
-"""Reach of the target's rim into what was judged, and calls behind the surface along it that chance does not give."""
-CONTRADICTED = 0.1  # chance of so many peaks above the threshold at which a tail no longer holds
+"""Depth of the target's rim, and number of calls behind the surface along it that chance does not explain."""
+CONTRADICTED = 0.1  # probability of so many peaks above the threshold at which a tail is rejected
 MOST_SKEW = 0.15
-"""Difference of the quartiles' distances from the median, over their sum: 0.15 are 1.35 times as far to one side."""
+"""Difference of the quartiles' distances from the median, over their sum: 0.15 means 1.35 times as far to one side."""
 DRAWS = 4000
 
 
 @dataclass(frozen=True)
 class OwnThreshold:
-    """``threshold`` in units of score, at which ``expected`` false calls are expected, with the 95 % interval ``low``
-    to ``high``; ``peaks`` above ``floor`` told it. ``evidence``: what is to be searched, without the ``rim_pixels``
-    that mix in what lies behind the target. ``doubts``: full sentences on why the numbers cannot be trusted."""
+    """``threshold``: in units of score, at which ``expected`` false calls are expected, with the 95 % interval ``low``
+    to ``high``. It is based on ``peaks`` above ``floor``. ``evidence``: what to search, without the ``rim_pixels`` that
+    mix in what lies behind the target. ``doubts``: full sentences on why the numbers cannot be trusted."""
 
     threshold: float
     expected: float
@@ -71,8 +71,8 @@ class OwnThreshold:
 
 
 def own_threshold(detector: Detector, cloud: Cloud, evidence: Evidence, false_calls: float) -> OwnThreshold:
-    """Find the threshold at which ``false_calls`` (above 0) are expected, by the capture's own peaks towards the
-    camera, or `LEAST`. With too few of them the numbers are NaN, and ``doubts`` says so."""
+    """Find the threshold at which ``false_calls`` (above 0) are expected, from the capture's own peaks towards the
+    camera; at least `LEAST`. With too few peaks the numbers are NaN, and ``doubts`` says so."""
     known = np.isfinite(evidence.score)
     covered = np.zeros(known.shape, bool)
     if cloud.organised:
@@ -88,8 +88,8 @@ def own_threshold(detector: Detector, cloud: Cloud, evidence: Evidence, false_ca
         few = f"only {len(peaks)} peaks of noise stand out towards the camera, too few to set a threshold by"
         doubts.append(f"{few} ({FEWEST_PEAKS} at least)")
         return OwnThreshold(*(float("nan"),) * 4, len(peaks), floor, objects, 0, evidence, tuple(doubts))
-    # all peaks, or the higher half, and again, while too many lie above the threshold: a few wide waves of a fixed
-    # pattern are then higher than the noise of many pixels, and one tail does not hold both
+    # take all peaks, or the higher half, and again while too many lie above the threshold: a few wide waves of a fixed
+    # pattern are then higher than the noise of many pixels, and one tail does not fit both
     falling, number = np.sort(peaks)[::-1], false_calls / 2.0
     while True:
         tail, half = Tail.of(falling, floor), len(falling) // 2
@@ -113,9 +113,9 @@ def own_threshold(detector: Detector, cloud: Cloud, evidence: Evidence, false_ca
 
 
 def each_object_once(cloud: Cloud, evidence: Evidence, found: tuple[Detection, ...]) -> tuple[Detection, ...]:
-    """Return the findings with each object that lies on the target as one of them, strongest first: findings that reach
-    its margin and are weaker than the object are its own. An object with a single finding keeps it. Nothing is joined
-    without a pixel grid, or where objects would cover more than `MOST_MASKED`."""
+    """Return the findings, strongest first, with each object on the target as one finding: findings that reach its
+    margin and are weaker belong to it. An object with a single finding keeps it. Nothing is joined without a pixel
+    grid, or if objects would cover more than `MOST_MASKED`."""
     if not cloud.organised or not found:
         return found
     proud, known = _proud(cloud, evidence), np.isfinite(evidence.score)
@@ -140,7 +140,7 @@ def _margin(cloud: Cloud) -> int:
 
 
 def behind(evidence: Evidence) -> np.ndarray:
-    """Return (h, w) bool: pixels whose score speaks for something behind the surface."""
+    """Return (h, w) bool: pixels whose score indicates something behind the surface."""
     if evidence.behind is not None:
         return evidence.behind
     with np.errstate(invalid="ignore"):
@@ -148,7 +148,7 @@ def behind(evidence: Evidence) -> np.ndarray:
 
 
 def skew_of(evidence: Evidence) -> float:
-    """Return Bowley's skewness of the residual, -1 to 1; damage on less than a quarter hardly moves it."""
+    """Return Bowley's skewness of the residual, -1 to 1; damage on less than a quarter hardly changes it."""
     known = evidence.residual_m[np.isfinite(evidence.residual_m)]
     low, middle, high = np.quantile(known, (0.25, 0.5, 0.75))
     return float((high + low - 2 * middle) / max(high - low, 1e-12))
@@ -165,7 +165,7 @@ class Tail:
 
     @classmethod
     def of(cls, peaks: np.ndarray, floor: float) -> Tail:
-        """Weigh the exponents by the scores (n,) of the peaks above a floor, which is above 0."""
+        """Weigh the exponents by the scores (n,) of the peaks above a floor, which is positive."""
         ratios = np.maximum(np.asarray(peaks, float) / floor, 1.0 + 1e-9)
         excesses = [_excess(ratios, exponent, floor) for exponent in EXPONENTS]
         sums = NORMAL_PEAKS + np.array([each.sum() for each in excesses])
@@ -185,7 +185,7 @@ class Tail:
         return float((self.weights * self.peaks * (1.0 + excesses / self.sums) ** -(self.peaks + NORMAL_PEAKS)).sum())
 
     def threshold(self, number: float) -> float:
-        """Return the threshold at which so many peaks are expected; the floor where fewer are expected there."""
+        """Return the threshold at which so many peaks are expected; the floor if fewer are expected there."""
         if number >= self.peaks:
             return self.floor
 
@@ -209,19 +209,19 @@ class Tail:
 
 
 def _excess(ratios: np.ndarray, exponent: float, floor: float) -> np.ndarray:
-    """Return how far scores, as ratios (n,) to the floor, lie above it, in factors of e by which peaks become fewer:
-    for the exponent 2 as of normal noise, whose maxima in two dimensions fall as s exp(-s^2 / 2) (Adler 1981)."""
+    """Return how far scores, as ratios (n,) to the floor, lie above it, in factors of e by which peaks become fewer.
+    The exponent 2 is that of normal noise, whose maxima in two dimensions fall as s exp(-s^2 / 2) (Adler 1981)."""
     power = np.log(ratios) if exponent == 0.0 else (ratios**exponent - 1.0) / exponent
     return np.asarray(floor**2 * (power - _crowd(floor) * np.log(ratios)))
 
 
 def _crowd(floor: float) -> float:
-    """Return the logarithm's share of the excess; low floors, where that law does not hold, get no more than half."""
+    """Return the logarithm's part of the excess; low floors, where that law does not hold, get at most half of it."""
     return min(floor**-2.0, 0.5)
 
 
 def _proud(cloud: Cloud, evidence: Evidence) -> np.ndarray:
-    """Return (h, w) bool: connected regions that stand before the surface as a whole, wider than noise is."""
+    """Return (h, w) bool: connected regions, wider than noise, that stand before the surface as a whole."""
     known = np.isfinite(evidence.residual_m)
     weights = _boxed(known.astype(np.float64))
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -254,7 +254,7 @@ def _boxed(image: np.ndarray) -> np.ndarray:
 
 
 def _depth_px(whole: np.ndarray) -> np.ndarray:
-    """Return the distance (h, w) of each pixel of a mask to its rim; the image's own edge is no rim."""
+    """Return the distance (h, w) of each pixel of a mask to its rim; the image's own edge does not count as a rim."""
     return np.asarray(ndimage.distance_transform_edt(np.pad(whole, 1, mode="edge"))[1:-1, 1:-1])
 
 
@@ -277,7 +277,7 @@ def _peaks(detector: Detector, cloud: Cloud, before: Evidence, covered: np.ndarr
 
 
 def _mixed_rim(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: float) -> np.ndarray:
-    """Return (h, w) bool: a band along the outline as deep as calls behind the surface reach where they are many."""
+    """Return (h, w) bool: a band along the outline, as deep as frequent calls behind the surface reach."""
     known = np.isfinite(evidence.score)
     whole = holes_filled(known)
     depth = _depth_px(whole).reshape(-1)
@@ -290,5 +290,5 @@ def _mixed_rim(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: 
 
 
 def _only(evidence: Evidence, where: np.ndarray) -> Evidence:
-    """Return the evidence with an opinion only ``where`` (h, w)."""
+    """Return the evidence with scores only ``where`` (h, w)."""
     return replace(evidence, score=np.where(where, evidence.score, np.nan))

@@ -37,7 +37,7 @@ LOD_SIGMAS = 1.96
 LEAST_SAMPLES = 4
 """Points that a cylinder holds at least in both clouds: the scatter of fewer says too little."""
 MOST_ALONE = 0.01
-"""Share of the target without a counterpart from which on it is told."""
+"""Share of the target without a counterpart from which on there is a warning."""
 
 
 class PlaneRansacConfig(ScoreMapConfig):
@@ -293,7 +293,7 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
 
 
 def coreset(features: np.ndarray, size: int) -> np.ndarray:
-    """Return at most ``size`` of the features (n, k): the most central, then ever the one farthest from those taken."""
+    """Return at most ``size`` of the features (n, k): the most central, then always the one farthest from these."""
     apart = ((features - features.mean(axis=0)) ** 2).sum(axis=1)
     taken, apart = [int(apart.argmin())], np.full(len(features), np.inf)
     while len(taken) < size:

@@ -1,9 +1,9 @@
-"""A part's own mesh as the undamaged surface: laid onto the cloud, it states where each ray should end.
+"""A part's own mesh as the undamaged surface: it is laid onto the cloud and tells where each ray should end.
 
-The part's front axis is turned to the camera, upright or rolled by quarters; closest points, then closest planes, move
-it onto the cloud (Besl and McKay 1992; Chen and Medioni 1992), points off it counting less (Tukey). Triangles that face
-away are left out. Not found: a part that is turned by more than about 30 degrees. Where the mesh fixes no place, as of
-a plane along itself, none is found, and nothing depends on it."""
+The part's front axis is turned to the camera, upright or rolled by quarters. Closest points, then closest planes, move
+it onto the cloud (Besl and McKay 1992; Chen and Medioni 1992); points off the part count less (Tukey). Triangles that
+face away are left out. Not found: a part that is turned by more than about 30 degrees. A direction that the mesh does
+not fix, such as a shift of a plane along itself, stays undetermined, and nothing depends on it."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from harness.vocabulary.geometry import MM, rotate_vectors, transform_points
 from harness.vocabulary.meshes import front_first, read_mesh
 
 SAMPLE, STEPS = 4000, 20
-"""Points by which the part is laid on; steps by closest points, twice as many by distances, as many by planes."""
+"""Number of points used; steps by closest points (twice as many by distances follow, then as many by planes)."""
 LEAST_SCALE_M, FAR_M = 0.1 * MM, 10.0
 EDGE_PX, BENT = 1.5, 0.5
-"""Pixels about a step or an edge of the part that are not judged, and the bend, in pixels, from which on it is one."""
+"""Distance in pixels from a step or edge of the part that is not judged, and the bend in pixels that makes an edge."""
 LOOSE = 1e-6
-"""Share of the largest information below which a direction counts as not fixed by the part."""
+"""Share of the largest information; a direction with less counts as not fixed by the part."""
 
 
 @lru_cache(maxsize=4)
@@ -58,7 +58,7 @@ def laid_on(points: np.ndarray, reference: ReferenceConfig, central: bool) -> tu
     pitch = float(np.sqrt(np.prod(np.ptp(flat[:, :2], axis=0)) / len(flat)))
 
     def met(rays: np.ndarray) -> np.ndarray:
-        """z where rays meet the part: from the lens through (n, 2) at z = 1, or along z at (n, 2)."""
+        """Return z where rays meet the part: from the lens through (n, 2) at z = 1, or along z at (n, 2)."""
         places = np.column_stack([rays, np.full(len(rays), 1.0 if central else -FAR_M)])
         starts, along = (np.zeros(places.shape), places) if central else (places, np.eye(3)[[2] * len(places)])
         origin, ray = transform_points(T_part_camera, starts), rotate_vectors(T_part_camera, along)
@@ -70,7 +70,7 @@ def laid_on(points: np.ndarray, reference: ReferenceConfig, central: bool) -> tu
             return np.where(there, starts[:, 2] + reach, np.nan)
 
     def z_at(places: np.ndarray) -> np.ndarray:
-        """The surface; NaN within `EDGE_PX` of a step, at which a camera mixes both sides."""
+        """Return z of the surface; NaN within `EDGE_PX` of a step, where a camera mixes both sides."""
         rays = places[:, :2] / places[:, 2:] if central else places[:, :2]
         z, side = met(rays), EDGE_PX * pitch
         bends = [met(rays + way) + met(rays - way) - 2 * z for way in (np.array([side, 0]), np.array([0, side]))]
@@ -81,7 +81,7 @@ def laid_on(points: np.ndarray, reference: ReferenceConfig, central: bool) -> tu
 
 
 def _scene(corners: np.ndarray) -> Any:
-    """Triangles (m, 3, 3) for rays and closest points, by their numbers."""
+    """Return triangles (m, 3, 3) as a scene for rays and closest points, by their numbers."""
     scene = load_open3d().t.geometry.RaycastingScene(nthreads=1)
     faces = np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3)
     scene.add_triangles(corners.reshape(-1, 3).astype(np.float32), faces)
@@ -105,7 +105,7 @@ def _fitted(
         off = np.linalg.norm(apart, axis=1)
         if step >= 3 * STEPS:
             off = np.einsum("ni,ni->n", apart, towards)
-        else:  # a point beyond an edge pulls towards the edge
+        else:  # a point beyond an edge pulls towards that edge
             towards = np.where(off[:, None] > LEAST_SCALE_M, apart / np.maximum(off, LEAST_SCALE_M)[:, None], towards)
         scale_m = max(float(np.median(np.abs(off))) / 0.6745, LEAST_SCALE_M if step >= 3 * STEPS else pitch_m)
         weight = bisquare_weights(off, BISQUARE_TUNING * scale_m)

@@ -1,3 +1,3 @@
-"""The harness: shared vocabulary at its leaf; experiments, engine, evaluation, report and programs above it."""
+"""The harness: shared vocabulary, experiments, engine, evaluation, report and programs."""
 
 __version__ = "0.1.0"

@@ -1,4 +1,4 @@
-"""``tofpod PROGRAM ...``: every program under one command; ``tofpod`` alone shows the most common tasks."""
+"""The command ``tofpod PROGRAM ...`` runs every program; ``tofpod`` alone lists the most common tasks."""
 
 from __future__ import annotations
 
@@ -37,21 +37,21 @@ complete -o filenames -F _tofpod tofpod
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The command. Returns what the program returns; 2 for an unknown program."""
+    """Run the command. Returns the program's exit code, or 2 for an unknown program."""
     given = sys.argv[1:] if arguments is None else arguments
     name, *rest = given or [""]
     if name in programs():
         sys.argv[1:] = rest
         return int(importlib.import_module(f"harness.{name}").main(rest if arguments is not None else None))
-    return exit_code_of(lambda: _told(name, rest))
+    return exit_code_of(lambda: _run(name, rest))
 
 
 @lru_cache
 def programs() -> dict[str, str]:
-    """Return the programs by name, each with the first sentence of its description."""
+    """Return the programs by name, with the first sentence of each description."""
     found = {}
     for path in sorted(Path(__file__).parent.glob("*.py")):
-        # read, not imported: the list is there at once
+        # read the source instead of importing it, so that the list appears at once
         source = path.read_text(encoding="utf-8")
         if "\ndef main(" in source and path.stem not in ("__main__", PART_OF_SET_UP):
             text = ast.get_docstring(ast.parse(source)) or ""
@@ -59,7 +59,7 @@ def programs() -> dict[str, str]:
     return found
 
 
-def _told(name: str, rest: list[str]) -> int:
+def _run(name: str, rest: list[str]) -> int:
     if name in ("", "-h", "--help"):
         wide = max(map(len, programs()))
         print("How small a damage can a time-of-flight depth camera detect?\n")
@@ -88,7 +88,7 @@ def _told(name: str, rest: list[str]) -> int:
 
 
 def _completion() -> str:
-    """Return a script that completes programs, options, experiments and cameras; all else is a file's name."""
+    """Return a shell script that completes programs, options, experiments and cameras, and otherwise file names."""
     from scenes.sensor.camera import camera_names
 
     experiments, cases = sorted(path.stem for path in shipped("experiments").glob("*.yaml")), []

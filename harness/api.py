@@ -18,7 +18,7 @@ Build a target, render what a camera sees of it, draw noisy frames, average them
     >>> figure = tofpod.plot(found)  # a Figure of Matplotlib
 
 Examples below go on from this one. A real capture goes the same way from `load`; whole experiments are run by `sweep`.
-A program's error message is a `UserError` here. Units are SI; where they are not, names say so.
+A program's error message is a `UserError` here. Units are SI, unless names state another.
 """
 
 from __future__ import annotations

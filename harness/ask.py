@@ -1,4 +1,4 @@
-"""``python -m harness.ask``: which camera finds a damage, how far away and with how many frames, from stored limits."""
+"""``python -m harness.ask``: which camera finds a damage, how far away, with how many frames, from stored limits."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     epilog="example: python -m harness.ask --damage hole --size 5mm --distance 1m",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Returns 0 for any answer, 2 on a mistake of the user, 130 after Ctrl-C."""
+    """Run the program. Returns 0 for any answer, 2 for a user's mistake, 130 after Ctrl-C."""
     from harness.evaluation.atlas import surfaces_of
     from harness.tables.atlas import ATLAS, curves
     from harness.tables.schema import write_table
@@ -76,7 +76,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def _read(path: Path) -> tuple[Any, dict[str, Any]]:
-    """Return the table of limits and what is stored with it. Raises UserError where it is none."""
+    """Return the table of limits and the data stored with it. Raises UserError if it is no such table."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -97,7 +97,7 @@ def _read(path: Path) -> tuple[Any, dict[str, Any]]:
 
 
 def _warnings(cameras: Iterable[str]) -> list[str]:
-    """Return warnings on those of the cameras whose precision is a guess, one for all that are guessed alike."""
+    """Return warnings about cameras whose precision is a guess, one for all that are guessed in the same way."""
     from scenes.sensor.camera import guessed_precision, load_camera
 
     alike: dict[str, list[str]] = {}
@@ -159,7 +159,7 @@ def _answer(options: argparse.Namespace, surfaces: Sequence[LimitSurface], title
 
 
 def _chosen(options: argparse.Namespace, surfaces: Sequence[LimitSurface], kind: str) -> list[LimitSurface]:
-    """Return the surfaces that a question is about. Raises UserError where a name is not in the atlas."""
+    """Return the surfaces for a question. Raises UserError if a name is not in the atlas."""
     from harness.vocabulary.declaration.diagnose import nearest
 
     detectors = list(dict.fromkeys(surface.detector for surface in surfaces))
@@ -180,7 +180,7 @@ def _chosen(options: argparse.Namespace, surfaces: Sequence[LimitSurface], kind:
 
 
 def length_m(option: str, text: str) -> float:
-    """Return the metres of a length with its unit. Raises UserError, which names the option."""
+    """Convert a length with its unit to metres. Raises UserError that names the option."""
     match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*([a-z]+)\s*", text)
     if match is None or match[2] not in UNITS_M or not float(match[1]) > 0:
         raise UserError(f"{option} {text}: is not a length with a unit", legal="such as 5mm, 0.5cm, 1m or 0.25in")
@@ -188,7 +188,7 @@ def length_m(option: str, text: str) -> float:
 
 
 def _exactly(surface: LimitSurface, place: Mapping[str, float], about: dict[str, Any]) -> str:
-    """Return the command that computes a set-up by a study of its own."""
+    """Return the command that computes a set-up by its own study."""
     from harness.evaluation import atlas
 
     axes: dict[str, Any] = {atlas.CAMERA: surface.camera, "capture.frames": int(place["frames"])}

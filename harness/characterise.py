@@ -1,4 +1,4 @@
-"""``python -m harness.characterise``: your own camera measured on static captures, as a page and a camera file."""
+"""``python -m harness.characterise``: measures your own camera on static captures, as a page and a camera file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
 
 CAMERA_FILE = "my_camera.yaml"
-REPEATED = 0.15  # Relative error of the simulated noise from which on the camera file counts as wrong
+REPEATED = 0.15  # relative error of the simulated noise from which on the camera file counts as wrong
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -43,7 +43,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     epilog="example: python -m harness.characterise near far --like azure_kinect_nfov --out my_camera",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Returns 0, 2 on a mistake of the user, 130 after Ctrl-C."""
+    """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""
     import numpy as np
 
     from harness.evaluation.study.record import read_record
@@ -70,7 +70,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     recordings = [opened_as(options.like, [path], options.intrinsics, **reading) for path in options.paths]
     captures = list(map(read_still, recordings))
     if options.like:
-        with_lens(options.like, captures[0].lens)  # of another size it cannot be refitted
+        with_lens(options.like, captures[0].lens)  # a camera of another image size cannot be refitted
     found = characteristics(captures, poses)
     rate_of = (options.rate, "stated by the user", "U") if options.rate else (30.0, "assumed", "M")
     if options.like and not options.rate:
@@ -83,7 +83,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     twin = characteristics(simulated(camera, found, options.albedo), poses)
     sources = {MEASURED: found, SIMULATED: twin}
     known = options.like
-    with suppress(UserError):  # none is as large, or it sees nothing of the surfaces
+    with suppress(UserError):  # no camera has so large an image, or it sees none of the surfaces
         known = known or camera_of_size(captures[0].lens)
         sources[KNOWN] = characteristics(simulated(with_lens(known, captures[0].lens), found, options.albedo), poses)
     rows, label = beside(found, twin, sources.get(KNOWN)), load_camera(known).title if known else ""

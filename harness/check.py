@@ -1,15 +1,15 @@
-"""``python -m harness.check experiments/regression.yaml``: a gate that fails if a detection limit became worse.
+"""``python -m harness.check experiments/regression.yaml``: a gate that fails if a detection limit has become worse.
 
-The study is run and compared with a baseline that lies in the repository, by `harness.evaluation.study.verdict`: a
-set-up fails if its a90 or its rate of false calls has grown, or its signals over what is needed have fallen, by more
-than 10 % and not by chance, as the tests say (0.1 % for the whole check); or if its limit is gone, more trials failed,
-or it is missing. With the same seed and code nothing fails.
+The study is run and compared with a committed baseline by `harness.evaluation.study.verdict`. A set-up fails if its a90
+or its rate of false calls has grown, or its signals relative to the threshold have fallen, by more than 10 % and not by
+chance, as the tests show (at 0.1 % for the whole check). It also fails if its limit is lost, if more trials failed, or
+if it is missing. With the same seed and code nothing fails.
 
-Of 20 checks each with 1.2 and 1.4 times the camera's noise and with 1.2 times the threshold all fail; of 25 whose a90
-grows by 20 % about the same a50, 11; with another draw of all noise alone 3 of 250 (95 %: 0.2 to 3.5 %), all by the
-signals (`tests/validation/gate_power.py`, boards as of regression.yaml).
-The diameter of through-holes hardly follows noise and threshold, the depth of blind holes does in proportion. Where
-both thresholds were calibrated anew, a90 must grow by two standard errors more (`verdict.limit_margin`)."""
+Of 20 checks each with 1.2 and 1.4 times the camera's noise and with 1.2 times the threshold, all fail; of 25 whose a90
+grows by 20 % about the same a50, 11 fail; with another draw of all noise alone, 3 of 250 fail (95 %: 0.2 to 3.5 %), all
+by the signals (`tests/validation/gate_power.py`, boards as in regression.yaml). The diameter of through-holes hardly
+follows noise and threshold; the depth of blind holes is proportional to them. If both thresholds were calibrated anew,
+a90 must grow by two standard errors more (`verdict.limit_margin`)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from harness.vocabulary.program import program
 if TYPE_CHECKING:
     from harness.evaluation.study.record import StudyRecord
 
-BASELINES = shipped("baselines")  # Folder of the committed baselines, one ``<name of the experiment>.json`` each
+BASELINES = shipped("baselines")  # folder of the committed baselines, one ``<name of the experiment>.json`` each
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -48,7 +48,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     epilog="Finished trials are kept: the same command resumes after Ctrl-C or a fault.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Returns 0, 1 where a set-up is worse or missing, 2 on a mistake of the user, 130 after Ctrl-C."""
+    """Run the program. Returns 0, 1 if a set-up is worse or missing, 2 for a user's mistake, 130 after Ctrl-C."""
     from harness.compare import FILES, write_comparison
     from harness.engine.study import run_study
     from harness.evaluation.study.record import read_record, record_text
@@ -62,7 +62,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     if study is None:
         raise UserError(f"{options.experiment}: has no `study`", fix="name an experiment with one: it measures limits")
     needed = fewest_boards(set_ups)
-    if study.boards < needed:  # no loss could ever be told from chance, and the gate would pass everything
+    if study.boards < needed:  # no loss could ever be significant, so the gate would pass everything
         what = f"with {study.boards} boards no loss is significant at {100 * ALPHA:g} %: the check cannot fail"
         fix = "raise study.boards: 24 are needed to detect a threshold that is 1.2 times as high"
         raise UserError(what, legal=f"at least {needed} boards for {many(set_ups, 'set-up')}", fix=fix)
@@ -70,7 +70,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     if not engine.shard.is_whole:
         raise UserError("--shard: a check needs the whole study", fix="run harness.sweep in shards, merge, then check")
     path = options.baseline or BASELINES / f"{experiment.config.name}.json"
-    baseline = _baseline(path, update=options.update)  # before anything runs: a study takes minutes
+    baseline = _baseline(path, update=options.update)  # before anything runs, because a study takes minutes
     code = run_study(experiment, options.out, engine, command)
     if code not in (0, 1):
         return code
@@ -102,7 +102,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def _baseline(path: Path, *, update: bool) -> StudyRecord | None:
-    """Read the baseline. Returns None where an ``update`` has none to compare with."""
+    """Read the baseline. Return None if there is none and this run is an ``update``."""
     from harness.evaluation.study.record import read_record
 
     if path.is_dir():

@@ -1,4 +1,4 @@
-"""``python -m harness.clean``: remove stored renders, or folders of results. Asks before it removes anything."""
+"""``python -m harness.clean``: removes stored renders or folders of results, after a question."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "python -m harness.clean results averaging/69346a82f4194e03 --dry-run",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Returns 0, 1 where something could not be removed or the answer was no, 2 on a mistake of the user."""
+    """Run the program. Returns 0, 1 if something could not be removed or the answer was no, 2 for a user's mistake."""
     from harness.listing import bytes_of, cache_removal, chosen_results, refuse_links, removable, remove_empty
     from harness.tables.text import many
     from scenes.render.cache import removed
@@ -56,7 +56,7 @@ def main(options: argparse.Namespace, command: str) -> int:
             return 0
         refuse_links(folders[0], folders[0].parent)
     if not options.dry_run:
-        with _held(folders, of_results):  # a sweep that runs is told before anything is asked
+        with _held(folders, of_results):  # report a running sweep before asking
             pass
     wanted = [each for one in folders for each in (removable(one) if of_results else cache_removal(one, limit))]
     what = (
@@ -64,7 +64,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     )
     if not _agreed(options, f"{what}, {size_text(sum(file.size_bytes for file in wanted))}", len(wanted)):
         return 0 if options.dry_run or not wanted else 1
-    with _held(folders, of_results):  # not while the question waits for its answer: that would block every sweep
+    with _held(folders, of_results):  # not held during the question, which would block every sweep
         gone = removed(wanted)
     for folder in folders if of_results else ():
         remove_empty(folder)
@@ -77,7 +77,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def _held(folders: list[Path], of_results: bool) -> ExitStack:
-    """Hold folders. Raises UserError where a sweep uses one, or where it cannot be written."""
+    """Lock folders. Raises UserError if a sweep uses one, or if one cannot be written."""
     from harness.engine.work import locked
     from scenes.render.cache import alone
 
@@ -91,7 +91,7 @@ def _held(folders: list[Path], of_results: bool) -> ExitStack:
 
 
 def _agreed(options: argparse.Namespace, what: str, count: int) -> bool:
-    """Ask whether to go on. Raises UserError where nobody can be asked."""
+    """Ask for confirmation. Raises UserError if nobody can be asked."""
     if options.dry_run or not count:
         print(f"would remove {what}" if count else "nothing to remove")
         return False

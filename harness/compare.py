@@ -1,4 +1,4 @@
-"""``python -m harness.compare A B``: two studies of detection limits, set-up by set-up, with paired tests."""
+"""``python -m harness.compare A B``: compares two studies of detection limits, set-up by set-up, with paired tests."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "both studies have the same boards. python -m harness.check fails if a detection limit grew.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Returns 0 for any result of the comparison, 2 on a mistake of the user, 130 after Ctrl-C."""
+    """Run the program. Returns 0 for any result of the comparison, 2 for a user's mistake, 130 after Ctrl-C."""
     from harness.evaluation.study.record import read_record
     from harness.evaluation.study.verdict import compare_studies, paired_set_ups
     from harness.report.compare import compare_parts

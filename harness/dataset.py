@@ -1,4 +1,4 @@
-"""``python -m harness.dataset EXPERIMENT --boards 500 --out DIR``: boards with masks, to train and to score on."""
+"""``python -m harness.dataset EXPERIMENT --boards 500 --out DIR``: writes boards with masks, to train and score on."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "python -m harness.score states the detection limit of any anomaly maps on it.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Returns 0, 1 where boards failed, 2 on a mistake of the user, 130 after Ctrl-C."""
+    """Run the program. Returns 0, 1 if boards failed, 2 for a user's mistake, 130 after Ctrl-C."""
     from harness.engine.boards import FEWEST, INDEX, read_index, samples_of
     from harness.experiment.load import load_experiment, resolved_yaml
     from scenes.render.cache import in_use
@@ -75,7 +75,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def _about(experiment: Experiment, licence: str, samples: list[Sample], command: str) -> dict[str, Any]:
-    """Return what ``dataset.json`` says of the whole; ``content`` names what decides the files' content."""
+    """Return the header of ``dataset.json``; ``content`` is a digest of all that determines the files."""
     from harness.engine.boards import DATASET_VERSION, categories_of
     from harness.engine.plan import PACKAGES
     from harness.vocabulary.provenance import record, source_digest
@@ -108,7 +108,7 @@ def _about(experiment: Experiment, licence: str, samples: list[Sample], command:
 
 
 def _written(out: Path, samples: list[Sample], engine: JobEngine) -> list[str]:
-    """Render what is missing and write the boards that are missing; returns why jobs failed. Progress: on stderr."""
+    """Render missing views and write missing boards; return why jobs failed. Progress is shown on stderr."""
     from harness.engine.boards import TRUTH, joined, seen_region, write_board
     from harness.engine.estimate import progress_display
     from harness.engine.run import carried_out
@@ -143,7 +143,7 @@ def _written(out: Path, samples: list[Sample], engine: JobEngine) -> list[str]:
 
 
 def _finish(out: Path, samples: list[Sample], about: dict[str, Any]) -> None:
-    """Write the COCO files and the card, and last the index that says that the data set is complete."""
+    """Write the COCO files, the card and, last, the index, which marks the data set as complete."""
     from harness.engine.boards import INDEX, INSET_PX, SPLITS, read_truth
     from harness.exchange import coco_data
     from harness.report.blocks import template

@@ -1,4 +1,4 @@
-"""``python -m harness.design``: what a planned study of detection limits can demonstrate."""
+"""``python -m harness.design``: predicts what a planned study of detection limits can demonstrate."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 LINKS = ("logit", "probit", "cloglog", "loglog")
 FILES = ("design.json", "design.png", "design.html")
 TARGETS = (30, 40, 60, 120)
-MOST_STUDIES = 100_000  # Simulated studies are kept in memory
-LEAST, MOST = 10, 10_000  # Targets of a study: as many rows as python -m harness.pod asks for; nobody makes more
+MOST_STUDIES = 100_000  # limited because simulated studies are kept in memory
+LEAST, MOST = 10, 10_000  # targets of a study: as many rows as python -m harness.pod requires; nobody makes more
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +41,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, metavar="DIR", help=f"write {', '.join(FILES)} there as well")
 
 
-# a curve, where it is from, sizes to choose from; face of a hole-free board in m2, None if not known
+# a curve and its origin, sizes to choose from, and the face of a hole-free board in m2 (None if unknown)
 Guess = tuple["PodCurve", str, tuple[float, float], float | None]
 
 
@@ -54,7 +54,7 @@ Guess = tuple["PodCurve", str, tuple[float, float], float | None]
     "simulated study.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Returns 0 (also where no plan shows a limit), 2 on a mistake of the user, 130 after Ctrl-C."""
+    """Run the program. Returns 0 (also if no plan shows a limit), 2 for a user's mistake, 130 after Ctrl-C."""
     from harness.evaluation.pod import design as plan
     from harness.report.design import StudyDesign, design_data, design_html, design_parts, save_design_png
     from harness.tables.text import show
@@ -66,7 +66,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     _check(options, guess)
     (curve, origin, sizes, board_m2), wanted = guess, options.false_calls_per_m2
     board_m2 = board_m2 if options.board_m2 is None else options.board_m2
-    # its mistakes come before the simulation's minute; `_check` has asked for the area
+    # refused before the simulation, which takes a minute; `_check` has required the area
     free = plan.hole_free(wanted, board_m2 or 0.0) if wanted is not None else None
     plans = plan.design(curve, sorted(set(options.targets)), sizes, studies=options.studies, seed=1)
     found = (plans, *plan.recommend(plans, options.goal), options.goal, free)
@@ -98,7 +98,7 @@ def _refuse_what_does_not_belong(options: argparse.Namespace) -> None:
 
 
 def _guess(options: argparse.Namespace) -> Guess:
-    """Return the curve that was told, or a study's, with the sizes that were told or inspected."""
+    """Return the given curve or a study's, with the given or inspected sizes."""
     from harness.evaluation.pod.design import curve_through
     from harness.evaluation.study.limit import limit_of
     from harness.evaluation.study.record import read_record, set_up_named
@@ -119,11 +119,11 @@ def _guess(options: argparse.Namespace) -> Guess:
 
 
 def _check(options: argparse.Namespace, guess: Guess) -> None:
-    """Refuse what would fail after minutes, or give nonsense."""
+    """Refuse arguments that would fail after minutes, or give nonsense."""
     curve, _, (low, high), board_m2 = guess
     a50, a90 = curve.size_at(0.5), curve.size_at(0.9)
     wrong = next((number for number in options.targets if not LEAST <= number <= MOST), None)
-    # NaN compares false with everything, so every rule is written as what has to hold.
+    # NaN compares false with everything, so every rule states the condition that must hold
     rules = (
         (0 <= low < high < float("inf"), f"--sizes {low:g} {high:g}: not a range", "0 <= FROM < TO"),
         (low < a50 < high, f"sizes of {low:g} to {high:g} do not hold a50 = {a50:.4g}", "--sizes FROM < a50 < TO"),

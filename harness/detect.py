@@ -1,4 +1,4 @@
-"""``python -m harness.detect``: the damage in a real capture, as a table and, with --out, as files."""
+"""``python -m harness.detect``: finds the damage in a real capture; prints a table and, with --out, writes files."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "; python -m harness.detect left.mcap right.mcap --register marks --merge fusion --out found/",
 )
 def main(arguments: argparse.Namespace, command: str) -> int:
-    """Returns 0, 2 on a mistake of the user, 130 after Ctrl-C."""
+    """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""
     from harness.inspection.run import inspect
 
     return inspect(arguments)

@@ -1,4 +1,4 @@
-"""``python -m harness.efficiency RESULTS``: every detector of a study beside the ideal observer."""
+"""``python -m harness.efficiency RESULTS``: compares every detector of a study with the ideal observer."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     epilog="It takes some seconds per damaged board. Views that are not in the store of renders are rendered again.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Returns 0, 2 on a mistake of the user, 130 after Ctrl-C."""
+    """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""
     from harness.engine.ideal import ideal_of_set_ups
     from harness.engine.plan import plan_of
     from harness.engine.tables import write_tables

@@ -1,4 +1,4 @@
-"""Simulated captures as other programs read them: TUM RGB-D, ROS 2, MCAP; pictures and masks of data sets."""
+"""Simulated captures in formats of other programs: TUM RGB-D, ROS 2, MCAP; pictures and masks of data sets."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from scipy.spatial.transform import Rotation
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Frame, FrameSource, Lens, Reason, Region, invert
 
-START_NS = 1_000_000_000 * 10**9  # time of the first frame, in 2001: 0 means "the latest" to ROS' tf
-PAUSE_NS = 10**9  # time between the last frame of a view and the first of the next, in which the camera is carried on
-BOARD_FRAME = "board"  # the world: x along the row of holes, y up the face, z out of it, origin at its centre
+START_NS = 1_000_000_000 * 10**9  # time of the first frame, in 2001; 0 would mean "the latest" to ROS's tf
+PAUSE_NS = 10**9  # time between two views, in which the camera is moved
+BOARD_FRAME = "board"  # the world frame: x along the row of holes, y up the face, z out of it, origin at its centre
 
 
 @dataclass(frozen=True)
 class ExportedView:
-    """Frames of one view. ``source`` has a lens and a pixel grid; ``T_board_camera`` (4, 4): the camera's place."""
+    """Frames of one view. ``source`` has a lens and a pixel grid. ``T_board_camera`` (4, 4): the camera's pose."""
 
     name: str
     source: FrameSource
@@ -44,7 +44,7 @@ class ExportedView:
         return self.start_ns + round(frame * 1e9 / self.frames_per_second)
 
     def exposures(self) -> Iterator[tuple[int, Frame]]:
-        """Yield time and frame on the whole sensor, as float32: without range, black, beyond the simulated region."""
+        """Yield time and frame on the whole sensor, float32; beyond the simulated region without range, and black."""
         lens, region = self.lens, self.source.region
 
         def on_sensor(values: np.ndarray, outside: float) -> np.ndarray:
@@ -68,7 +68,7 @@ def on_window(values: np.ndarray, region: Region, window: Region, outside: float
 def in_turn(
     sources: Sequence[FrameSource], poses: Sequence[np.ndarray], n_frames: int, frames_per_second: float
 ) -> tuple[ExportedView, ...]:
-    """Place views one after the other in time, named ``view_00`` and so on; ``poses`` are their ``T_camera_board``."""
+    """Put views one after the other in time, named ``view_00`` and so on; ``poses`` are their ``T_camera_board``."""
     digits = max(2, len(str(len(sources) - 1)))
     length_ns = round(n_frames * 1e9 / frames_per_second) + PAUSE_NS
     starts_ns = (START_NS + number * length_ns for number in range(len(sources)))
@@ -91,11 +91,11 @@ UNITS_PER_M = 5000  # the benchmark's depth scale
 FARTHEST_M = (2**16 - 1) / UNITS_PER_M
 CALIBRATION = "rtabmap_calib.yaml"
 OPTICAL_ROTATION = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0]])
-"""(3, 4): RTAB-Map's base (x forward, z up) from the camera's optical frame (z forward, y down)."""
+"""The (3, 4) matrix from the camera's optical frame (z forward, y down) to RTAB-Map's base (x forward, z up)."""
 
 
 def write_tum(folder: Path, views: Sequence[ExportedView]) -> None:
-    """Write a sequence of all views into an empty folder. Raises UserError where two views have different lenses."""
+    """Write a sequence of all views into an empty folder. Raises UserError if two views have different lenses."""
     lens = views[0].lens
     if any(view.lens != lens for view in views):
         raise UserError("the TUM RGB-D layout has one lens for all frames, and these views have several")
@@ -124,21 +124,21 @@ def write_tum(folder: Path, views: Sequence[ExportedView]) -> None:
 
 
 def depth_units(z_m: np.ndarray) -> np.ndarray:
-    """Return (h, w) uint16 in 0.2 mm; 0 where there is no range or it lies beyond the 13.1 m that 16 bits hold."""
+    """Return (h, w) uint16 in units of 0.2 mm; 0 without range, or beyond the 13.1 m that 16 bits hold."""
     with np.errstate(invalid="ignore"):
         held = (z_m > 0) & (z_m <= FARTHEST_M)
     return np.rint(np.where(held, z_m, 0.0).astype(np.float64) * UNITS_PER_M).astype(np.uint16)
 
 
 def undistorted(lens: Lens, picture: np.ndarray) -> np.ndarray:
-    """Return a picture (h, w[, 3]) as the pinhole sees it: the nearest pixel of the lens' own image, else 0."""
+    """Return a picture (h, w[, 3]) for the pinhole camera: the nearest pixel of the lens's own image, else 0."""
     matrix, size = lens.matrix, (lens.width, lens.height)
     u, v = cv2.initUndistortRectifyMap(matrix, np.array(lens.distortion), np.eye(3), matrix, size, cv2.CV_32FC1)
     return cv2.remap(np.ascontiguousarray(picture), np.rint(u), np.rint(v), cv2.INTER_NEAREST)
 
 
 def seconds_text(stamp_ns: int) -> str:
-    """Return a time as the benchmark writes it: seconds with six digits, exact to the microsecond."""
+    """Return a time in the benchmark's format: seconds with six digits, exact to the microsecond."""
     microseconds = (stamp_ns + 500) // 1000
     return f"{microseconds // 10**6}.{microseconds % 10**6:06d}"
 
@@ -161,11 +161,11 @@ def calibration_text(lens: Lens) -> str:
 POINTS_TOPIC = "/points2"
 INFO_TOPIC = "/depth/camera_info"
 POSE_TOPIC = "/tf_static"
-BAG_VERSION: Literal[8] = 8  # of metadata.yaml: the oldest that the library writes, read by later ROS too
+BAG_VERSION: Literal[8] = 8  # of metadata.yaml: the oldest that the library writes; later ROS versions read it too
 FLOAT32 = 7  # sensor_msgs/PointField's code
 POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4"), ("intensity", "<f4")])
-"""``rgb`` holds the bytes of 0x00RRGGBB; by ROS' convention its field is declared as a float of these bytes."""
-FOREVER = (9223372036, 854775807)  # seconds and nanoseconds that ROS 2 writes for an unlimited duration
+"""``rgb`` holds the bytes of 0x00RRGGBB; by ROS's convention, its field is declared as a float of these bytes."""
+FOREVER = (9223372036, 854775807)  # seconds and nanoseconds of an unlimited duration in ROS 2
 
 
 def write_bag(folder: Path, view: ExportedView, is_mcap: bool) -> None:
@@ -199,12 +199,12 @@ def write_bag(folder: Path, view: ExportedView, is_mcap: bool) -> None:
                 write(INFO_TOPIC, stamp_ns, _info_message(types.types, view.lens, header))
                 write(POINTS_TOPIC, stamp_ns, _cloud_message(types.types, frame, slopes, header))
     except sqlite3.OperationalError as error:
-        # SQLite hides the system's error number; of a new file in our own folder it complains for want of space only
+        # SQLite hides the system's error number; for a new file in our own folder, only lack of space is an error
         raise OSError(errno.ENOSPC, str(error), str(folder)) from error
 
 
 def frame_name(view: ExportedView) -> str:
-    """Return the name of a view's own optical frame, so that bags can be played together."""
+    """Return the name of a view's optical frame; different names let bags be played together."""
     return f"{view.name}_depth_optical_frame"
 
 
@@ -214,7 +214,7 @@ def _header(types: dict[str, Any], frame: str, stamp_ns: int) -> Any:
 
 
 def _cloud_message(types: dict[str, Any], frame: Frame, slopes: np.ndarray, header: Any) -> Any:
-    """The frame as `POINT`: z of the camera, x and y along ``slopes`` (h, w, 2); NaN without range."""
+    """Return the frame as `POINT`: z of the camera, x and y along ``slopes`` (h, w, 2); NaN without range."""
     assert frame.rgb is not None
     points = np.zeros(frame.z_m.shape, POINT)
     x_y = slopes * frame.z_m[..., None].astype(np.float64)
@@ -238,7 +238,7 @@ def _cloud_message(types: dict[str, Any], frame: Frame, slopes: np.ndarray, head
 
 
 def _info_message(types: dict[str, Any], lens: Lens, header: Any) -> Any:
-    """The lens in ROS' terms: D in OpenCV's order k1 k2 p1 p2 k3 .. k6; P is K, as the cloud is not rectified."""
+    """Return the lens in ROS's terms: D in OpenCV's order k1 k2 p1 p2 k3 .. k6; P is K, as clouds are not rectified."""
     distorted = any(lens.distortion)
     region = types["sensor_msgs/msg/RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
     return types["sensor_msgs/msg/CameraInfo"](
@@ -269,7 +269,7 @@ def _pose_message(types: dict[str, Any], view: ExportedView) -> Any:
 
 
 def _qos(latched: bool) -> tuple[Any, ...]:
-    """Reliable, the last ten; a latched topic is kept for those who subscribe later, as tf_static must be."""
+    """Return a reliable profile, history of ten; a latched topic is kept for later subscribers, as tf_static needs."""
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
     endless, history = QosTime(*FOREVER), (QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE)
@@ -281,7 +281,7 @@ def _qos(latched: bool) -> tuple[Any, ...]:
 
 
 def picture_bytes(kind: Literal[".png", ".tiff"], picture: np.ndarray) -> bytes:
-    """Return a picture (h, w[, 3]) as PNG of 8 or 16 bits or plain TIFF of float32; channels in OpenCV's order."""
+    """Encode a picture (h, w[, 3]) as PNG of 8 or 16 bits or plain TIFF of float32; channels in OpenCV's order."""
     plain = [cv2.IMWRITE_TIFF_COMPRESSION, 1] if kind == ".tiff" else []
     coded, content = cv2.imencode(kind, np.ascontiguousarray(picture), plain)
     assert coded
@@ -297,8 +297,8 @@ def run_lengths(mask: np.ndarray) -> list[int]:
 
 
 def coco_data(pictures: Sequence[dict[str, Any]], kinds: Sequence[str], about: dict[str, Any]) -> dict[str, Any]:
-    """Return a COCO file's content. ``pictures``: ``file_name``, ``width``, ``height`` and ``damages`` each, which have
-    ``kind``, ``run_lengths``, ``bbox`` (left, top, width, height) and ``pixels``."""
+    """Return a COCO file's content. ``pictures``: each with ``file_name``, ``width``, ``height`` and ``damages``, which
+    have ``kind``, ``run_lengths``, ``bbox`` (left, top, width, height) and ``pixels``."""
     numbers = {kind: number for number, kind in enumerate(kinds, start=1)}
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []

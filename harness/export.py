@@ -1,4 +1,4 @@
-"""``python -m harness.export``: the simulated views of an experiment for other mapping programs, with their truth."""
+"""``python -m harness.export``: exports an experiment's simulated views, with truth, for other mapping programs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from scenes.target.custom import TargetConfig
 
 FORMATS = ("tum", "ros2", "mcap")
-REPEAT = 0  # The trial whose noise is exported: the same frames as an experiment's first repeat
+REPEAT = 0  # the trial whose noise is exported: the same frames as in an experiment's first repeat
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -43,7 +43,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     epilog="example: python -m harness.export experiments/perspectives.yaml --format mcap --views 3 --out bags/",
 )
 def main(arguments: argparse.Namespace, command: str) -> int:
-    """Returns its exit code (0, 2 for the user's mistake, 130 for Ctrl-C)."""
+    """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""
     from harness.engine.plan import batch_of
     from harness.exchange import in_turn, write_bag, write_tum
     from harness.experiment.load import load_experiment
@@ -91,7 +91,7 @@ def _write_beside(
     views: tuple[ExportedView, ...],
     command: str,
 ) -> None:
-    """Write the truth, the nominal poses that a registration may start from, the declaration, and the provenance."""
+    """Write the truth, the nominal poses for a registration, the declaration, and the provenance."""
     import numpy as np
 
     from harness.experiment.load import resolved_yaml

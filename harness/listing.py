@@ -39,7 +39,7 @@ def bytes_of(text: str) -> int:
 
 
 Row = Mapping[str, Any]
-SETTABLE = {"detectors": "settings", "cameras": "numbers"}  # kinds of offers, and the name of what can be set of each
+SETTABLE = {"detectors": "settings", "cameras": "numbers"}  # kinds of offers, and what can be set for each
 
 
 def plug_ins(kind: str) -> PlugIns:
@@ -54,7 +54,7 @@ def plug_ins(kind: str) -> PlugIns:
 
 
 def offered(kind: str) -> list[Row]:
-    """Return a row for each offer; an unusable offer has ``broken``, which gives the reason, and ``fix``."""
+    """Return a row for each offer; an unusable one has ``broken``, which states the reason, and ``fix``."""
     rows: list[Row] = []
     for offer in plug_ins(kind).offers():
         try:
@@ -71,13 +71,13 @@ def offered(kind: str) -> list[Row]:
 
 
 def shown(kind: str, name: str) -> Row:
-    """Return an offer's row with all of its settings. Raises UserError where it is unknown, taken twice or broken."""
+    """Return an offer's row with all of its settings. Raises UserError if it is unknown, ambiguous or broken."""
     settable = _detector_settings(name) if kind == "detectors" else _numbers(name)
     return {**_origin(plug_ins(kind).offer(name)), **_facts(kind, name), SETTABLE[kind]: settable}
 
 
 def grid_of(kind: str, rows: Sequence[Row]) -> Grid:
-    """Return rows of offers as a table."""
+    """Return a table of rows of offers."""
     heads: tuple[str, ...] = ("pixels", "range", "light", "title")
     if kind == "detectors":
         heads = ("version", "what it does")
@@ -125,7 +125,7 @@ def _facts(kind: str, name: str) -> Row:
 
 
 def _detector_settings(name: str) -> list[dict[str, Any]]:
-    """Every setting with default and what is legal; of a setting of several kinds, those of the default's kind."""
+    """Yield every setting with default and legal values; for one of several kinds, those of the default kind."""
     from pydantic import ValidationError
 
     from detectors import detector_type
@@ -149,7 +149,7 @@ def _detector_settings(name: str) -> list[dict[str, Any]]:
 
 
 def _numbers(name: str) -> list[dict[str, Any]]:
-    """Every number of the camera's file with its tag and source."""
+    """Yield every number of the camera's file with its tag and source."""
     from harness.vocabulary.declaration.shape import get
     from scenes.sensor.camera import load_camera, number_paths
 
@@ -203,7 +203,7 @@ SHOWN_SETTINGS = 6
 
 
 def result_folders(out: Path, experiment: str | None = None) -> list[dict[str, Any]]:
-    """Return `described` of every folder with ``limits``, settings in which it ``differs``, ``is_latest``."""
+    """Return `described` of every folder, with ``limits``, settings in which it ``differs``, and ``is_latest``."""
     found = []
     for parent in folders_in(out, EXPERIMENT_NAME):
         if experiment is not None and parent.name != experiment:
@@ -222,7 +222,7 @@ def result_folders(out: Path, experiment: str | None = None) -> list[dict[str, A
 
 
 def limit_text(limits: list[dict[str, Any]]) -> str:
-    """Return the detection limit with its set-up; the span of several; "" where there is no study."""
+    """Return the detection limit with its set-up, or the range of several; "" if there is no study."""
     found = [row for row in limits if row["a90_95_mm"] is not None and row["verdict"] == "demonstrated"]
     if not found:
         return "a90/95 not demonstrated" if limits else ""
@@ -234,7 +234,7 @@ def limit_text(limits: list[dict[str, Any]]) -> str:
 
 
 def differs_text(differs: dict[str, Any]) -> str:
-    """Return the settings that tell a run from others of its experiment, at most `SHOWN_SETTINGS`."""
+    """Return at most `SHOWN_SETTINGS` settings in which a run differs from others of its experiment."""
     names = names_of(differs)
     parts = [f"{names[path]}={value_text(path, value)}" for path, value in differs.items()]
     more = len(parts) - SHOWN_SETTINGS
@@ -242,7 +242,7 @@ def differs_text(differs: dict[str, Any]) -> str:
 
 
 def _settings(run: Path) -> dict[str, Any]:
-    """Every setting of a run's resolved experiment by its dotted path; empty where it cannot be read."""
+    """Return every setting of a run's resolved experiment by its dotted path; empty if it cannot be read."""
     try:
         found = {".".join(path): value for path, value in leaves(read_yaml(run / EXPERIMENT.name).data)}
         canonical_json(found)
@@ -252,7 +252,7 @@ def _settings(run: Path) -> dict[str, Any]:
 
 
 def _limits(run: Path) -> list[dict[str, Any]]:
-    """The detection limits of a study; empty where there are none or they cannot be read."""
+    """Return the detection limits of a study; empty if there are none or they cannot be read."""
     rows = []
     try:
         for row in csv.DictReader(io.StringIO(bounded_bytes(run / "limits.csv", TEXT_BYTES).decode())):
@@ -279,7 +279,7 @@ def described(run: Path) -> dict[str, Any]:
         facts = strict_json(bounded_bytes(run / PROVENANCE.name, TEXT_BYTES), nan=True)
         if not isinstance(facts, dict):
             raise ValueError("is no provenance")
-    except FileNotFoundError:  # a run that is not over
+    except FileNotFoundError:  # the run is not finished
         records = 0
         with contextlib.suppress(UserError):  # of a newer tofpod, or reached through a link
             records = len(Journal(run / "journal"))
@@ -303,7 +303,7 @@ def described(run: Path) -> dict[str, Any]:
 
 
 def in_use(run: Path) -> bool:
-    """Return whether a sweep is at work in this folder; False where the system has no locks."""
+    """Return whether a sweep is running in this folder; False if the system has no locks."""
     from harness.engine.work import LOCK
 
     try:
@@ -316,7 +316,7 @@ def in_use(run: Path) -> bool:
 
 
 def folders_in(folder: Path, names: re.Pattern[str]) -> list[Path]:
-    """Return folders with such names, links left out, sorted."""
+    """Return folders with such names, without links, sorted."""
     with contextlib.suppress(FileNotFoundError, NotADirectoryError), os.scandir(folder) as entries:
         found = [entry for entry in entries if names.fullmatch(entry.name) and entry.is_dir(follow_symlinks=False)]
         return sorted(Path(entry.path) for entry in found)
@@ -329,14 +329,14 @@ def files_below(folder: Path) -> Iterator[Path]:
 
 
 def latest_run(parent: Path) -> str | None:
-    """Return the name of the run that ``parent/latest`` points to; None where there is no such link of tofpod's."""
+    """Return the name of the run to which ``parent/latest`` points; None without such a link by tofpod."""
     path = Path(parent) / LATEST
     target = os.readlink(path) if path.is_symlink() else ""
     return target if DIGEST_NAME.fullmatch(target) else None
 
 
 def point_to(run: Path) -> None:
-    """Let the link ``latest`` beside a run point to it, unless it is not tofpod's; failures are printed on stderr."""
+    """Let the link ``latest`` beside a run point to it, unless tofpod did not make it; print failures on stderr."""
     path = Path(run).parent / LATEST
     if os.path.lexists(path) and latest_run(path.parent) is None:
         print(f"{path}: was not written by tofpod and is left unchanged; the newest run is {run}", file=sys.stderr)
@@ -351,7 +351,7 @@ def point_to(run: Path) -> None:
 
 # ---------------------------------------------------------------- removal
 
-UNFINISHED = re.compile(r"^\.(.+)\.\w{8}\.part(\.\w+)$")  # name of what a killed process was writing
+UNFINISHED = re.compile(r"^\.(.+)\.\w{8}\.part(\.\w+)$")  # name of a file that a killed process was writing
 
 
 def refuse_links(*paths: Path) -> None:
@@ -363,14 +363,14 @@ def refuse_links(*paths: Path) -> None:
 
 
 def cache_removal(folder: Path, limit_bytes: int | None) -> list[StoredFile]:
-    """Return the longest unused renders, so that the rest fits, and old leftovers; None: all of both."""
+    """Return the longest unused renders to remove so that the rest fits, and old leftovers; for None all of both."""
     if limit_bytes is None:
         return stored_renders(folder) + leftovers(folder, 0.0)
     return longest_unused(stored_renders(folder), limit_bytes, ()) + leftovers(folder)
 
 
 def chosen_results(out: Path, name: str) -> list[Path]:
-    """Return the folders of results named ``NAME`` or ``NAME/DIGEST``. Raises UserError where there are none."""
+    """Return the folders of results named ``NAME`` or ``NAME/DIGEST``. Raises UserError if there are none."""
     experiment, slash, digest = name.partition("/")
     if not EXPERIMENT_NAME.fullmatch(experiment) or (slash and not DIGEST_NAME.fullmatch(digest)):
         legal = "NAME or NAME/DIGEST, as python -m harness.ls results shows them"
@@ -379,7 +379,7 @@ def chosen_results(out: Path, name: str) -> list[Path]:
     refuse_links(parent, parent / digest)
     found = [path for path in folders_in(parent, DIGEST_NAME) if digest in ("", path.name)]
     for folder in found or [parent / digest]:
-        # every sweep begins with its declaration, whose first line says whose it is
+        # every sweep first writes its declaration, whose first line identifies tofpod
         declared = folder / EXPERIMENT.name
         if not declared.is_file() or not bounded_bytes(declared, TEXT_BYTES).startswith(b"# tofpod experiment "):
             raise UserError(f"{folder}: is not a folder of results", fix="python -m harness.ls results shows them")
@@ -403,7 +403,7 @@ def removable(folder: Path) -> list[StoredFile]:
 
 
 def remove_empty(folder: Path) -> None:
-    """Remove a folder of results where nothing is left in it, and ``latest`` where it pointed to it."""
+    """Remove a folder of results if nothing is left in it, and ``latest`` if it pointed to it."""
     for inner, _, _ in os.walk(folder, topdown=False):
         with contextlib.suppress(OSError):
             os.rmdir(inner)

@@ -1,4 +1,4 @@
-"""``python -m harness.ls``: list detectors and cameras with their settings, folders of results, and stored renders."""
+"""``python -m harness.ls``: lists detectors and cameras with their settings, folders of results, and stored renders."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "python -m harness.ls cache",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Returns 0 (also where something listed is broken), 2 on a mistake of the user."""
+    """Run the program. Returns 0 (also if something listed is broken), 2 for a user's mistake."""
     if options.what == "keys":
         from harness.listing import reference
 
@@ -44,7 +44,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def _list_offers(options: argparse.Namespace) -> int:
-    """List detectors and cameras, or all that can be set of those of a name. Raises UserError for another."""
+    """List detectors and cameras, or the settings of those with a name. Raises UserError for an unknown name."""
     from harness.listing import SETTABLE, grid_of, offered, plug_ins, shown
     from harness.tables.text import Grid, show
     from harness.vocabulary.declaration.diagnose import nearest
@@ -77,7 +77,7 @@ def _list_offers(options: argparse.Namespace) -> int:
 
 
 def _list_results(options: argparse.Namespace) -> int:
-    """List every folder of results with state, limit, differences. Raises UserError for an unknown experiment."""
+    """List every folder of results with state, limit and differences. Raises UserError for an unknown experiment."""
     from harness.listing import differs_text, limit_text, result_folders
     from harness.tables.text import Grid
 

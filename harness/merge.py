@@ -1,4 +1,4 @@
-"""``python -m harness.merge``: join the journals of shards and machines into one folder of results."""
+"""``python -m harness.merge``: joins the journals of shards and machines into one folder of results."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "--into results/averaging/0123456789abcdef; then the sweep's own command, without --shard, writes the report",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Returns 0, 1 where two journals give different results for one trial, 2 on a mistake of the user."""
+    """Run the program. Returns 0, 1 if two journals give different results for a trial, 2 for a user's mistake."""
     folders, into = options.folders, options.into
     _refuse_others(folders, into)
     declared = next((path for folder in folders if (path := folder / "experiment.yaml").is_file()), None)
     if declared is None:
         raise UserError(f"{folders[0]}: has no experiment.yaml", fix="name folders as sweeps leave them")
-    # written again where it is there: a folder that cannot be written shows before anything is copied
+    # written even if it exists: this shows whether the folder is writable before anything is copied
     write_bytes(into / "experiment.yaml", bounded_bytes(declared, TEXT_BYTES))
     counts: Counter[str] = Counter()
     different, damaged = [], []
@@ -64,8 +64,8 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def merge_into(into: Journal, other: Journal, counts: Counter[str]) -> list[str]:
-    """Copy trials that ``into`` lacks or has not finished; count those copied, known, and alike but for last digits.
-    Returns the keys of those that differ. Raises UserError where a newer tofpod wrote either."""
+    """Copy trials that ``into`` lacks or has not finished; count those copied, known, and equal but for last digits.
+    Return the keys of those that differ. Raises UserError if a newer tofpod wrote either journal."""
     different = []
     for key, entry in other.entries():
         known = into.read(key)
@@ -85,7 +85,7 @@ def merge_into(into: Journal, other: Journal, counts: Counter[str]) -> list[str]
 
 
 def _without_seconds(value: object) -> object:
-    """A record without timings and learned arrays, whose last digits differ; what trials made of them is compared."""
+    """Return a record without timings and learned arrays, whose last digits differ; results are compared."""
     if isinstance(value, dict):
         kept = {name: each for name, each in value.items() if not name.startswith("seconds") and name != "arrays"}
         return {name: _without_seconds(each) for name, each in kept.items()}
@@ -93,7 +93,7 @@ def _without_seconds(value: object) -> object:
 
 
 def _alike(first: Any, second: Any, *, in_tenth_um: bool = False) -> bool:
-    """Return whether values agree as on unlike processors: to a thousandth, or 1 um; counts must be equal."""
+    """Return whether values agree as between different processors: to a thousandth, or 1 um; counts must be equal."""
     if isinstance(first, dict) and isinstance(second, dict) and first.keys() == second.keys():
         return all(_alike(first[name], second[name], in_tenth_um=name == "error_tenth_um") for name in first)
     if isinstance(first, list) and isinstance(second, list) and len(first) == len(second):
@@ -106,7 +106,7 @@ def _alike(first: Any, second: Any, *, in_tenth_um: bool = False) -> bool:
 
 
 def _refuse_others(folders: list[Path], into: Path) -> None:
-    """Only journals of one experiment belong together; its folder's name is its digest."""
+    """Raise UserError unless all journals belong to one experiment, whose digest is its folder's name."""
     for folder in folders:
         if not (folder / "journal").is_dir():
             fix = "name folders that python -m harness.ls results lists"

@@ -1,4 +1,4 @@
-"""``python -m harness.pod``: the probability of detection of the user's inspections (MIL-HDBK-1823A)."""
+"""``python -m harness.pod``: the probability of detection from the user's own inspections (MIL-HDBK-1823A)."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     epilog="example: python -m harness.pod blades.csv --hit found --size length --target blade --unit mm",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Returns 0 (also where no limit is demonstrated), 2 on a mistake of the user, 130 after Ctrl-C."""
+    """Run the program. Returns 0 (also if no limit is demonstrated), 2 for a user's mistake, 130 after Ctrl-C."""
     from harness.report.mapod import mapod_html, mapod_parts, save_mapod_png
     from harness.report.pod import pod_html, pod_parts, save_pod_png
     from harness.tables.text import show
@@ -100,7 +100,7 @@ def _corrected(options: argparse.Namespace) -> Mapod:
 
 
 def _unlike(read: Inspections, study: SetUpRecord, radius_mm: float) -> str:
-    """Say that the real hits were not counted as the study's were, or that the table does not tell; "" otherwise."""
+    """Return a remark if the real hits were counted otherwise than the study's, or if the table does not show it."""
     from harness.evaluation.pod.inspections import texts_of
 
     counted = "by {} at a threshold of {:.3g}, within {:.3g} mm"

@@ -1,4 +1,4 @@
-"""``python -m harness.prepare``: compile the inner loops once, so that the first sweep need not. Part of the set-up."""
+"""``python -m harness.prepare``: compiles the inner loops once, as a part of the installation."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from harness.vocabulary.program import program
 
 @program(lambda parser: None, "Compile the inner loops once.")
 def main(options: argparse.Namespace, command: str) -> int:
-    """Drive the loops of single views through small captures (those of maps compile when first used), in two processes.
-    Returns 0."""
+    """Run the loops of single views on small captures, in two processes; map loops compile at first use. Returns 0."""
     from harness.engine.processes import PROCESSES
 
     began = time.perf_counter()
@@ -27,7 +26,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def draw_frames() -> None:
-    """Draw a frame by every camera, and average frames in every way."""
+    """Draw a frame with every camera, and average frames in every way."""
     from detectors.average import AverageConfig, prefix_averages
     from harness.vocabulary.geometry import Region
     from scenes.closed_form import plane_view
@@ -63,7 +62,7 @@ def analyse() -> None:
     surfaces += [{"shape": shape} for shape in ("auto", "free_form")]
     for settings in ({"crop": {"kind": "auto"}}, *({"crop": {"kind": "none"}, "surface": each} for each in surfaces)):
         detector = load_detector("thesis", settings)
-        with suppress(UserError):  # a capture so small may be no target to the crop, whose loops have run by then
+        with suppress(UserError):  # such a small capture may show no target to the crop; its loops have run by then
             evidence = detector.analyse(cloud)
             for detection in detector.find(cloud, evidence, detector.quiet_threshold(cloud, evidence) / 2):
                 detector.measure(cloud, evidence, detection)

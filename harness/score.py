@@ -1,11 +1,12 @@
 """``python -m harness.score PREDICTIONS --dataset DIR``: the detection limit of a method's anomaly maps.
 
-A map is judged as a study judges a score: the threshold is the lowest with the wanted rate of false calls on the good
-boards of ``validation``; pixels above it that steps of at most `LINK_M` join are a finding, which hits a damage by the
-experiment's rule (`harness.engine.judge.matched`); limits follow from ``test``. Only inspected pixels count.
+A map is judged like a detector's score in a study: the threshold is the lowest with the wanted rate of false calls on
+the good boards of ``validation``; pixels above it, connected by steps of at most `LINK_M`, are a finding, which hits a
+damage by the experiment's rule (`harness.engine.judge.matched`). Limits follow from ``test``. Only inspected pixels
+count.
 
 AU-PRO is the area under the mean overlap of damages against the share of false pixels, up to `PRO_LIMIT` and divided by
-it (Bergmann et al., International Journal of Computer Vision 129 (2021), 1038), with each damage as a region."""
+it (Bergmann et al., Int. Journal of Computer Vision 129 (2021), 1038), with each damage as a region."""
 
 from __future__ import annotations
 
@@ -29,8 +30,8 @@ if TYPE_CHECKING:
     from harness.evaluation.study.limit import SetUpLimit
 
 ENDINGS = (".npy", ".tiff", ".tif")
-JUDGED = ("validation", "test")  # Splits of which every board needs a map
-LINK_M = 0.010  # Longest step within a finding, as in `detectors.score_map`
+JUDGED = ("validation", "test")  # splits whose boards all need a map
+LINK_M = 0.010  # longest step within a finding, as in `detectors.score_map`
 PRO_LIMIT = 0.3
 MOST_NAMED = 3
 JUDGED_BY = ("inspected", "board_xy_m", "damage")
@@ -55,7 +56,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "folders of results.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Returns 0 (also where no limit is demonstrated), 2 on a mistake of the user."""
+    """Run the program. Returns 0 (also if no limit is demonstrated), 2 for a user's mistake."""
     from harness.engine.boards import read_index
     from harness.evaluation.study.record import StudyRecord, record_text
     from harness.report.pod import pod_html
@@ -95,7 +96,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def _found(predictions: Path, dataset: Path, samples: list[str]) -> dict[str, Path]:
-    """The file of each board's map. Raises UserError that names all that is missing, extra or wrong."""
+    """Return the file of each board's map. Raises UserError that names all missing, extra or wrong files."""
     from harness.engine.boards import read_arrays
 
     wanted = {name for name in samples if name.split("/")[1] in JUDGED}
@@ -124,7 +125,7 @@ def _found(predictions: Path, dataset: Path, samples: list[str]) -> dict[str, Pa
 
 
 def _fault(path: Path, inspected: np.ndarray) -> str:
-    """Say what is wrong with a map; nothing where all is well."""
+    """Return what is wrong with a map; empty if nothing is."""
     try:
         scores = _read(path)
     except UserError:
@@ -136,7 +137,7 @@ def _fault(path: Path, inspected: np.ndarray) -> str:
 
 
 def _read(path: Path) -> np.ndarray:
-    """Return a map's numbers. Raises UserError where it holds none."""
+    """Return a map's numbers. Raises UserError if there are none."""
     import cv2
 
     from detectors.recordings.arrays import load_npy
@@ -155,7 +156,7 @@ def _read(path: Path) -> np.ndarray:
 def _judged(
     category: str, maps: dict[str, Path], options: argparse.Namespace, index: dict[str, Any], rate: float
 ) -> tuple[SetUpLimit, dict[str, Any]]:
-    """Judge the maps of a category, at a threshold by its good boards of ``validation``: limit, and scores."""
+    """Judge the maps of a category at a threshold from its good boards of ``validation``: limit and scores."""
     import pandas as pd
 
     from harness.engine.boards import read_arrays, read_truth
@@ -166,7 +167,7 @@ def _judged(
     from harness.evaluation.study.limit import limit_of
 
     def boards(split: str) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray, float]]:
-        """Boards of a split: name, scores (NaN where not inspected), places, damage, area inspected."""
+        """Yield the boards of a split: name, scores (NaN if not inspected), places, damage, inspected area."""
         for each in sorted(one for one in maps if one.startswith(f"{category}/{split}/")):
             inspected, places, damage = read_arrays(options.dataset, each, *JUDGED_BY)
             scores, places_m = np.where(inspected, _read(maps[each]), np.nan), places.astype(float)
@@ -224,7 +225,7 @@ def _judged(
 
 
 def _findings(places_m: np.ndarray, above: np.ndarray) -> Findings:
-    """Findings that the pixels ``above`` (h, w) make, without scores; their centres (m, 2) lie on the face."""
+    """Return the findings of pixels ``above`` (h, w), without scores; their centres (m, 2) lie on the face."""
     from detectors.clusters import euclidean_clusters
     from detectors.measure import centres_of
     from detectors.score_map import Findings
@@ -238,7 +239,7 @@ def _findings(places_m: np.ndarray, above: np.ndarray) -> Findings:
 
 def area_under(scores: np.ndarray, found: np.ndarray, false: np.ndarray, limit: float = 1.0) -> float:
     """Return the area under the share of the weights ``found`` (n,) above a threshold against that of ``false`` (n,),
-    up to ``limit`` and divided by it; NaN where either has no weight. Equal scores are one threshold."""
+    up to ``limit`` and divided by it; NaN if either has no weight. Equal scores make one threshold."""
     order = np.argsort(-scores, kind="stable")
     last = np.append(np.flatnonzero(np.diff(scores[order])), len(scores) - 1)
     up, across = (np.append(0.0, np.cumsum(each[order])[last]) for each in (found, false))

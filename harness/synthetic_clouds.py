@@ -1,4 +1,4 @@
-"""Small synthetic clouds with known damage, and without, on which detectors are tried (`harness.testing`)."""
+"""Small synthetic clouds, with and without known damage, to test detectors (`harness.testing`)."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ SHAPE = (90, 120)  # rows and columns: 126 by 168 mm at 0.7 m
 DISTANCE_M, NOISE_M, FRAMES = 0.7, 3e-4, 20
 LENS = Lens(SHAPE[1], SHAPE[0], 500.0, 500.0, 59.5, 44.5)
 DAMAGE = ((-0.04, -0.02, 0.010, 0.012), (0.03, 0.02, 0.007, 0.008), (0.05, -0.03, 0.008, -0.006))
-"""x, y and radius on the face, and depth behind it (before it, where negative), metres: two holes and a bump."""
+"""Two holes and a bump: x, y and radius on the face, and depth behind it (negative: in front of it), metres."""
 
 
 def synthetic_clouds() -> tuple[Cloud, ...]:
-    """A tilted plane, a cylinder's face, and a tilted plane some of whose pixels have no range; each with `DAMAGE`."""
+    """Return a tilted plane, a cylinder's face, and a tilted plane with pixels without range; each with `DAMAGE`."""
     return plane(seed=1), cylinder(seed=2), with_gaps(plane(seed=3), seed=4)
 
 
 def plane(seed: int, tilt: float = 0.1, damage: Sequence[tuple[float, float, float, float]] = DAMAGE) -> Cloud:
-    """A plane whose z grows by ``tilt`` metres with each metre in x."""
+    """Return a plane whose z grows by ``tilt`` metres per metre in x."""
     return _seen(seed, lambda x, y: DISTANCE_M + tilt * x, damage)
 
 
 def cylinder(seed: int, radius_m: float = 0.5) -> Cloud:
-    """The convex face of a cylinder about the y axis."""
+    """Return the convex face of a cylinder about the y axis."""
     return _seen(seed, lambda x, y: DISTANCE_M + radius_m - np.sqrt(radius_m**2 - x**2))
 
 
 def with_gaps(cloud: Cloud, seed: int, share: float = 0.05) -> Cloud:
-    """The cloud without a share of its pixels, without a block of them, and without its last column."""
+    """Return the cloud without a share of its pixels, a block of them, and its last column."""
     gone = np.random.default_rng(seed).random(cloud.valid.shape) < share
     gone[10:14, 20:26] = True
     gone[:, -1] = True
@@ -40,7 +40,7 @@ def with_gaps(cloud: Cloud, seed: int, share: float = 0.05) -> Cloud:
 
 
 def without(cloud: Cloud, gone: np.ndarray) -> Cloud:
-    """The cloud with no range at the pixels ``gone`` (h, w) bool."""
+    """Return the cloud without range at the pixels ``gone`` (h, w) bool."""
     return replace(
         cloud,
         points_m=np.where(gone[..., None], np.nan, cloud.points_m),
@@ -57,7 +57,7 @@ def _seen(
 ) -> Cloud:
     slopes = LENS.region_slopes(LENS.whole)
     z = np.full(SHAPE, DISTANCE_M)
-    # the ray meets the face where z = face(z * slopes); the slopes are small, so that this converges by itself
+    # the ray meets the face where z = face(z * slopes); the iteration converges because the slopes are small
     for _ in range(60):
         z = face(slopes[..., 0] * z, slopes[..., 1] * z)
     x, y = slopes[..., 0] * z, slopes[..., 1] * z

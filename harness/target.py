@@ -1,4 +1,4 @@
-"""``python -m harness.target``: build a target, print its truth, write its mesh and its truth."""
+"""``python -m harness.target``: builds a target, prints its truth, and writes its mesh and its truth."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     epilog="example: python -m harness.target thesis --out board.glb --truth truth.json",
 )
 def main(arguments: argparse.Namespace, command: str) -> int:
-    """Returns 0, 2 on a mistake of the user."""
+    """Run the program. Returns 0, 2 for a user's mistake."""
     config = declared(arguments.target, arguments.board)
 
     from harness.tables.text import Grid, show
@@ -54,7 +54,7 @@ def main(arguments: argparse.Namespace, command: str) -> int:
 
 
 def declared(what: str | Path | Mapping[str, Any], board: int) -> TargetConfig:
-    """Return the target of a name, a file or a declaration; of a family one ``board``. Raises UserError."""
+    """Return the target from a name, a file or a declaration; for a family, one ``board``. Raises UserError."""
     from harness.vocabulary.declaration.diagnose import read_as, settings_of
     from harness.vocabulary.declaration.yaml_source import read_yaml
     from scenes.target.drawn import DrawnTargetConfig

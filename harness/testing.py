@@ -7,7 +7,7 @@
     def test_my_detector_keeps_the_contract():
         check_detector(AcmeDetector, settings={"window_px": 7})
 
-Every check is a function of its own, listed in `CHECKS`."""
+Every check is a separate function, listed in `CHECKS`."""
 
 from __future__ import annotations
 

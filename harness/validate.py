@@ -1,4 +1,4 @@
-"""``python -m harness.validate``: the simulated cameras beside published figures, or beside a real capture."""
+"""``python -m harness.validate``: compares the simulated cameras with published figures, or with a real capture."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     epilog="The exit code is 1 if a figure fails and its entry in the file of figures gives no reason.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Returns 0, 1 where a figure fails and its entry gives no reason, 2 on a mistake of the user, 130 after Ctrl-C."""
+    """Run the program. Returns 0, 1 if a figure fails without a reason, 2 for a user's mistake, 130 after Ctrl-C."""
     if options.capture or options.board:
         if options.figures:
             raise UserError("--figures belongs to the scorecard, not to a capture")

@@ -81,7 +81,7 @@ def test_the_drill_of_a_simulated_capture_is_found_again(recorded, capsys):
     out = recorded / "out"
     assert main(["--board", str(recorded / "known.yaml"), *options, "--out", str(out)]) == 0
     told = capsys.readouterr().out
-    assert "diameter=6 mm comes nearest" in told
+    assert "diameter=6 mm is closest" in told
     assert "1.png is left out: the whole range jumps by +17.0 mm" in told
     rows = list(csv.DictReader((out / "capture.csv").open()))
     right = [row for row in rows if row["where"].endswith("6 mm")]
@@ -90,14 +90,14 @@ def test_the_drill_of_a_simulated_capture_is_found_again(recorded, capsys):
             assert float(row["simulated"]) == pytest.approx(float(row["measured"]), rel=0.15)
     peaks = {row["where"]: float(row["simulated"]) for row in rows if row["at"] == "all"}
     assert list(peaks.values()) == sorted(peaks.values())
-    assert "comes nearest" in (out / "capture.html").read_text()
+    assert "is closest" in (out / "capture.html").read_text()
 
 
 @pytest.mark.slow
 def test_without_a_capture_the_simulation_stands_alone(recorded, capsys):
     out = recorded / "alone"
     assert main(["--board", str(recorded / "known.yaml"), "--out", str(out)]) == 0
-    assert capsys.readouterr().out.count("No capture is given: the simulation stands alone.") == 1
+    assert capsys.readouterr().out.count("No capture is given, so there is nothing to compare with.") == 1
     rows = list(csv.DictReader((out / "capture.csv").open()))
     assert {row["measured"] for row in rows} == {""}
     assert all(

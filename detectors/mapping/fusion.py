@@ -30,17 +30,17 @@ from harness.vocabulary.geometry import Cloud, MapViews, Reason, Region, invert,
 
 CELLS = 2000
 CLASSES, PER_CLASS = 12, 100
-"""Classes of distance on the sensor with equal numbers of pairs, and the least number worth a median."""
+"""Number of classes of distance on the sensor, with equal numbers of pairs, and the fewest pairs worth a median."""
 LENGTHS = 24
-"""Trial lengths, geometric from a pixel to the largest distance between views."""
+"""Number of trial lengths, geometric from a pixel to the largest distance between views."""
 EXPONENTS = (1.0, 1.5, 2.0)
-"""The law of a pattern that a filter smooths over a few pixels is flat at first (2), not pointed (1)."""
+"""The covariance of a pattern that a filter smooths over a few pixels is flat at first (2), not pointed (1)."""
 MEDIAN_SQUARE = 0.45494
 """Median of the square of a standard normal deviate."""
 MEDIAN_ERROR = 2.33
-"""Standard error of the median of n such squares, as a part of it, times the root of n."""
+"""Standard error of the median of n such squares, relative to it, times the root of n."""
 GATE_SIGMAS = 5.0
-"""An observation so many deviations from the median of at least three views is an outlier."""
+"""An observation this many deviations from the median of at least three views is an outlier."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +88,8 @@ def between_views(
 def _law(
     first: np.ndarray, unit: np.ndarray, distance: np.ndarray, known: np.ndarray, may_vanish: bool
 ) -> tuple[float, float, float, float]:
-    """(factor of ``first``, sill, length, exponent), all (c,) in standard errors: of nothing at all (where it
-    ``may_vanish``), ``first`` alone, and both terms that with the least chi square plus Schwarz's penalty."""
+    """Return (factor of ``first``, sill, length, exponent), all (c,) in standard errors, of the law with the least chi
+    square plus Schwarz's penalty: none (if it ``may_vanish``), ``first`` alone, or both terms."""
     from scipy.optimize import nnls
 
     penalty = float(np.log(max(len(distance), 2)))
@@ -151,9 +151,9 @@ def combine(
 
 
 def _outliers(heights: np.ndarray, variances: np.ndarray) -> np.ndarray:
-    """(k, h, w) bool: observations more than `GATE_SIGMAS` deviations (their own, or the robust spread of the views, if
-    that is larger) from the median of at least three views, where they cannot be damage: as far before the fitted
-    surface, where damage would have been in the others' way; or behind, but alone among its neighbours."""
+    """Return (k, h, w) bool: observations more than `GATE_SIGMAS` deviations (their own, or the robust spread of the
+    views if larger) from the median of at least three views, where they cannot be damage: as far before the fitted
+    surface, where damage would have been in the others' way; or behind, but alone among their neighbours."""
     middle = pixel_medians(heights)
     deviation = heights - middle
     limit = GATE_SIGMAS * np.maximum(1.4826 * pixel_medians(np.abs(deviation)), np.sqrt(variances))
@@ -167,11 +167,11 @@ def _outliers(heights: np.ndarray, variances: np.ndarray) -> np.ndarray:
 
 
 LATERAL_PX = 0.1
-"""Standard deviation of where a pixel looks: the reprojection error of a well calibrated lens."""
+"""Standard deviation of the direction in which a pixel looks: the reprojection error of a well calibrated lens."""
 SMOOTH_POINTS = 8192
 BINS, PER_BIN = 16, 40
 SAMPLED = 16_384
-"""Pixels from which the law is read: a class' median is then known to 7 % from three frames."""
+"""Number of pixels from which the law is read: the median of a class is then known to 7 % from three frames."""
 LEAST_M2 = 1e-14
 """Least variance: no point is known better than to 0.1 um, and no weight is infinite."""
 
@@ -246,7 +246,7 @@ def fuse(
 
 
 def _roughness(view: placing.PlacedView) -> np.ndarray:
-    """(h, w) z less the view's own smooth surface; only needed, and only worked out, where frames do not repeat."""
+    """Return (h, w) z less the view's own smooth surface; only needed, and computed, where frames do not repeat."""
     inside = view.chosen.inside
     rough = np.full(inside.shape, np.nan)
     if not (view.chosen.cloud.count[inside] > 1).any():
@@ -278,8 +278,8 @@ def _median(values: np.ndarray) -> float:
 def _registration_variance(
     view: placing.ChosenView, points_m: np.ndarray, along: np.ndarray, T_reference_map: np.ndarray
 ) -> np.ndarray:
-    """(h, w) variance, by the registration, of the displacements w x (p - centre) + t of points (h, w, 3) along vectors
-    (h, w, 3): that of w . ((p - centre) x along) + t . along. 0 where the method has no covariance."""
+    """Return the variance (h, w), by the registration, of the displacements w x (p - centre) + t of points (h, w, 3)
+    along vectors (h, w, 3): that of w . ((p - centre) x along) + t . along; 0 without a covariance."""
     if not view.known_covariance:
         return np.zeros(points_m.shape[:2])
     turn = np.kron(np.eye(2), T_reference_map[:3, :3])
@@ -326,7 +326,7 @@ def depth_noise(cloud: Cloud, inside: np.ndarray, deviation_m: np.ndarray) -> tu
         samples, freedom = cloud.variance_m2[used], cloud.count[used] - 1.0
     else:
         used = inside & np.isfinite(deviation_m)
-        # one sample has the variance of a frame: it is divided by their number below
+        # one sample has the variance of a single frame: it is divided by their number below
         samples, freedom = deviation_m[used] ** 2 * cloud.count[used], np.ones(int(used.sum()))
     slope, constant, typical = 0.0, LEAST_M2, 1.0
     if used.any():
@@ -334,17 +334,17 @@ def depth_noise(cloud: Cloud, inside: np.ndarray, deviation_m: np.ndarray) -> tu
         numbers, where = np.unique(freedom[some], return_inverse=True)
         samples = samples[some] / (chi2.median(numbers) / numbers)[where]
         x = q[used][some]
-        # through the medians of classes of q: robust against damage in the view
+        # the law goes through the medians of classes of q: robust against damage in the view
         parts = np.array_split(np.argsort(x, kind="stable"), max(1, min(BINS, len(x) // PER_BIN)))
         typical = float(np.median(x))
         middle = np.array([np.median(x[part]) for part in parts]) / typical
         height = np.maximum([np.median(samples[part]) for part in parts], LEAST_M2)
-        # each median is known to the same part of itself
+        # the relative error of each median is the same
         slope, constant = nnls(np.column_stack([middle, np.ones(len(parts))]) / height[:, None], np.ones(len(parts)))[0]
     frame = slope * q / typical + constant
     left = 0.0
     if cloud.z_step_m > 0 and repeated:
-        # rounding leaves in any average what no scatter shows: where frames repeat each other exactly it is all
+        # any average keeps an error of rounding that no scatter shows; if frames repeat exactly, it is the whole error
         left = rounding_left_m2(cloud.z_step_m, max(float(slope + constant) - cloud.z_step_m**2 / 12.0, 0.0))
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.maximum(frame / cloud.count + left, LEAST_M2), repeated

@@ -1,9 +1,9 @@
 """The steps from views to one cloud: prepare, register (`detectors.registration.register`), and merge.
 
-A volume is a truncated signed distance field over the views' depth images (Open3D's VoxelBlockGrid): depth is resampled
-to an image without distortion by the same triangles as the map, as the field's projection knows no lens. Every view
-counts alike and depth counts along its own optical axis (Curless and Levoy 1996). Not modelled: noise and incidence in
-the weights; views through a hole remove part of its rim."""
+A volume is a truncated signed distance field over the views' depth images (Open3D's VoxelBlockGrid). Depth is resampled
+by the same triangles as for the map to an image without distortion, because the field's projection has no lens model.
+All views count alike, and depth counts along its own optical axis (Curless and Levoy 1996). Not modelled: noise and
+incidence in the weights; views through a hole, which remove part of its rim."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, Region, invert, transform_points
 
 TRUNCATION_VOXELS = 4.0
-"""Distance at which the field is cut off: over 5 mm for pixels of 1.4 mm, ten times the noise of a single frame."""
+"""Distance at which the field is cut off: over 5 mm for pixels of 1.4 mm, ten times the noise of one frame."""
 OVERSAMPLING = 2
-"""Pixels of the undistorted image along a side of a pixel: the field takes the depth of the nearest one."""
+"""Pixels of the undistorted image along a side of a pixel; the field takes the depth of the nearest one."""
 WALL_DEG = 60.0
 """Angle between the normals of a crossing and of the smooth face, beyond which the crossing lies on a wall. A dent as
 deep as its radius has flanks of 45 degrees; a drilled wall has 90, less what the camera's blur takes."""
 LOOKED_UP_AT = 0.5
 """Added to the principal point: Open3D cuts pixel positions off, so the first pixel's centre is 0.5."""
 BLOCK, BLOCKS_AT_FIRST = 8, 4096
-"""Voxels along a side of a block (larger blocks lie mostly beyond the cut), and blocks that are reserved at first."""
+"""Voxels along a side of a block (larger blocks lie mostly beyond the cut), and blocks reserved at first."""
 
 
 def integrate(views: Sequence[ChosenView], voxel_m: float | None) -> tuple[Cloud, tuple[str, ...]]:
@@ -70,7 +70,7 @@ def integrate(views: Sequence[ChosenView], voxel_m: float | None) -> tuple[Cloud
 
 
 def _undistorted(view: ChosenView) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-    """Depth (h, w, 1) float32, 0 for none, on a pinhole's grid; colour (h, w, 3) 0..1 if any; camera matrix."""
+    """Return depth (h, w, 1) float32, 0 for none, on a pinhole's grid; colour (h, w, 3) 0..1 if any; camera matrix."""
     cloud, inside = view.cloud, view.inside
     with np.errstate(invalid="ignore"):
         slopes = cloud.points_m[..., :2] / cloud.points_m[..., 2:]
@@ -87,7 +87,7 @@ def _undistorted(view: ChosenView) -> tuple[np.ndarray, np.ndarray | None, np.nd
 
 
 def _crossings(views: Sequence[ChosenView], voxel: float) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Places and normals (n, 3) of the zero crossings, in the first view's frame; colours where all views have them."""
+    """Return places, normals (n, 3) of zero crossings, first view's frame; and colours if all views have them."""
     coloured = all(view.cloud.rgb is not None for view in views)
     names, channels = ["tsdf", "weight", "color"][: 2 + coloured], [[1], [1], [3]][: 2 + coloured]
     with open3d_on_one_thread() as o3d:
@@ -108,7 +108,7 @@ def _crossings(views: Sequence[ChosenView], voxel: float) -> tuple[np.ndarray, n
         try:
             found = field.extract_point_cloud(0.5)
         except RuntimeError as error:
-            # Open3D cannot make a cloud of no points
+            # Open3D cannot make a cloud without points
             what = f"a volume with voxels of {1e3 * voxel:.3g} mm holds no surface of the target"
             raise UserError(what, fix="choose smaller voxels, check the crop, or merge in another way") from error
         points, normals = (found.point[name].numpy().astype(np.float64) for name in ("positions", "normals"))
@@ -116,7 +116,7 @@ def _crossings(views: Sequence[ChosenView], voxel: float) -> tuple[np.ndarray, n
 
 
 def _facing(views: Sequence[ChosenView], points_m: np.ndarray, normals: np.ndarray, pitch_m: float) -> np.ndarray:
-    """(n,) bool: crossings whose normal is within `WALL_DEG` of that of the smooth surface through all targets."""
+    """Return (n,) bool: crossings whose normal is within `WALL_DEG` of that of the smooth surface of all targets."""
     T_reference_map = T_reference_map_of(views[0])
     surface = common_surface(views, T_reference_map)
     x, y, _ = transform_points(invert(T_reference_map), points_m).T
@@ -128,9 +128,9 @@ def _facing(views: Sequence[ChosenView], points_m: np.ndarray, normals: np.ndarr
 
 
 SEVERAL = -1
-"""Stands for several views, or an unknown one."""
+"""Number of a view that stands for several views, or an unknown view."""
 MAX_BOXES = 1 << 21
-"""Boxes of the grid along one axis: three axes in a 63-bit key."""
+"""Most boxes of the grid along one axis, so that three axes fit into a 63-bit key."""
 
 
 @dataclass(frozen=True)
@@ -257,7 +257,7 @@ def _on_grid(views: Sequence[ChosenView], step_m: float) -> Cloud:
 
 
 def _columns(view: ChosenView) -> np.ndarray:
-    """(n, 10), NaN where unknown."""
+    """Return (n, 10), NaN where unknown."""
     cloud, inside = view.cloud, view.inside
     count = cloud.count[inside].astype(np.float64)
     unknown = np.full(len(count), np.nan)

@@ -1,6 +1,6 @@
-"""The map's frame and cells, and views placed in it: where each ray meets the target's surface, how far off it ends.
+"""The map's frame and cells, and views placed in it: where a ray meets the target's surface, and how far off it ends.
 
-Samples are resampled to a grid in triangles of neighbours, which leaves no gaps and no beats between two grids; it
+Samples are resampled to a grid over triangles of neighbours, which leaves no gaps and no beats between two grids; it
 blurs by a tent whose variance is a sixth of the spacing squared."""
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud, invert, transform_points
 
 LONGEST_EDGE = 4.0
-"""Longest edge of a triangle between samples without a grid, in spacings: a longer one bridges a gap."""
+"""Longest edge, in spacings, of a triangle between samples without a grid; a longer edge bridges a gap."""
 SLACK = 1e-9
-"""A cell on the edge between two triangles belongs to the first; rounding must not lose it to both."""
+"""A cell on the edge between two triangles belongs to the first; rounding must not take it from both."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Raster:
 
     @property
     def concentration(self) -> np.ndarray:
-        """(h, w) sum of squares of the samples' weights: by what independent errors shrink in variance."""
+        """Return (h, w) sum of squares of the samples' weights: independent errors shrink in variance by it."""
         return np.asarray(self.weights.multiply(self.weights).sum(axis=1), np.float64).reshape(self.shape)
 
 
@@ -83,7 +83,7 @@ def raster_between(places: np.ndarray, valid: np.ndarray, organised: bool, spaci
 
 
 def _of_grid(valid: np.ndarray) -> np.ndarray:
-    """(t, 3) flat indices: two triangles for each four neighbours; of four with one invalid the one that is left."""
+    """Return (t, 3) flat indices: two triangles for each four neighbours, or one if one of the four is invalid."""
     index = np.arange(valid.size).reshape(valid.shape)
     a, b, c, d = (index[r, s].ravel() for r in (slice(-1), slice(1, None)) for s in (slice(-1), slice(1, None)))
     has_a, has_b, has_c, has_d = (valid.ravel()[corner] for corner in (a, b, c, d))
@@ -93,7 +93,7 @@ def _of_grid(valid: np.ndarray) -> np.ndarray:
 
 
 def _of_points(places: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """(t, 3) indices of samples (n, 2) without a grid: Delaunay's triangles with short edges."""
+    """Return (t, 3) indices of samples (n, 2) without a grid: Delaunay's triangles with short edges."""
     from scipy.spatial import Delaunay
 
     known = np.flatnonzero(valid)
@@ -128,9 +128,9 @@ def _fill(places: np.ndarray, triangles: np.ndarray, corners: np.ndarray, shares
 
 FIT_POINTS = 20_000
 STEEPEST = 0.1
-"""Cosine between the optical axis and the surface's normal below which the axis does not say where the target is."""
+"""Cosine between optical axis and surface normal below which the axis does not say where the target is."""
 MAX_CELLS = 1 << 24
-"""Cells of a map: a board of 4 m in millimetres."""
+"""Most cells of a map: those of a board of 4 m in millimetres."""
 
 
 @dataclass(frozen=True)
@@ -149,12 +149,12 @@ class ChosenView:
 
     @cached_property
     def points_reference_m(self) -> np.ndarray:
-        """(n, 3) the target's points in the first view's frame, in the order of the grid."""
+        """The target's points (n, 3) in the first view's frame, in the order of the grid."""
         return transform_points(self.registration.T_reference_view, self.cloud.points_m[self.inside])
 
     @cached_property
     def slope_step(self) -> float:
-        """Step of x/z and y/z from pixel to pixel, the median; without a grid as if the points lay on a square one."""
+        """Median step of x/z and y/z from pixel to pixel; without a grid, as if the points lay on a square one."""
         points = self.cloud.points_m
         with np.errstate(invalid="ignore"):
             slopes = np.where(self.inside[..., None], points[..., :2] / points[..., 2:], np.nan)

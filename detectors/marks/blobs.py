@@ -1,8 +1,8 @@
-"""Pixels that differ from the target's own colour, and their groups: candidates for marks, with their rims.
+"""Groups of pixels whose colour differs from the target's own: candidates for marks, with their rims.
 
-A smooth polynomial over the target follows light of another colour; the scatter of what is left (minimum covariance
-determinant, Rousseeuw 1985) says how far the target's own colour strays; the threshold is extrapolated from its tail to
-a rate of false pixels. Marks may cover a quarter of the target. Not modelled: shadows with hard edges."""
+A smooth polynomial fitted over the target removes light of uneven colour. The scatter of the remainder (minimum
+covariance determinant, Rousseeuw 1985) measures how far the target's own colour varies; the threshold is extrapolated
+from its tail to a given rate of false pixels. Marks may cover a quarter of the target. Not modelled: hard shadows."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from detectors.surface import SurfaceConfig, fit_surface
 from harness.vocabulary.geometry import Cloud
 
 FALSE_RATE = 1e-5
-"""Share of the target's own pixels that the extrapolated tail puts beyond the threshold. Real tails give ten (Gauss) to
-a hundred (Laplace) times as many: no mark, because a mark has nine that touch."""
+"""Share of the target's own pixels that the extrapolated tail puts beyond the threshold. Real tails put ten (Gauss) to
+a hundred (Laplace) times as many there; they form no mark, because a mark has nine pixels that touch."""
 DEGREE = 2
-"""Degree of the polynomial: one lamp's fall-off, or two lamps of different colour, bend once over a board."""
+"""Degree of the polynomial: the light of one lamp, or of two lamps of different colour, bends once over a board."""
 SAMPLE, STEPS, CORE = 4096, 6, 0.6
-"""Pixels of the fit, the steps of the scatter, and the share of the pixels that it rests on."""
+"""Number of pixels in the fit, number of steps of the scatter, and share of the pixels on which the scatter rests."""
 CORE_SHRINKS = {1: 0.2146, 2: 0.3891}
-"""Variance of the innermost `CORE` of a Gaussian in one and two dimensions."""
+"""Variance of the innermost part (`CORE`) of a Gaussian in one and two dimensions."""
 GAUSSIAN_LIMITS = {1: 4.4172, 2: 4.7985}
-"""Distances that `FALSE_RATE` of a Gaussian's exceed, in one and two dimensions."""
+"""Distances that a share `FALSE_RATE` of a Gaussian exceeds, in one and two dimensions."""
 NEARBY_PX = 16
-"""Reach to which a camera smears colour: JPEG keeps one for two by two pixels, in blocks of eight of these."""
+"""Distance over which a camera smears colour: JPEG keeps one for two by two pixels, in blocks of eight of these."""
 TAIL = (0.4, 0.7)
-"""Quantiles from which the tail is extrapolated; those above may be marks."""
+"""Quantiles from which the tail is extrapolated; pixels above them may belong to marks."""
 
 
 def chromaticity(rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -58,7 +58,7 @@ def stand_out(features: np.ndarray, rounding: np.ndarray, xy: np.ndarray) -> tup
     offset = np.stack([f - fit_surface(some_x, some_y, f[::stride], smooth).evaluate(x, y) for f in features.T], axis=1)
     darkness = np.sqrt(np.maximum(rounding / np.median(rounding), 1.0))
     apart, p = (offset / darkness[:, None])[::stride], features.shape[1]
-    # the covariance (p, p) of the bulk about the backdrop, as of a Gaussian whose innermost part it is
+    # the covariance (p, p) of the bulk about the backdrop, scaled as the innermost part of a Gaussian
     scatter = np.diag([max(sigma_of(each), 1e-6) ** 2 for each in apart.T])
     for _ in range(STEPS):
         square = np.einsum("ni,ij,nj->n", apart, np.linalg.inv(scatter), apart)
@@ -67,8 +67,8 @@ def stand_out(features: np.ndarray, rounding: np.ndarray, xy: np.ndarray) -> tup
     scatter += np.median(rounding) * np.eye(p)
     contrast = np.sqrt(np.einsum("ni,ij,nj->n", offset, np.linalg.inv(scatter), offset))
     distance = contrast / darkness
-    # a Weibull tail through the quantiles `TAIL`, between a Gaussian's (shape 2 in two dimensions) and an exponential
-    # one (shape 1), and never below the Gaussian's
+    # the tail is a Weibull through the quantiles `TAIL`, between a Gaussian (shape 2 in two dimensions) and an
+    # exponential (shape 1), and never below the Gaussian
     middle, outer = np.quantile(distance[::stride], TAIL)
     logs = [-np.log(1.0 - share) for share in TAIL]
     shape = np.log(logs[1] / logs[0]) / np.log(outer / middle) if 0 < middle < outer else 2.0
@@ -77,31 +77,31 @@ def stand_out(features: np.ndarray, rounding: np.ndarray, xy: np.ndarray) -> tup
 
 
 def above_half(chosen: np.ndarray, contrast: np.ndarray) -> np.ndarray:
-    """Return (h, w) bool: of the ``chosen`` pixels those whose contrast is more than half of the greatest nearby (of
-    medians of 3 x 3), so that a group ends where its edge is half way."""
+    """Return (h, w) bool: those of the ``chosen`` pixels whose contrast exceeds half of the greatest nearby (of medians
+    of 3 x 3), so that a group ends half way along its edge."""
     beyond = np.where(chosen, contrast, 0.0).astype(np.float32)
     greatest = cv2.dilate(cv2.medianBlur(beyond, 3), np.ones((2 * NEARBY_PX + 1,) * 2, np.uint8))
     return np.asarray(chosen & (beyond > 0.5 * greatest))
 
 
 LEAST_PIXELS, MOST_BLOBS = 9, 200
-"""Least pixels of a mark, three by three (fewer have no inside), and the most groups that are looked at."""
+"""Least number of pixels of a mark, three by three (fewer have no inside), and the most groups that are examined."""
 RIM_PX, RING_PX = 2, 8
-"""Reach beyond the pixels found in which a mixed rim is looked for, and of the surroundings that are compared."""
+"""Width of the band about a group that is searched for a mixed rim, and of the band taken as its surroundings."""
 MIXED_SHARE = 0.15
-"""Share of the rim, two pixels wide, between 0.2 and 0.8 of the way from one colour to the other: 0.6 / 2 where colours
-are means over the pixel's area, none where they are those of its centre."""
+"""Share of the rim, two pixels wide, that lies between 0.2 and 0.8 of the way from one colour to the other: it is 0.6 /
+2 where a colour is the mean over the pixel's area, and 0 where it is the colour at the pixel's centre."""
 SHARE_SIGMA = 0.1
-"""Deviation of a rim's colour as a share of area: a camera's transfer curve and its lens's blur are not known."""
+"""Standard deviation of a rim pixel's share of area: the camera's transfer curve and the lens's blur are unknown."""
 ALIKE = 0.35
-"""A pixel has a blob's colour where its distance to it is less than this part of that to the surroundings' colour."""
+"""A pixel has a blob's colour if its distance to that is below this part of its distance to the surroundings'."""
 CUT_SHARE = 0.05
-"""Share of the pixels around a blob: so many of its own colour, but off the target, mean that it goes on there."""
-SHIFTS = 12  # of the lattice along each axis, over which the error of a centroid is averaged
+"""If more than this share of the pixels around a blob have its colour but lie off the target, the blob goes on."""
+SHIFTS = 12  # shifts of the lattice along each axis, over which the error of a centroid is averaged
 RECTANGULAR = 0.85
-"""Least share of its smallest rectangle that a rectangle's pixels fill; an ellipse's fill 0.79."""
+"""Least share of its smallest enclosing rectangle that a rectangle's pixels fill; those of an ellipse fill 0.79."""
 SIZES, TURNS = 5, np.array([-1.0, 0.0, 1.0]) / 3
-"""Outlines between one whole pixel and the next, over width and height; turns of each, in pixels over its length."""
+"""Number of outlines between one pixel and the next, over width and height; their turns, in pixels over the length."""
 
 
 @dataclass(frozen=True)
@@ -145,8 +145,8 @@ def find_blobs(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray) -> list[B
 def _window(
     cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, labels: np.ndarray, label: int, box: np.ndarray
 ) -> tuple[np.ndarray, Callable[[bool], Blob | None]]:
-    """Shares (n,) of the way from the surroundings' colour (0) to the group's (1) on either side of its border; and
-    what makes a blob of the group once it is known whether rims are mixed."""
+    """Compute the shares (n,) of the way from the surroundings' colour (0) to the group's (1) on either side of its
+    border, and a function that makes a blob of the group once it is known whether rims are mixed."""
     left, top, width, height, area = (int(value) for value in box)
     margin = max(RING_PX + 2, round(0.5 * np.sqrt(area)))
     row, column = max(top - margin, 0), max(left - margin, 0)
@@ -157,7 +157,7 @@ def _window(
     core = _eroded(group)
     core = core if core.sum() >= LEAST_PIXELS else group
     ring = grown(group, RING_PX) & ~grown(group, RIM_PX + 2) & target & ~others
-    if ring.sum() < LEAST_PIXELS:  # nothing of the target's own colour is seen around it
+    if ring.sum() < LEAST_PIXELS:  # none of the target's own colour is visible around it
         return np.zeros(0), lambda mixed: None
     rgb = _evenly_lit(cloud.rgb[cut].astype(float), ring, group)
     other = np.median(rgb[ring], axis=0)
@@ -165,13 +165,13 @@ def _window(
     share = (rgb - other) @ span / max(float(span @ span), 1e-12)
     # neighbours share their colour in a camera's mosaic and in JPEG: independent pixels that would average alike
     strays = float(np.sqrt(max(np.mean(share[ring] ** 2), 25.0 * np.mean(cv2.blur(share, (5, 5))[ring] ** 2))))
-    # the threshold that found the group knows the target's colour only, and leaves gaps where contrast is low: the
-    # connected pixels more of the group's colour than not, as far as the surroundings reach
+    # the threshold that found the group knows the target's colour only, and leaves gaps at low contrast: take the
+    # connected pixels nearer to the group's colour, as far as the surroundings reach
     group = parts_with((share > 0.5) & target & grown(group, RING_PX), group)
     rim = grown(group, 1) & ~_eroded(group) & target
 
     def settled(mixed: bool) -> Blob | None:
-        """Weigh each pixel by how far it has the group's colour if rims are mixed, else wholly; None for too few."""
+        """Weigh each pixel by its share of the group's colour if rims are mixed, else by 1; None for too few pixels."""
         weights = group.astype(float)
         if mixed:
             near = grown(group, RIM_PX) & target & ~(others & ~group)
@@ -179,7 +179,7 @@ def _window(
         v, u = np.nonzero((weights > 0.5) & target)
         if len(u) < LEAST_PIXELS or min(np.ptp(u), np.ptp(v)) < 1:
             return None
-        # why the group may go on where the target's points do not
+        # the reason why the group may continue where the target has no points
         around = grown(group, 1) & ~group
         alike = np.linalg.norm(rgb - other - span, axis=-1) < ALIKE * np.linalg.norm(span)
         on = around & alike & ~target
@@ -193,7 +193,7 @@ def _window(
         used_v, used_u = np.nonzero((weights > 0) & target)
         grid = np.stack([used_u, used_v], axis=1).astype(float)
         if mixed:
-            # the weights of the rim are wrong by `SHARE_SIGMA`, and by what the surroundings' colours stray
+            # the weights of the rim are wrong by `SHARE_SIGMA`, and by the scatter of the surroundings' colours
             arm = np.argwhere(rim)[:, ::-1] - np.argwhere(group)[:, ::-1].mean(axis=0)
             covariance = (SHARE_SIGMA**2 + strays**2) * arm.T @ arm / max(float(weights.sum()), 1.0) ** 2
         else:
@@ -207,8 +207,8 @@ def _window(
 
 
 def _evenly_lit(rgb: np.ndarray, ring: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Colours (h, w, 3) as if the light were everywhere that at the group's middle: each channel over the plane through
-    the ring's, or light that falls off along a group would weigh its two ends differently."""
+    """Return colours (h, w, 3) as if the light at the group's middle fell everywhere: each channel over a plane fitted
+    to the ring. Otherwise light that falls off along a group would weigh its two ends differently."""
     v, u = np.mgrid[0 : rgb.shape[0], 0 : rgb.shape[1]]
     middle_v, middle_u = (float(axis[group].mean()) for axis in (v, u))
     basis = np.stack([np.ones(rgb.shape[:2]), (u - middle_u) / rgb.shape[1], (v - middle_v) / rgb.shape[0]], axis=-1)
@@ -218,7 +218,7 @@ def _evenly_lit(rgb: np.ndarray, ring: np.ndarray, group: np.ndarray) -> np.ndar
 
 
 def _eroded(mask: np.ndarray) -> np.ndarray:
-    """Take a pixel off the mask; beyond the window counts as outside."""
+    """Remove one pixel along the mask's border; the area beyond the window counts as outside."""
     return shrunk(np.pad(mask, 1), 3)[1:-1, 1:-1]
 
 
@@ -242,7 +242,7 @@ def centroid_covariance_px2(polygon_px: np.ndarray) -> np.ndarray:
 
 def region_covariance_px2(pixels: np.ndarray) -> np.ndarray:
     """Return the covariance (2, 2) of the centroid of a region known by its pixel positions (m, 2) alone, which are on
-    no line. Their convex outline stands for it, or their smallest rectangle where they fill that. Its size and slope
+    no line. Their convex outline represents it, or their smallest rectangle if they fill that. Its size and slope
     are known to part of a pixel, and decide whether the errors of opposite edges add or cancel: the covariance is the
     mean over outlines up to a pixel larger and turned by up to that."""
     hull = cv2.convexHull(pixels.astype(np.float32))
@@ -266,7 +266,7 @@ def region_covariance_px2(pixels: np.ndarray) -> np.ndarray:
 
 
 def _area_and_centre(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Signed areas (...,) and centroids (..., 2) of polygons (..., n, 2)."""
+    """Return the signed areas (...,) and centroids (..., 2) of polygons (..., n, 2)."""
     following = np.roll(x, -1, axis=-2)
     cross = x[..., 0] * following[..., 1] - x[..., 1] * following[..., 0]
     area = cross.sum(axis=-1) / 2

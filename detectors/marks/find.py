@@ -1,9 +1,9 @@
-"""The marks of one view: coloured spots or codes (OpenCV's) that are found, judged, and put in doubt.
+"""The marks of one view: coloured spots or codes (OpenCV's) that are found, judged and, if need be, put in doubt.
 
-The slope of a mark's plane is fitted to the mark and its surroundings, the offset to the mark alone, which may be thick
-or ranged differently. The centroid is that of the pixels' rays cut by this plane, weighted by the surface that they
-cover and by their colour. Spots behind the surface are holes. Not modelled: a surface or tag that bends within the
-mark; a lens whose distortion is more than quadratic over one tag."""
+The slope of a mark's plane is fitted to the mark and its surroundings, but the offset to the mark alone, because a mark
+may be thick or ranged differently. Its centroid is the mean of the pixels' rays cut by this plane, weighted by the
+surface that they cover and by their colour. Spots behind the surface are holes. Not modelled: a surface or tag that
+bends within the mark; a lens whose distortion is more than quadratic over one tag."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Patch:
 
     @property
     def normal(self) -> np.ndarray:
-        """Unit normal (3,) towards the camera (z points away from it)."""
+        """Return the unit normal (3,) towards the camera (z points away from the camera)."""
         steep = np.array([self.slope_x, self.slope_y, -1.0])
         return np.asarray(steep / np.linalg.norm(steep))
 
@@ -54,8 +54,8 @@ class Patch:
         return np.asarray(points_m * scale[:, None])
 
     def range_covariance_m2(self, centre_m: np.ndarray, cloud: Cloud, pixels: np.ndarray) -> np.ndarray:
-        """Return the covariance (3, 3) of a centre (3,) on the plane by the mean z of its pixels (n,): by what is left
-        about the plane, the frames' noise, or what a map states, the most of these; `CORRELATED_PIXELS` share it."""
+        """Return the covariance (3, 3) of a centre (3,) on the plane by its pixels' mean z (n,): from scatter about the
+        plane, the frames' noise or a map's variance, whichever is largest; `CORRELATED_PIXELS` share it."""
         frames = cloud.variance_m2.ravel()[pixels] / np.maximum(cloud.count.ravel()[pixels], 1)
         known = frames[np.isfinite(frames)]
         variance = max(self.sigma_m**2, float(known.mean()) if len(known) else 0.0)
@@ -86,19 +86,19 @@ class Spot:
 
     @property
     def is_hole(self) -> bool:
-        """True where it lies behind the surface."""
+        """True where the spot lies behind the surface."""
         return self.behind_m > max(BEHIND_M, BEHIND_SIGMAS * self.behind_sigma_m)
 
 
 def fit_patch(points_m: np.ndarray) -> Patch | None:
-    """Fit the plane of at least two thirds of points (n, 3). None where they are too few or on a line."""
+    """Fit the plane of at least two thirds of points (n, 3); return None where they are too few or lie on a line."""
     x, y, z = points_m[:: max(1, len(points_m) // PATCH_POINTS)].T
     try:
         plane = fit_surface(x, y, z, SurfaceConfig(degree=1))
     except UserError:
         return None
     level, at_x, at_y = plane.evaluate(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])).tolist()
-    # what lies off the plane on one side only has shifted it, but not turned it
+    # points off the plane on one side only have shifted it, but not turned it
     off = z - plane.evaluate(x, y)
     off = off[np.abs(off - median_of(off)) <= 3.0 * max(sigma_of(off - median_of(off)), LEAST_SCALE_M)]
     return Patch(at_x - level, at_y - level, level + float(off.mean()), max(float(off.std()), LEAST_SCALE_M))
@@ -124,7 +124,7 @@ def place_spot(cloud: Cloud, blob: Blob, patch: Patch) -> Spot:
     scatter = np.cov((on_plane - centre).T, aweights=covers, ddof=0)
     _, minor, major = np.sqrt(12.0 * np.maximum(np.linalg.eigvalsh(scatter), 0.0))
     pixel_area = float(np.linalg.norm(np.cross(jacobian[:, 0], jacobian[:, 1])))
-    # of a flat mark: a hole's own depths differ, which must not excuse it
+    # the scatter of a flat mark: a hole's own depths differ, and must not hide that it is one
     behind_sigma = patch.sigma_m * float(np.sqrt(2.0 * min(1.0, CORRELATED_PIXELS / len(pixels))))
     area, pitch = pixel_area * float(weights.sum()), float(np.sqrt(pixel_area))
     covariance, sizes = (covariance + covariance.T) / 2, np.array([major, minor, area / major])
@@ -132,9 +132,9 @@ def place_spot(cloud: Cloud, blob: Blob, patch: Patch) -> Spot:
 
 
 CORNER_PX = 0.25
-"""Standard deviation per axis of a refined corner: 0.18 on drawn sharp tags of 40 pixels, 0.34 with a blur of 1.5."""
+"""Standard deviation of a refined corner per axis: 0.18 on drawn sharp tags of 40 pixels, 0.34 with a blur of 1.5."""
 LEAST_SEEN, WHOLE = 0.5, 0.95
-"""Share of a tag's pixels on the target, below which it is not the target's; and that of a tag in no doubt."""
+"""Least share of a tag's pixels on the target for a tag of the target, and for a tag that is not in doubt."""
 HALF_STEPS = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
 
 
@@ -159,7 +159,7 @@ def coded_marks(cloud: Cloud, inside: np.ndarray, dictionary: str) -> MarkSet:
 
 
 def _coded_mark(cloud: Cloud, inside: np.ndarray, code: int, corners: np.ndarray, twice: bool) -> Mark | None:
-    """The tag as a mark; None where it is off the target or without range."""
+    """Return the tag as a mark; None where it lies off the target or has no range."""
     area = np.zeros(inside.shape, dtype=np.uint8)
     cv2.fillConvexPoly(area, np.rint(corners).astype(np.int32), 1)
     pixels = np.flatnonzero((area > 0) & inside)
@@ -195,21 +195,21 @@ def _quadratic(uv: np.ndarray) -> np.ndarray:
 
 
 CLEAR_MARGIN = 2.0
-"""Marks whose pixels pass the threshold by this factor have whole outlines; else lightness is tried too."""
+"""If the marks' pixels pass the threshold by this factor, their outlines are whole; else lightness is tried."""
 LEAST_TARGET = 100
 BEHIND_M = 2.0 * MM
-"""A mark may seem to lie so far behind its surroundings: cameras range dark and bright surfaces differently."""
+"""A mark may seem to lie this far behind its surroundings: cameras range dark and bright surfaces differently."""
 BEHIND_SIGMAS = 5.0
 RAISED_SHARE = 0.25
-"""A mark may stand before its surroundings by this part of its breadth: a tag on board, but no object."""
+"""Largest height of a mark above its surroundings, as a share of its breadth: allows a tag on board, but no object."""
 SAME_COLOUR = 0.35
-"""Two spots have one colour where their contrasts to their surroundings differ by less than this part of them."""
+"""Two spots have the same colour if their contrasts to their surroundings differ by less than this fraction of them."""
 WEAK_SHARE = 1 / 3
-"""Share of the strongest colour's contrast to its surroundings: weaker spots beside such marks are stains."""
+"""Share of the strongest colour's contrast to its surroundings; weaker spots beside such marks are stains."""
 UNLIKE_SHARE, UNLIKE_PIXELS = 0.3, 1.5
-"""A mark's length, breadth or area is unlike the others' from this part of the median and so many pixels on."""
+"""A mark is unlike the others if its sizes are off their median by more than this fraction and these pixels."""
 LARGEST_SHARE = 0.15
-"""Share of the target: a larger spot is a part of the target of another colour."""
+"""Share of the target; a larger spot is a part of the target that has another colour."""
 
 
 def find_marks(cloud: Cloud, inside: np.ndarray, config: RedMarks | ColourMarks | CodedMarks) -> MarkSet:
@@ -225,7 +225,7 @@ def find_marks(cloud: Cloud, inside: np.ndarray, config: RedMarks | ColourMarks 
     if isinstance(config, CodedMarks):
         return coded_marks(cloud, inside, config.dictionary)
     if isinstance(config, RedMarks):
-        # the thesis' rule, by MATLAB's standard deviation with n - 1
+        # the rule of the thesis, with MATLAB's standard deviation (n - 1)
         red = cloud.rgb[inside][:, 0].astype(np.float64)
         mean, spread = red.mean(), red.std(ddof=1)
         limit = mean + config.deviations * spread
@@ -236,8 +236,8 @@ def find_marks(cloud: Cloud, inside: np.ndarray, config: RedMarks | ColourMarks 
         if not cloud.organised:
             return MarkSet((), np.flatnonzero(coloured), "marks need a pixel grid, which this cloud does not have")
         return _marks(cloud, inside, coloured, "" if coloured.any() else missing)
-    # by lightness where chromaticity gives too few marks or hardly any contrast, if that does better: black and white
-    # have the light's own chromaticity, and black hardly any
+    # lightness is tried where chromaticity gives too few marks or hardly any contrast: black and white have the light's
+    # own chromaticity, and black hardly any
     found, margin = _standing_out(cloud, inside, chromaticity)
     if len(found.trusted) >= LEAST_MARKS and margin >= CLEAR_MARGIN:
         return found
@@ -250,7 +250,7 @@ def find_marks(cloud: Cloud, inside: np.ndarray, config: RedMarks | ColourMarks 
 def _standing_out(
     cloud: Cloud, inside: np.ndarray, feature: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 ) -> tuple[MarkSet, float]:
-    """The marks by one feature of the colours, and the median margin of the trusted ones' pixels."""
+    """Find the marks by one feature of the colours; return them and the median margin of the trusted marks' pixels."""
     assert cloud.rgb is not None
     contrast, margin = np.zeros(inside.shape), np.zeros(inside.shape)
     contrast[inside], margin[inside] = stand_out(*feature(cloud.rgb[inside]), cloud.points_m[inside][:, :2])
@@ -258,7 +258,7 @@ def _standing_out(
     found = _marks(cloud, inside, coloured, "no other spots stand apart from the target's colour")
     pixels = [mark.pixels for mark in found.trusted]
     median = float(np.median(margin.ravel()[np.concatenate(pixels)])) if pixels else 0.0
-    # a hole through which another colour shows is no fiducial
+    # a hole through which another colour shows is not a fiducial
     return replace(found, points=_pixels_of(found.marks)), median
 
 
@@ -267,12 +267,12 @@ def _pixels_of(marks: Sequence[Mark]) -> np.ndarray:
 
 
 def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str) -> MarkSet:
-    """The marks among coloured pixels, in the order of their pixels; ``missing`` says why there are not more."""
+    """Return the marks among coloured pixels, in the order of their pixels; ``missing`` says why there are not more."""
     points_m, n_target = cloud.points_m.reshape(-1, 3), int(inside.sum())
     blobs = find_blobs(cloud, inside, coloured)
     patches = [fit_patch(points_m[blob.surroundings]) for blob in blobs]
     spots = [place_spot(cloud, blob, patch) for blob, patch in zip(blobs, patches, strict=True) if patch is not None]
-    # groups of one colour, each spot compared with the first of its group
+    # groups of one colour: each spot is compared with the first spot of a group
     colours: list[list[Spot]] = []
     for spot in sorted(spots, key=lambda s: (-s.area_m2, int(s.blob.pixels[0]))):
         for group in colours:
@@ -289,7 +289,7 @@ def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str)
         if flat and 2.0 * sum(s.area_m2 for s in colour if s.is_hole) <= sum(s.area_m2 for s in colour):
             whole, usual_m = [s for s in flat if not s.blob.doubt], None
             if len(whole) >= 3:
-                # half of the spots' area is in larger ones, so that chips do not count much
+                # half of the spots' area is in larger spots, so that chips count little
                 sizes, areas = np.array([s.sizes_m for s in whole]), [s.area_m2 for s in whole]
                 usual_m = np.quantile(sizes, 0.5, axis=0, weights=areas, method="inverted_cdf")
             groups.append((float(np.linalg.norm(flat[0].blob.contrast)), [_mark(s, usual_m, n_target) for s in flat]))
@@ -309,7 +309,7 @@ def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str)
 
 
 def _mark(spot: Spot, usual_m: np.ndarray | None, n_target: int) -> Mark:
-    """The spot as a mark, with its doubt; ``usual_m`` (3,): sizes of its like; ``n_target``: pixels of the target."""
+    """Return the spot as a mark, with its doubt; ``usual_m`` (3,): the usual sizes; ``n_target``: pixels of target."""
     doubt, sizes_m = spot.blob.doubt, spot.sizes_m
     pixels = spot.blob.pixels[spot.blob.weights > 0.5]
     if doubt:

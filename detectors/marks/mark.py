@@ -1,5 +1,4 @@
-"""Fiducial marks for a registration: their data, settings of the rules that find them, and conditions on a set of
-marks."""
+"""Fiducial marks for a registration: their data, settings of the rules that find them, conditions on a set of marks."""
 
 from __future__ import annotations
 
@@ -54,10 +53,10 @@ MarksConfig = Annotated[RedMarks | ColourMarks | CodedMarks, Field(discriminator
 
 @dataclass(frozen=True)
 class Mark:
-    """One mark in one view, camera frame, metres. ``centre_m`` (3,): its centroid on the surface. ``covariance_m2``
-    (3, 3): that of the centroid, without errors that all pixels of the mark share (a range offset, lens distortion).
-    ``normal`` (3,): the surface's there, towards the camera. ``pixels`` (n,): flat indices into the cloud's grid.
-    ``area_m2``: on the surface. ``code``: None for a piece of tape. ``doubt``: why it should not be relied on."""
+    """One mark in one view, camera frame, metres. ``centre_m`` (3,): its centroid on the surface. ``covariance_m2`` (3,
+    3): of the centroid, without errors that all pixels of the mark share (a range offset, lens distortion). ``normal``
+    (3,): of the surface there, towards the camera. ``pixels`` (n,): flat indices into the cloud's grid. ``area_m2``: on
+    the surface. ``code``: None for a piece of tape. ``doubt``: why not to rely on it."""
 
     centre_m: np.ndarray
     covariance_m2: np.ndarray
@@ -80,7 +79,7 @@ class MarkSet:
 
     @property
     def trusted(self) -> tuple[Mark, ...]:
-        """Marks without a doubt."""
+        """The marks that are not in doubt."""
         return tuple(mark for mark in self.marks if not mark.doubt)
 
 
@@ -96,7 +95,7 @@ def problem_of(marks: Sequence[Mark], missing: str = "") -> str:
 
 
 def off_line_problem(marks: Sequence[Mark]) -> str:
-    """Return a sentence if the marks lie on a line, with their distance from it; empty otherwise."""
+    """Return a sentence, with their distance from the line, if the marks lie on a line; empty otherwise."""
     places = np.stack([mark.centre_m for mark in marks])
     sizes = np.linalg.svd(places - places.mean(axis=0), compute_uv=False) / np.sqrt(len(marks))
     error = float(np.sqrt(np.mean([np.linalg.eigvalsh(mark.covariance_m2)[-1] for mark in marks])))

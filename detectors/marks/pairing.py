@@ -84,17 +84,17 @@ def place(from_m: np.ndarray, from_spread_m2: np.ndarray, to_m: np.ndarray, to_s
 
 
 SHARED_M = 1.0 * MM
-"""Standard deviation per axis of what the pixels of a mark share and two views do not, which is in no covariance."""
+"""Standard deviation per axis of an error that a mark's pixels share but two views do not; in no covariance."""
 DISTANCE_SIGMAS = 4.0
-"""A distance between two marks may differ by so many standard deviations: a true pair is lost once in 16,000."""
+"""Standard deviations by which a distance between two marks may differ: a true pair is lost once in 16,000."""
 FIT_CHI2 = 21.1
-"""Limit of chi^2 of a matched mark's place, three degrees of freedom: a true one is lost once in 10,000."""
+"""Limit of chi^2 of a matched mark's place, three degrees of freedom: a true match is lost once in 10,000."""
 GUESS_SIGMA_M = 50 * MM
-"""Error of the guess at marks, root mean square: five degrees over half a metre, and some centimetres."""
+"""Root mean square error of the guess at the marks: five degrees over half a metre, and some centimetres."""
 PAIR_WORTH = 3.0
 """Logarithm of the odds that a mark of one view is found in the other: 20 to 1."""
 CLEAR_ODDS, FEWER = 4.5, 3
-"""Logarithm of the odds, 90 to 1, at which one placement is taken before another; and fewer pairs that it may have."""
+"""Logarithm of the odds, 90 to 1, that decide between two placements; how many pairs fewer the winner may have."""
 NO_PAIRS = np.zeros((0, 2), dtype=np.int64)
 
 
@@ -184,7 +184,7 @@ Solution = tuple[tuple[int, ...], np.ndarray, float]
 
 
 def _solutions(few: _Side, many: _Side) -> list[Solution]:
-    """Placements that bring more than half of the smaller set's marks together, at most `FEWER` less than the best."""
+    """Return placements that bring more than half of the smaller set together, at most `FEWER` below the best."""
     n = len(few.places)
     least = max(LEAST_MARKS, n // 2 + 1)
     # pairs of which every set of more than half of the marks holds one: disjoint ones, the longest first, and of an odd
@@ -203,7 +203,7 @@ def _solutions(few: _Side, many: _Side) -> list[Solution]:
             found.setdefault(solution[0], solution)
             best = max(best, n - solution[0].count(-1))
     near = [solution for solution in found.values() if n - solution[0].count(-1) >= best - FEWER]
-    # without those that place the marks as a better one does, to within half the distance between neighbours
+    # leave out those that place the marks as a better one does, to within half the distance between neighbours
     limit = (few.distances + np.where(np.eye(n, dtype=bool), np.inf, 0.0)).min() / 2
     kept: list[Solution] = []
     for solution in sorted(near, key=lambda s: (s[0].count(-1), s[2], s[0])):
@@ -214,7 +214,7 @@ def _solutions(few: _Side, many: _Side) -> list[Solution]:
 
 
 def _holding(few: _Side, many: _Side, i: int, j: int, least: int) -> list[Solution]:
-    """The solutions with at least so many pairs in which marks i and j of the smaller set have partners."""
+    """Return the solutions with at least ``least`` pairs in which marks i and j of the smaller set have partners."""
     apart = np.abs(many.distances - few.distances[i, j])
     fits = apart < DISTANCE_SIGMAS * np.sqrt(few.variances[i, j] + many.variances)
     a, b = np.nonzero(fits & ~np.eye(len(apart), dtype=bool))
@@ -239,7 +239,7 @@ def _holding(few: _Side, many: _Side, i: int, j: int, least: int) -> list[Soluti
     partner = _mutual(np.where(consistent, off, np.inf))
     partner = partner[(partner >= 0).sum(axis=1) >= least]
     for _ in range(2):
-        # once from the marks that the distances gave, once more from those that fitted
+        # the first pass uses the marks that the distances gave, the second those that fitted
         if len(partner) == 0:
             return []
         weights = np.where(partner >= 0, 1.0 / (few.worst[None] + many.worst[partner]), 0.0)
@@ -255,7 +255,7 @@ def _holding(few: _Side, many: _Side, i: int, j: int, least: int) -> list[Soluti
 
 
 def _mutual(cost: np.ndarray) -> np.ndarray:
-    """(k, n) of each row of costs (k, n, m) its cheapest column, where it is that column's cheapest row; else -1."""
+    """Return (k, n): for each row of costs (k, n, m) its cheapest column where that is mutual, else -1."""
     column, row = cost.argmin(axis=2), cost.argmin(axis=1)
     back = np.take_along_axis(row, column, axis=1) == np.arange(cost.shape[1])
     finite = np.isfinite(np.take_along_axis(cost, column[..., None], axis=2)[..., 0])

@@ -1,10 +1,10 @@
-"""Captures in files of arrays: which array holds the distances, and the meaning of its axes. Height maps and bare
-numbers too.
+"""Captures in files of arrays: which array holds the distances, and the meaning of its axes; also height maps and bare
+numbers.
 
 The libraries that read them run within `files.limited_memory`. Arrays of objects, which would need pickle, are refused.
 A height map's pixels lie a stated pitch apart, and it is a cloud in parallel projection: x and y count from its middle,
-and z, which points away from the viewer, is `DISTANCE_M` at the median height. Without a stated unit, micrometres,
-millimetres or metres are taken, whichever gives the relief a plausible part of the extent."""
+and z, which points away from the viewer, is `DISTANCE_M` at the median height. If no unit is stated, the program takes
+micrometres, millimetres or metres, whichever gives the relief a plausible part of the extent."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ import numpy as np
 
 from detectors.recordings.distances import UNITS_M, default_metres, frame_of, refuse_narrow
 from detectors.recordings.intrinsics import lens_for
-from detectors.recordings.recording import Given, Recording, damage_told
+from detectors.recordings.recording import Given, Recording, read_errors
 from harness.vocabulary import files
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import RAISE, refuse_bytes, refuse_pixels
@@ -38,18 +38,18 @@ EXPORT = "Location = pc.Location; Color = pc.Color; save('cloud.mat','Location',
 
 Arrays = Mapping[str, np.ndarray]
 ArraysLoader = Callable[[Path], Arrays]
-"""Loads a file's arrays by name; the only array of a file without names is called ""."""
+"""Function that loads a file's arrays by name; the only array of a file without names is called ""."""
 
 
 def load_npy(path: Path) -> dict[str, np.ndarray]:
     """Map an ``.npy`` file. Raises UserError where it is broken or holds objects."""
-    with damage_told(f"{path}: cannot be read as arrays", LEGAL_ARRAYS):
+    with read_errors(f"{path}: cannot be read as arrays", LEGAL_ARRAYS):
         return {"": np.lib.format.open_memmap(path, mode="r")}
 
 
 def load_npz(path: Path) -> dict[str, np.ndarray]:
     """Return the arrays of an ``.npz`` file by name. Raises UserError where it is broken, too large, or has objects."""
-    with damage_told(f"{path}: cannot be read as arrays", LEGAL_ARRAYS):
+    with read_errors(f"{path}: cannot be read as arrays", LEGAL_ARRAYS):
         with zipfile.ZipFile(path) as archive:
             stated = sum(entry.file_size for entry in archive.infolist())
         fix = f"save its frames as .npy, which is not unpacked; {RAISE}"
@@ -64,7 +64,7 @@ def load_mat(path: Path) -> dict[str, np.ndarray]:
     import scipy.io
 
     fix = f"save it with '-v7', not '-v7.3'; save the arrays of a point cloud pc: {EXPORT}"
-    with damage_told(f"{path}: cannot be read as a MATLAB file", LEGAL_MAT, fix):
+    with read_errors(f"{path}: cannot be read as a MATLAB file", LEGAL_MAT, fix):
         try:
             # cells and structs hold no frames, and nested deeply enough they end the process without a word
             flat = [name for name, _, kind in scipy.io.whosmat(path) if kind not in ("cell", "struct")]
@@ -87,9 +87,9 @@ def load_picture(path: Path) -> dict[str, np.ndarray]:
     import cv2
 
     level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what it would print is told once, below
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # a message below replaces its output
     try:
-        with damage_told(f"{path}: cannot be read", LEGAL_PICTURES):
+        with read_errors(f"{path}: cannot be read", LEGAL_PICTURES):
             is_read, pages = cv2.imreadmulti(str(path), flags=cv2.IMREAD_UNCHANGED)
             if not is_read or not pages:
                 raise ValueError("it is damaged, or its type does not match its name")
@@ -106,15 +106,15 @@ SENSOR_SIZES = (
     *((256, 192), (160, 120), (240, 180), (1024, 768), (1280, 720), (848, 480), (1280, 960), (1280, 1024)),
 )  # (width, height) of the depth images of usual cameras
 SAME_SCENE, SEVERAL = 0.05, 8
-"""Part of its distance by which the median pixel of two successive frames differs at most, and frames looked at."""
+"""Most relative difference of the median pixel between successive frames, and number of frames examined."""
 NEIGHBOURS = 0.1
-"""The same of neighbouring pixels: rows of a floor seen flat differ by 1 %, noise by less; a wrong layout by 100 %."""
+"""The same between neighbouring pixels: rows of a flat floor differ by 1 %, noise by less; a wrong layout by 100 %."""
 
 
 @dataclass(frozen=True)
 class RawLoader:
     """Whole frames of ``width`` x ``height`` numbers, row by row, from a byte of a file on. ``step``: bytes from pixel
-    to pixel, more than a number's where brightness and confidence stand between."""
+    to pixel, more than a number's if brightness and confidence lie between."""
 
     width: int
     height: int
@@ -174,7 +174,7 @@ DISTANCE_NAMES = ("depth", "z", "z_mm", "depth_mm", "xyz", "points", "location")
 COLOUR_NAMES = ("rgb", "color", "colour", "colors")
 AMPLITUDE_NAMES = ("amplitude", "ir", "intensity")
 LEGAL_AXES = "depth (h, w) or (n, h, w); points (h, w, 3), (n, h, w, 3) or, without a pixel grid, (n_points, 3)"
-FEWEST_ROWS = 8  # of an image: fewer are the columns of a table of points
+FEWEST_ROWS = 8  # of an image: fewer are columns of a table of points
 FRAMES_OF_POINTS = 20
 """(a, b, 3) is taken for a frames of b points, not for a grid, from b = 20 a on: no sensor is that wide."""
 

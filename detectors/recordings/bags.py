@@ -20,7 +20,7 @@ from detectors.recordings.depth_images import NOT_DEPTH
 from detectors.recordings.distances import UNITS_M, default_metres
 from detectors.recordings.intrinsics import KNOWN_MODELS, LEGAL_LENS, lens_for, read_lens
 from detectors.recordings.messages import DEPTH_NUMBERS, encoding_of, frame_of_message, stored_depth
-from detectors.recordings.recording import NO_GRID, Given, Recording, damage_told
+from detectors.recordings.recording import NO_GRID, Given, Recording, read_errors
 from harness.vocabulary.declaration.yaml_source import MAX_BYTES, read_yaml
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Frame, Lens
@@ -81,7 +81,7 @@ class Bag:
     def _readable(self) -> AbstractContextManager[None]:
         mend = f"rosbag reindex {self.path}" if self._is_ros1 else "ros2 bag reindex, or mcap recover"
         what = f"{', '.join(map(str, self.files))}: is truncated or damaged, or is not a bag"
-        return damage_told(what, LEGAL_BAG, f"copy it again; if the recording was cut off, run: {mend}")
+        return read_errors(what, LEGAL_BAG, f"copy it again; if the recording was cut off, run: {mend}")
 
     @contextmanager
     def _opened(self) -> Iterator[Reader | Ros1Reader]:
@@ -126,7 +126,7 @@ def find_bag(path: Path) -> Bag:
         what = f"{path}: has no {METADATA} (the recorder writes it when it stops), but {', '.join(held)}"
         raise UserError(what, legal=LEGAL_BAG, fix="name that file itself, or run: ros2 bag reindex")
     fix = "copy it again, name the .db3 or .mcap itself, or run: ros2 bag reindex"
-    with damage_told(f"{metadata}: is not a description of a ROS 2 bag, or is cut off", LEGAL_BAG, fix):
+    with read_errors(f"{metadata}: is not a description of a ROS 2 bag, or is cut off", LEGAL_BAG, fix):
         info = read_yaml(metadata).data["rosbag2_bagfile_information"]
         files = tuple(path / Path(name).name for name in info["relative_file_paths"])
         mode = str(info.get("compression_mode") or "none").lower()
@@ -150,7 +150,7 @@ INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 UNIT_TYPE = "std_msgs/msg/Float32"
 USUAL_TOPIC = "points2"
 RAY_TOLERANCE_PX = 0.01
-"""A lens counts where each point lies within this of its pixel's ray: far more than float32 leaves of it."""
+"""A lens counts if each point lies within this of its pixel's ray: far more than the error of float32."""
 
 
 def open_bag(path: Path, given: Given) -> Recording:

@@ -3,7 +3,7 @@
 Open3D drops the grid and fills a cut PLY up with zeros, so the header is read here: a PCD is organised where HEIGHT >
 1, a PLY where it states num_cols and num_rows. A list has a point a line: x y z, then an intensity, or red green blue,
 or both; a line of names may say otherwise. Its grid is stated by a comment or a first line of two whole numbers, or
-told by a lens with as many pixels, or a sensor's usual size on which x/z and y/z rise evenly."""
+determined by a lens with as many pixels, or a sensor's usual size on which x/z and y/z rise evenly."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ import numpy as np
 from detectors.open3d_library import load_open3d
 from detectors.recordings.arrays import SENSOR_SIZES
 from detectors.recordings.distances import UNITS_M, frame_of
-from detectors.recordings.recording import NO_GRID, Given, Recording, damage_told
+from detectors.recordings.recording import NO_GRID, Given, Recording, read_errors
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import TABLE_BYTES, bounded_bytes, refuse_pixels
 from harness.vocabulary.geometry import Frame, Lens
@@ -85,14 +85,14 @@ PLY_BYTES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4
 HEADER_BYTES = 65536
 COUNT = re.compile(r"\d{1,15}", re.ASCII)
 """A count in a header: more digits are no file's, and Python refuses to read thousands of them."""
-PCD_NUMBERS = 10_000  # numbers in one point: descriptors of some hundred stand in published clouds
-LZF_STRONGEST = 100  # factor by which LZF can shorten at most: three bytes stand for at most 264
+PCD_NUMBERS = 10_000  # numbers in one point; published clouds have descriptors with some hundred
+LZF_STRONGEST = 100  # largest compression factor of LZF: three bytes represent at most 264
 
 
 def _read_cloud(path: Path, _: Lens | None) -> tuple[np.ndarray, tuple[int, int], np.ndarray | None, np.ndarray | None]:
     """Read one PLY or PCD. Raises UserError where it has no header, holds no points, or is cut off."""
     o3d = load_open3d()
-    with damage_told(f"{path}: cannot be read", LEGAL_CLOUD), path.open("rb") as file:
+    with read_errors(f"{path}: cannot be read", LEGAL_CLOUD), path.open("rb") as file:
         content = file.read(HEADER_BYTES)
     width, height, data_bytes = (_ply_header if path.suffix.lower() == ".ply" else _pcd_header)(path, content)
     if width * height < 1:
@@ -101,7 +101,7 @@ def _read_cloud(path: Path, _: Lens | None) -> tuple[np.ndarray, tuple[int, int]
     if (found := path.stat().st_size) < data_bytes:
         what = f"{path}: is truncated: {found} of at least {data_bytes} bytes"
         raise UserError(what, legal="a whole file", fix="copy or export it again")
-    # Open3D's complaints go to the terminal; what they say is checked here and told once.
+    # Open3D prints warnings to the terminal; their causes are checked here and reported once
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         cloud = o3d.t.io.read_point_cloud(str(path), remove_nan_points=False, remove_infinite_points=False)
     read = len(cloud.point.positions) if "positions" in cloud.point else 0
@@ -142,7 +142,7 @@ def _ply_header(path: Path, content: bytes) -> tuple[int, int, int]:
 
 
 def _pcd_header(path: Path, content: bytes) -> tuple[int, int, int]:
-    """Return the same of a PCD."""
+    """Return the same values as `_ply_header` for a PCD."""
     end = re.search(rb"^DATA\s+(\w+)\s*?\r?\n", content, re.MULTILINE)
     if end is None:
         raise UserError(f"{path}: is not a PCD file, or its header is cut off", legal=LEGAL_CLOUD)
@@ -154,7 +154,7 @@ def _pcd_header(path: Path, content: bytes) -> tuple[int, int, int]:
             raise ValueError(f"{text[:20]!r} is not a count")
         return int(text)
 
-    with damage_told(f"{path}: its PCD header cannot be read", LEGAL_CLOUD):
+    with read_errors(f"{path}: its PCD header cannot be read", LEGAL_CLOUD):
         width, height = count(fields["WIDTH"][0]), count(fields["HEIGHT"][0])
         points = count(fields["POINTS"][0]) if "POINTS" in fields else width * height
         sizes = [count(text) for text in fields["SIZE"]]
@@ -190,7 +190,7 @@ COLUMNS = {
 
 def _read_list(path: Path, lens: Lens | None) -> tuple[np.ndarray, tuple[int, int], np.ndarray | None, Any]:
     """Read one list of points. Raises UserError where it cannot be read as numbers."""
-    with damage_told(f"{path}: cannot be read", LEGAL_LIST):
+    with read_errors(f"{path}: cannot be read", LEGAL_LIST):
         content = bounded_bytes(path, TABLE_BYTES).removeprefix(codecs.BOM_UTF8)
     lines = content[:65536].decode("latin1").splitlines()[:HEAD_LINES]
     head = [bool(re.match(r"\s*(#|//|;|$)", line)) or _numbers(line) is None for line in lines]
@@ -214,7 +214,7 @@ def _read_list(path: Path, lens: Lens | None) -> tuple[np.ndarray, tuple[int, in
 
 
 def _numbers(line: str) -> list[float] | None:
-    """Return the numbers of a line; None where something else stands there."""
+    """Return the numbers of a line; None if it holds anything else."""
     try:
         return [float(word) for word in re.split(r"[,;\s]+", line.strip(" \t\r,;")) if word]
     except ValueError:
@@ -228,7 +228,7 @@ def _table(path: Path, content: bytes, skipped: int, line: str) -> np.ndarray:
     is_decimal_comma = "," in line and "." not in line and re.search(r"[;\t]", line)
     content = content.translate(bytes.maketrans(b",;", b". " if is_decimal_comma else b"  "))
     options: Any = {"sep": r"\s+", "header": None, "comment": "#", "dtype": np.float64, "encoding": "latin1"}
-    with damage_told(f"{path}: cannot be read as points", LEGAL_LIST):
+    with read_errors(f"{path}: cannot be read as points", LEGAL_LIST):
         values: np.ndarray = pandas.read_csv(io.BytesIO(content), skiprows=skipped, **options).to_numpy()
     if 3 <= values.shape[1] <= MOST_COLUMNS:
         return values
@@ -238,7 +238,7 @@ def _table(path: Path, content: bytes, skipped: int, line: str) -> np.ndarray:
 
 
 def _columns(path: Path, values: np.ndarray, line: str) -> dict[str, np.ndarray]:
-    """Return columns by name: x, y, z, i, r, g, b. ``line`` stands before the numbers and may name them."""
+    """Return columns by name: x, y, z, i, r, g, b. ``line`` precedes the numbers and may name them."""
     bare = re.sub(r"\([^)]*\)|\[[^]]*\]", " ", line).strip(" #/\t\r,;").lower()
     names = [COLUMNS.get(word, "") for word in re.split(r"[,;\s]+", bare)]
     count = values.shape[1]
@@ -250,6 +250,6 @@ def _columns(path: Path, values: np.ndarray, line: str) -> dict[str, np.ndarray]
     colour = {6: "rgb", 7: "irgb"}.get(count, "i" if count in (4, 5) else "")
     found = {name: values[:, i] for i, name in enumerate("xyz" + colour)}
     if "r" in found and ((beyond := values[:, count - 3 :]).min() < 0 or beyond.max() > 255 or (beyond % 1).any()):
-        # normals, or another thing: no colour
+        # normals or something else, but no colour
         return {name: found[name] for name in found if name not in "rgb"}
     return found

@@ -1,8 +1,8 @@
 """Folders and lists of 16-bit depth PNGs: Open3D's recorder, Azure SDK exports, TUM RGB-D, or bare pictures.
 
-What decides the layout: a sub-folder ``depth`` (with ``color`` or ``rgb`` beside it), names that hold "depth", names
-that are numbers, else every 16-bit grey PNG. A ``depth.txt`` beside marks TUM RGB-D. A picture's kind is told by its
-first bytes, and Pillow reads its header: OpenCV would decode a header of 30,000 x 30,000 pixels into gigabytes."""
+The layout is recognised by a sub-folder ``depth`` (with ``color`` or ``rgb`` beside it), by names that hold "depth", or
+by names that are numbers; else every 16-bit grey PNG counts. A ``depth.txt`` marks TUM RGB-D. A picture's first bytes
+show its kind, and Pillow reads its header: OpenCV would decode a header of 30,000 x 30,000 pixels into gigabytes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from PIL import ImageFile, JpegImagePlugin, PngImagePlugin
 
 from detectors.recordings.distances import UNITS_M, frame_of
 from detectors.recordings.intrinsics import lens_for
-from detectors.recordings.recording import Given, Recording, damage_told
+from detectors.recordings.recording import Given, Recording, read_errors
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import PICTURE_BYTES, bounded_bytes, refuse_pixels
 from harness.vocabulary.geometry import Frame
@@ -33,7 +33,7 @@ LEGAL_PICTURE = "PNG or JPEG"
 def read_picture(path: Path, flags: int) -> np.ndarray:
     """Return a PNG or JPEG decoded by OpenCV with its ``flags``: (h, w) or (h, w, 3), blue first. Raises UserError
     where it is another kind of file, cannot be decoded, or is too large."""
-    with damage_told(f"{path}: cannot be read", LEGAL_PICTURE):
+    with read_errors(f"{path}: cannot be read", LEGAL_PICTURE):
         content = bounded_bytes(path, PICTURE_BYTES)
     return decoded(str(path), content, flags)
 
@@ -41,7 +41,7 @@ def read_picture(path: Path, flags: int) -> np.ndarray:
 def decoded(name: str, content: bytes, flags: int) -> np.ndarray:
     """Decode a file's content as `read_picture` does."""
     refuse_pixels(name, *_header(name, content).size)
-    with damage_told(f"{name}: cannot be decoded", LEGAL_PICTURE):
+    with read_errors(f"{name}: cannot be decoded", LEGAL_PICTURE):
         picture = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
         if picture is None:
             raise ValueError("its pixels are damaged")
@@ -62,7 +62,7 @@ def _header(name: str, content: bytes) -> ImageFile.ImageFile:
     """Read a picture's header alone, as the kind that its first bytes say."""
     kind = PngImagePlugin.PngImageFile if content.startswith(PNG_SIGNATURE) else JpegImagePlugin.JpegImageFile
     what = f"{name}: cannot be decoded: it is neither PNG nor JPEG, or it is truncated"
-    with damage_told(what, LEGAL_PICTURE):
+    with read_errors(what, LEGAL_PICTURE):
         return kind(io.BytesIO(content))
 
 
@@ -169,7 +169,7 @@ def depth_named(paths: Sequence[Path], others: Sequence[Path]) -> tuple[Path, ..
 
 def png_kind(path: Path) -> tuple[int, int, int, int]:
     """Return (width, height, bits, colour type) of a PNG. Raises UserError where it is no PNG, or too large."""
-    with damage_told(f"{path}: cannot be read", LEGAL_PNG), path.open("rb") as file:
+    with read_errors(f"{path}: cannot be read", LEGAL_PNG), path.open("rb") as file:
         head = file.read(26)
     if len(head) < 26 or head[:8] != PNG_SIGNATURE or head[12:16] != b"IHDR":
         raise UserError(f"{path}: is no PNG, or is truncated", legal=LEGAL_PNG, fix="copy or export it again")

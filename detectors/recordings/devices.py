@@ -27,7 +27,7 @@ from detectors.recordings.intrinsics import (
     lens_for,
     parse_calibration,
 )
-from detectors.recordings.recording import Given, Recording, damage_told
+from detectors.recordings.recording import Given, Recording, read_errors
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import FRAME_PIXELS, TEXT_BYTES, bounded_bytes, refuse_bytes, refuse_pixels, strict_json
 from harness.vocabulary.geometry import Frame, Lens, transform_points
@@ -36,7 +36,7 @@ TITLES = ("DEPTH", "IR", "COLOR")
 LEGAL_MKV = "a recording of k4arecorder with its DEPTH track"
 SEGMENT_ID = bytes.fromhex("18538067")
 WAITING = 4
-"""Captures held while their other pictures may still come; the recorder interleaves its tracks within one frame."""
+"""Most captures held while their other pictures may still follow; the recorder interleaves tracks within one frame."""
 
 
 def open_mkv(path: Path, given: Given) -> Recording:
@@ -103,7 +103,7 @@ def _opened(path: Path) -> Any:
     # Without these the decoder guesses the form by content: a playlist or a script called .mkv would open other files,
     # and addresses.
     only = {"protocol_whitelist": "file", "format_whitelist": "matroska,webm"}
-    with damage_told(f"{path}: cannot be opened as a recording", LEGAL_MKV):
+    with read_errors(f"{path}: cannot be opened as a recording", LEGAL_MKV):
         return av.open(f"file:{path}", format="matroska", options=only)
 
 
@@ -166,7 +166,7 @@ def _refuse_truncated(path: Path) -> None:
 LEGAL_STRAY = "Stray Scanner's folder: depth/*.png, confidence/*.png, camera_matrix.csv, odometry.csv"
 LEGAL_R3D = "Record3D's .r3d: metadata and rgbd/*.depth"
 COLOUR_WIDTHS = (1920, 1280, 640, 3840)
-"""Widths of the pictures that ARKit's lens may be of; all are 4 : 3, as its depth is."""
+"""Widths of the pictures to which ARKit's lens may refer; all are 4 : 3, as its depth is."""
 BLUR_PX = 0.5  # motion over this much of a pixel spreads an edge further than the sensor itself does
 
 
@@ -237,7 +237,7 @@ def is_stray(folder: Path) -> bool:
 
 
 def open_stray(folder: Path, given: Given) -> Recording:
-    """Open Stray Scanner's folder. Raises UserError where a file is broken or the lens' resolution cannot be told."""
+    """Open Stray Scanner's folder. Raises UserError if a file is broken or the lens's resolution is unknown."""
     depths = depth_files(folder / "depth")
     height, width = read_depth_png(depths[0]).shape
     beside = [folder / "confidence" / path.name for path in depths]
@@ -270,7 +270,7 @@ def open_stray(folder: Path, given: Given) -> Recording:
 
 def _table(path: Path) -> np.ndarray:
     """Return the numbers of a small CSV, (rows, columns), without its line of names."""
-    with damage_told(f"{path}: cannot be read as a table of numbers", LEGAL_STRAY):
+    with read_errors(f"{path}: cannot be read as a table of numbers", LEGAL_STRAY):
         text = bounded_bytes(path, TEXT_BYTES).decode("utf-8-sig")
         lines = (line.strip(" ,\r") for line in text.splitlines() if re.match(r"\s*[-+.\d]", line))
         table = np.array([[float(cell) for cell in re.split(r"[,;\s]+", line) if cell] for line in lines], float)
@@ -286,7 +286,7 @@ def open_r3d(path: Path, given: Given) -> Recording:
             held = ", ".join(archive.namelist()[:6]) or "nothing"
             raise UserError(f"{path}: contains no Record3D capture ({held[:200]})", legal=LEGAL_R3D)
         content = _content(path, archive, "metadata")
-    with damage_told(f"{path}: its metadata cannot be read", LEGAL_R3D):
+    with read_errors(f"{path}: its metadata cannot be read", LEGAL_R3D):
         info = strict_json(content)
         k = np.array([float(x) for x in info["K"]]).reshape(3, 3).T
         width, height = int(info.get("dw", 192)), int(info.get("dh", 256))
@@ -309,7 +309,7 @@ def open_r3d(path: Path, given: Given) -> Recording:
 
 
 def _archive(path: Path) -> zipfile.ZipFile:
-    with damage_told(f"{path}: is not a Record3D archive, or is cut off", LEGAL_R3D):
+    with read_errors(f"{path}: is not a Record3D archive, or is cut off", LEGAL_R3D):
         return zipfile.ZipFile(path)
 
 
@@ -321,7 +321,7 @@ def _depth_names(archive: zipfile.ZipFile) -> list[str]:
 def _content(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
     """Return an entry's bytes, no more than `files.TEXT_BYTES`: depth of an iPhone has 0.1 MB."""
     refuse_bytes(f"{path}: {name}", archive.getinfo(name).file_size, TEXT_BYTES)
-    with damage_told(f"{path}: {name} cannot be read", LEGAL_R3D), archive.open(name) as stream:
+    with read_errors(f"{path}: {name} cannot be read", LEGAL_R3D), archive.open(name) as stream:
         return stream.read(TEXT_BYTES)
 
 
@@ -333,5 +333,5 @@ def _plane(path: Path, archive: zipfile.ZipFile, name: str, kind: str, size: tup
     except ImportError as error:
         what = f"{path}: {name}: is compressed by LZFSE, and the package that unpacks it is not installed"
         raise UserError(what, fix="pip install pyliblzfse, or export the capture as PLY") from error
-    with damage_told(f"{path}: {name}: is damaged, its LZFSE data cannot be unpacked", LEGAL_R3D):
+    with read_errors(f"{path}: {name}: is damaged, its LZFSE data cannot be unpacked", LEGAL_R3D):
         return np.frombuffer(liblzfse.decompress(packed), kind).reshape(size[::-1])

@@ -15,15 +15,15 @@ UNITS_M = {"mm": 1e-3, "m": 1.0, "cm": 1e-2, "um": 1e-6, "in": 0.0254, "tum": 1 
 """Metres in one stored unit; ``tum`` is the scale of the TUM RGB-D benchmark, 5000 to the metre."""
 LEGAL_UNITS = "mm, cm, m, um, in (inch), tum (5000 to the metre), or N/m for N to the metre (4000/m)"
 NEAREST_M, FARTHEST_M = 0.05, 20.0
-"""Bounds of a plausible median distance: nearer than any time-of-flight camera works, farther than any of them sees."""
+"""Bounds of a plausible median distance: no time-of-flight camera works nearer or sees farther."""
 FARTHEST_ASIDE = 4.0  # times its z that the median point may lie off the axis: 76 degrees
 RAYS_TELL = 3.0
-"""Ratio of bends that tells lengths along rays from z: 0.1 to 0.5 of real captures' z, up to 2 of a pipe's."""
+"""Ratio of bends that tells lengths along rays from z: 0.1 to 0.5 for real captures' z, up to 2 for a pipe's."""
 COMMON_STEPS_M = (1e-3, 2.5e-4, 2e-4, 1e-4)
 """Rounding steps that cameras store: 1 mm (Kinects), 0.25 mm (L515), 0.2 mm (TUM), 0.1 mm."""
 CAMERA_FRAME = "the camera's frame: x right, y down, z forward from the lens"
 TURNED_SHARE = 0.99
-"""Part of the points that must have z below 0 before they are turned: no camera measures behind itself."""
+"""Share of the points that must have z below 0 before they are turned: no camera measures behind itself."""
 
 
 def metres_per_unit(unit: str) -> float:
@@ -90,7 +90,7 @@ def frame_of(
 
 SHARED_CODE = 20  # pixels that must share a number before it can be a full scale
 ISOLATED = 4.0
-"""Factor between codes and all distances: a wall four times as far as all else has more than a few distances."""
+"""Factor between codes and all distances: a wall four times as far as the rest has more than a few distances."""
 FEW_CODES = 8
 
 
@@ -140,14 +140,14 @@ READINGS = {
 NEAR_M = (0.8, 1.8)
 """Middle and spread (a factor) of the distances at which targets are looked at: 95 % within 0.25 to 2.6 m."""
 NEAR_LIMIT_M, FAR_FLOOR = 0.15, 0.05
-"""Any distance above the first keeps at least the second as its part of the commonest distance's weight."""
+"""A distance above the first keeps at least the second as its part of the commonest distance's weight."""
 SURE, LIKELY, SHOWN = 0.98, 0.75, 0.003
-"""Probabilities: above the first a unit is told, below the second asked for; the third hides a reading."""
+"""Probabilities: no warning from the first on; the user must decide below the second; not listed below the third."""
 MILLIMETRE_SIZES = {
     **{(640, 576): 4.5, (320, 288): 6.0, (512, 512): 3.5, (1024, 1024): 3.0, (512, 424): 8.0, (256, 192): 8.0}
 }  # image sizes of cameras that all store 1 mm and the median distance in metres that they can reach
 QUARTER_SIZES = {(1024, 768): 20.0, (640, 480): 2.0, (1280, 720): 2.0, (1920, 1080): 2.0}
-"""Image sizes of cameras with 0.25 mm (L515, Helios; colour that the L515 is aligned to), and the weight that adds."""
+"""Image sizes of cameras with 0.25 mm (L515, Helios; colour to which the L515 is aligned), and the weight that adds."""
 
 
 class Unit(NamedTuple):
@@ -184,9 +184,9 @@ def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int,
     """Decide the unit of numbers (n,) that nothing states; ``size``: width and height of the image.
 
     Each of `READINGS` is weighed by how common it is and by how far it puts the nearest tenth of the points, which is
-    where targets are (`NEAR_M`). A common divisor of all numbers speaks for the unit in which they are whole
-    millimetres; sizes that only cameras with 1 mm have speak for it (`MILLIMETRE_SIZES`), and against distances beyond
-    their reach. Raises UserError where no reading is clearly the likeliest, with the distance that each gives."""
+    where targets are (`NEAR_M`). A common divisor of all numbers supports the unit in which they are whole
+    millimetres. Image sizes that only cameras with 1 mm have support that unit (`MILLIMETRE_SIZES`), and exclude it
+    beyond their reach. Raises UserError if no reading is clearly the likeliest, with the distance that each gives."""
     near, median = (float(q) for q in np.quantile(stored[:: max(1, stored.size // 50_000)], (0.1, 0.5)))
     integers = usual_m == UNITS_M["mm"]
     divisor = int(np.gcd.reduce(stored.astype(np.int64))) if integers else 1
@@ -239,7 +239,7 @@ def rounding_step_m(z_m: np.ndarray) -> float:
 
 
 def refuse_implausible(frame: Frame, scale_m: float) -> None:
-    """Raise UserError where the median distance of a frame with a valid pixel speaks for a wrong unit."""
+    """Raise UserError if the median distance of a frame with a valid pixel indicates a wrong unit."""
     valid = frame.z_m[np.isfinite(frame.z_m)]
     median_m = float(np.median(valid[:: max(1, valid.size // 50_000)]))
     if NEAREST_M <= median_m <= FARTHEST_M:

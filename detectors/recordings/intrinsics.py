@@ -10,14 +10,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from detectors.recordings.recording import Given, damage_told
+from detectors.recordings.recording import Given, read_errors
 from harness.vocabulary.declaration.yaml_source import MAX_BYTES, DeclarationError, parse_yaml
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, refuse_bytes, strict_json
 from harness.vocabulary.geometry import Lens, OtherLens
 
 Mode = tuple[tuple[int, int], tuple[int, int], tuple[int, int]]
-"""A read-out of the sensor: the binned sensor, the offset of the crop in it, and the image; (x, y) pixels."""
+"""A read-out of the sensor: the binned sensor, the crop's offset in it, and the image; (x, y) in pixels."""
 DEPTH_MODES: dict[str, Mode] = {
     "NFOV_2X2BINNED": ((512, 512), (96, 90), (320, 288)),
     "NFOV_UNBINNED": ((1024, 1024), (192, 180), (640, 576)),
@@ -40,7 +40,7 @@ def parse_calibration(name: str, content: bytes) -> dict[str, Any]:
     """Parse the calibration's JSON (a trailing zero byte is the recorder's). Raises UserError for any other content."""
     refuse_bytes(name, len(content), TEXT_BYTES)
     legal = "the JSON that k4arecorder attaches: CalibrationInformation with its Cameras"
-    with damage_told(f"{name}: is not an Azure Kinect calibration", legal, OWN_LENS):
+    with read_errors(f"{name}: is not an Azure Kinect calibration", legal, OWN_LENS):
         cameras = strict_json(content.rstrip(b"\0"))["CalibrationInformation"]["Cameras"]
         return {camera["Purpose"].removeprefix("CALIBRATION_CameraPurpose"): camera for camera in cameras}
 
@@ -71,7 +71,7 @@ def colour_camera(name: str, cameras: dict[str, Any], width: int, height: int) -
         parameters[1] = (parameters[1] * 2304 + 384) / 3072
         parameters[3] = parameters[3] * 2304 / 3072
     T_colour_depth = np.eye(4)
-    with damage_told(f"{name}: the colour camera's place cannot be read", "Rt with Rotation and Translation", OWN_LENS):
+    with read_errors(f"{name}: the colour camera's place cannot be read", "Rt with Rotation and Translation", OWN_LENS):
         T_colour_depth[:3, :3] = np.reshape(np.array(camera["Rt"]["Rotation"], float), (3, 3))
         T_colour_depth[:3, 3] = np.reshape(np.array(camera["Rt"]["Translation"], float), 3)
     mode = ((width, rows), (0, (rows - height) // 2), (width, height))
@@ -84,7 +84,7 @@ def _camera(name: str, cameras: dict[str, Any], purpose: str) -> tuple[dict[str,
         raise UserError(f"{name}: the calibration has no camera for {purpose}", legal="cameras Depth and PhotoVideo")
     camera: dict[str, Any] = cameras[purpose]
     legal = f"SensorWidth and SensorHeight, {MODEL} with 14 finite parameters"
-    with damage_told(f"{name}: the calibration's intrinsics cannot be read", legal, OWN_LENS):
+    with read_errors(f"{name}: the calibration's intrinsics cannot be read", legal, OWN_LENS):
         is_sized = all(isinstance(camera[key], int) for key in ("SensorWidth", "SensorHeight"))
         model, numbers = camera["Intrinsics"]["ModelType"], [float(x) for x in camera["Intrinsics"]["ModelParameters"]]
     known = is_sized and model == MODEL and len(numbers) == 14 and np.isfinite(numbers).all()
@@ -115,7 +115,7 @@ FOUND_BESIDE = (
 BARE_MATRICES = (
     *("intrinsics.txt", "intrinsic.txt", "camera-intrinsics.txt", "intrinsic_depth.txt", "K.txt", "cam_K.txt"),
 )
-"""Names of text files likewise: other text beside frames is mostly something else."""
+"""The same for text files: other text beside frames is mostly something different."""
 SPELLINGS = {
     **{"fx": ("fx", "fl_x", "focal_x"), "fy": ("fy", "fl_y", "focal_y")},
     **{"cx": ("cx", "ppx", "c_x"), "cy": ("cy", "ppy", "c_y")},
@@ -124,9 +124,9 @@ MATRICES = ("intrinsic_matrix", "camera_matrix", "cam_K", "K", "k")
 SIZES = (("width", "height"), ("image_width", "image_height"), ("width_px", "height_px"), ("w", "h"))
 COEFFICIENTS = ("distortion", "distortion_coefficients", "D", "d", "coeffs", "dist_coeffs")
 MODELS = ("distortion_model", "model", "camera_model")
-"""Keys by which programs name focal lengths and centre, the matrix, size, and distortion."""
+"""Keys by which programs name focal lengths and centre, the matrix, the size, and the distortion."""
 FAR_OFF = 0.2
-"""Part of the image by which a principal point may lie off its middle before the lens is doubted."""
+"""Part of the image by which a principal point may lie off the middle before the lens is doubted."""
 NUMBER, MAX_MATRIX_TEXT = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", 2000
 NESTED = 3  # levels of mappings in a file in which a lens is looked for
 DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -212,7 +212,7 @@ def parsed_lens(path: Path) -> dict[str, Any]:
     """Return the file's mapping; of bare numbers, these by name. Raises UserError where it is neither JSON nor YAML."""
     if not path.exists():
         raise UserError(f"{path}: no such file", legal=LEGAL_LENS)
-    with damage_told(f"{path}: cannot be read", LEGAL_LENS, "give another file"):
+    with read_errors(f"{path}: cannot be read", LEGAL_LENS, "give another file"):
         text = bounded_bytes(path, TEXT_BYTES).decode("utf-8-sig")
         words = re.sub(r"[\[\](),;]|#.*", " ", text).split() if len(text) < MAX_MATRIX_TEXT else []
         if len(words) in (4, 9, 12, 16) and all(re.fullmatch(NUMBER, word) for word in words):
@@ -287,7 +287,7 @@ def _focal_and_centre(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
     key = _matrix_key(data)
     assert key is not None
     m = _numbers(path, key, data[key], 9)
-    # the last row is 0 0 1: what stands elsewhere tells whether it is by rows, or by columns as Open3D's
+    # the last row is 0 0 1: anything else there shows whether it is by rows, or by columns as Open3D's
     return (m[0], m[4], m[6], m[7]) if m[6] or m[7] else (m[0], m[4], m[2], m[5])
 
 
@@ -322,7 +322,7 @@ def _numbers(path: Path, key: str, value: Any, count: int | None) -> tuple[float
 
 
 def _number(path: Path, key: str, value: Any) -> float:
-    # Python's integers have no largest one, and lists may be endless to print.
+    # Python's integers have no largest value, and lists may be too long to print
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < LARGEST:
         shown = repr(value)[:40] if isinstance(value, str | bool | float | None) else type(value).__name__
         raise UserError(f"{path}: {key} is {shown}", legal=f"a number within {LARGEST:g}")

@@ -17,7 +17,7 @@ from detectors.recordings.depth_images import depth_named, open_depth_folder, op
 from detectors.recordings.devices import is_stray, open_mkv, open_r3d, open_stray
 from detectors.recordings.distances import UNITS_M, Unit, decided_unit, metres_per_unit, ray_lengths_doubt, scale_in
 from detectors.recordings.intrinsics import mappings, parsed_lens
-from detectors.recordings.recording import Given, Recording, damage_told
+from detectors.recordings.recording import Given, Recording, read_errors
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import OtherLens
 
@@ -28,10 +28,10 @@ LEGAL_FORMATS = (
 )
 FILES = {".mkv": open_mkv, ".r3d": open_r3d, **dict.fromkeys(LOADERS, open_arrays)}
 FILES |= dict.fromkeys((*BAG_SUFFIXES, ROS1_SUFFIX), open_bag)
-"""Suffixes of files of which each is a capture, and what opens it."""
+"""Suffixes of files of which each is a capture, and the function that opens it."""
 ListOpener = Callable[[Sequence[Path], Given, str], Recording]
 LISTS: dict[str, ListOpener] = {".png": open_depth_list, **dict.fromkeys((*CLOUDS, *POINT_LISTS), open_clouds)}
-"""Suffixes of files of which several, all of one suffix, are one capture."""
+"""Suffixes of files of which several, all with the same suffix, form one capture."""
 SAVE = "python -c \"import numpy, {}; numpy.save('depth.npy', {})\", then name depth.npy"
 PICTURE, HDF5 = SAVE.format("cv2", "cv2.imread('FILE', -1)"), SAVE.format("h5py", "h5py.File('FILE')['NAME'][:]")
 CONVERT = {
@@ -134,7 +134,7 @@ def _opened(paths: list[Path], given: Given) -> Recording:
 
 
 def _open_folder(folder: Path, given: Given) -> Recording:
-    with damage_told(f"{folder}: cannot be read", LEGAL_FORMATS, "check its permissions"):
+    with read_errors(f"{folder}: cannot be read", LEGAL_FORMATS, "check its permissions"):
         inside = shown(folder)
     if is_stray(folder):
         return open_stray(folder, given)

@@ -23,7 +23,7 @@ NO_GRID = "the cloud has no pixel grid; it is treated as unorganised points"
 
 
 @contextmanager
-def damage_told(what: str, legal: str, fix: str = "copy or export it again") -> Iterator[None]:
+def read_errors(what: str, legal: str, fix: str = "copy or export it again") -> Iterator[None]:
     """Turn a library's exception on a damaged file into a UserError that begins with ``what``; limit its memory."""
     try:
         with limited_memory():
@@ -57,7 +57,7 @@ class Recording:
     """A real capture as a `harness.vocabulary.geometry.FrameSource`.
 
     ``read`` yields the frames in order; each call starts again. ``shape``: (height, width). ``files``: all whose
-    content can change a number. ``scale_m``: metres in one stored unit, and ``unit_from`` who says so: "" where the
+    content can change a number. ``scale_m``: metres in one stored unit, and ``unit_from`` its origin: "" where the
     data shall decide. ``notes``: how the files were understood. ``warnings``: full sentences on what makes the
     distances doubtful; every program shows them first. ``selection`` picks frames."""
 
@@ -98,7 +98,7 @@ class Recording:
 
     @cached_property
     def slopes(self) -> np.ndarray | None:
-        """(h, w, 2) x/z and y/z per pixel; NaN where the distortion has no inverse. None where frames carry points."""
+        """Slopes x/z, y/z (h, w, 2) of pixels; NaN where the distortion has no inverse. None if frames carry points."""
         return None if self.lens is None else _returning_slopes(self.lens, self.region)
 
     def selected(self) -> Iterator[Frame]:

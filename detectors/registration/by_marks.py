@@ -1,17 +1,17 @@
 """Registration by marks: matched by code or by distances, placed by weighted least squares; alone or jointly.
 
-Where it is judged whether the views belong together, `SHARED_M` allows for what range or lens are wrong by in one view
-alone. The covariance holds the noise, widened where the marks disagree by more than chance allows (Birge's ratio).
+Where the program judges whether views belong together, `SHARED_M` allows for errors of range or lens in a single view.
+The covariance holds the noise, widened where the marks disagree by more than chance allows (Birge's ratio).
 
-The joint adjustment is one of bundles (Triggs et al., 2000) with one smooth surface in place of many points. Unknown
-are the poses of all views but the first, the surface z(x, y) (a cubic), the marks' places on it, and each view's own
-smooth error across it:
+The joint adjustment is a bundle adjustment (Triggs et al., 2000) with one smooth surface in place of many points. Its
+unknowns are the poses of all views but the first, the surface z(x, y) (a cubic), the marks' places on it, and each
+view's own smooth error across it:
 
 z(T_v p) - S(x, y) - b_v(x, y) = noise for some 2000 target points p of each view v, and P (T_v c - M) = noise for each
 mark c of each view that is one of the reference's, in the surface's frame. Noise across is that of the sampling, with
-one independent value in 25 pixels; Tukey's weights keep holes out. b_v is what all pixels of a view share smoothly
-(wiggling, multipath): a cubic, whose level and tilts cannot be told from the pose's; the scatter of the seven other
-terms between views gives their common deviation (by expectation maximisation), so that the covariance holds the three.
+one independent value in 25 pixels; Tukey's weights keep holes out. b_v is the smooth error that all pixels of a view
+share (wiggling, multipath): a cubic, whose level and tilts cannot be told from the pose's. The scatter of its seven
+other terms between views gives their common deviation (by expectation maximisation), and so widens the three's too.
 Not modelled: errors of a view within the plane; a surface that no cubic follows; gross errors of marks."""
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from detectors.views import PreparedView
 from harness.vocabulary.geometry import MM, invert, transform_points
 
 WIDEN_BELOW = 0.01
-"""Chance of marks that disagree so much by their noise alone, below which the covariance is widened."""
+"""Chance, below which the covariance is widened, that marks disagree so much by their noise alone."""
 REFUSE_BELOW = 1e-4
-"""The same with `SHARED_M` for each mark and axis allowed for, below which the views do not fit."""
+"""The same chance, with `SHARED_M` allowed for each mark and axis, below which the views do not fit together."""
 
 
 def register_by_marks(reference: PreparedView, view: PreparedView) -> registered.Registration:
@@ -65,7 +65,7 @@ def register_by_marks(reference: PreparedView, view: PreparedView) -> registered
 
 
 def held_out_error_m(reference: PreparedView, view: PreparedView) -> float | None:
-    """Return the root mean square distance (m) of each matched mark from where the registration by the others puts it;
+    """Return the root mean square distance (m) of each matched mark from its place by a registration with the others;
     None where fewer than four marks match, or where leaving one out leaves the rest on a line."""
     ours, theirs, problem, _ = _matched(reference, view)
     if problem or len(ours) < 4:
@@ -83,7 +83,7 @@ def held_out_error_m(reference: PreparedView, view: PreparedView) -> float | Non
 def _matched(
     reference: PreparedView, view: PreparedView
 ) -> tuple[tuple[Mark, ...], tuple[Mark, ...], str, tuple[str, ...]]:
-    """Trusted marks of both views that are pairs, the reason why they must not be used (or empty), and notes."""
+    """Return trusted marks of both views that are pairs, the reason why they must not be used (or empty), and notes."""
     problem = "; ".join(f"{each.view.name}: {each.marks.problem}" for each in (reference, view) if each.marks.problem)
     if problem:
         return (), (), problem, ()
@@ -103,11 +103,11 @@ def _placed(ours: Sequence[Mark], theirs: Sequence[Mark], shared_m: float) -> Pl
 
 MAX_STEPS = 40
 CONVERGED_M, CONVERGED_SHARED = 1e-6, 0.02
-"""Largest last move of an unknown, and largest last change of the views' own deviation, as a part of it."""
+"""Largest last move of an unknown, and largest last relative change of the deviation of the views' own errors."""
 LEAST_SHARED_M = 1e-6
 DEGREE = 3
 TERMS = tuple((k - j, j) for k in range(DEGREE + 1) for j in range(k + 1))
-"""Chebyshev orders in x and y by total degree: a level, two tilts, then seven that no pose can imitate."""
+"""Orders of the Chebyshev terms in x and y by total degree: a level, two tilts, then seven that no pose can imitate."""
 POSE_TERMS = 3
 
 
@@ -182,7 +182,7 @@ class JointState:
             right[columns] -= weighted.T @ residual
 
         for v, each in enumerate(data):
-            # the first view's pose is no unknown
+            # the first view's pose is not an unknown
             pose, moves = (poses[v - 1], 6) if v else (np.empty(0, dtype=int), 0)
             residual, basis, by_pose, weight = self.across(each, v)
             rows = np.concatenate([-basis, -basis, by_pose[:, :moves]], axis=1)
@@ -211,7 +211,7 @@ def register_jointly(views: Sequence[PreparedView]) -> list[registered.Registrat
 
 
 def _adjust(views: Sequence[PreparedView], marked: Sequence[registered.Registration]) -> list[registered.Registration]:
-    """Registrations of views 1.. adjusted from those by their marks, none of which failed."""
+    """Return registrations of views 1.., adjusted from those by their marks, none of which failed."""
     T_reference = [np.eye(4), *(found.T_reference_view for found in marked)]
     data = [_view_data(view, views[0]) for view in views]
     # the frame of the surface z(x, y): z along its mean normal, towards the camera
@@ -234,7 +234,7 @@ def _adjust(views: Sequence[PreparedView], marked: Sequence[registered.Registrat
         matrix, right = state.equations(data)
         covariance = np.linalg.inv(matrix)
         motion = covariance @ right
-        # the maximisation step of EM: beside the squares of the terms that no pose can imitate stands their variance
+        # the maximisation step of EM: the squares of the terms that no pose can imitate, plus their variance
         squares = (state.own + state.split(motion)[3]) ** 2 + state.split(np.diag(covariance))[3]
         shared = max(float(np.sqrt(squares[:, POSE_TERMS:].mean())), LEAST_SHARED_M)
         settled = abs(shared - state.shared_m) <= CONVERGED_SHARED * state.shared_m

@@ -29,11 +29,11 @@ from detectors.views import PreparedView
 from harness.vocabulary.geometry import MM, Lens, transform_points
 
 GUESS_ERROR_M, GUESS_ERROR_RAD = 10 * MM, np.deg2rad(3.0)
-"""Usual error of a nominal pose; first pairs may lie twice as far apart as it moves the outermost point."""
+"""Usual error of a nominal pose; the first pairs may lie twice as far apart as this moves the outermost point."""
 FINEST_PITCHES = 3.0
-"""Limit of the last stage: a mark's rim is known to a pixel in either view, and noise and shared errors add one."""
+"""Limit of the last stage: a mark's rim is known to a pixel in either view; noise and shared errors add one more."""
 STAGE_ITERATIONS, LEAST_CHANGE = 100, 1e-8
-"""A stage ends after so many steps, or a smaller change of the paired points' share and of their distance (m)."""
+"""A stage ends after this many steps, or once the paired points' share and their distance (m) change by less."""
 CONVERGED_PITCHES = 0.05
 
 
@@ -77,7 +77,7 @@ def register_by_icp(reference: PreparedView, view: PreparedView, config: IcpRegi
 
 
 def stages_m(pitch_m: float, extent_m: float) -> tuple[float, ...]:
-    """Return the greatest distance of a pair in each stage: from twice a usual guess error, halved to three pitches."""
+    """Return the greatest distance of a pair in each stage: twice a guess's usual error, halved to three pitches."""
     finest = FINEST_PITCHES * pitch_m
     limits = [max(2 * (GUESS_ERROR_M + GUESS_ERROR_RAD * extent_m), finest)]
     while limits[-1] > finest:
@@ -86,7 +86,7 @@ def stages_m(pitch_m: float, extent_m: float) -> tuple[float, ...]:
 
 
 def _pairs(tree: Any, moved_m: np.ndarray, limit_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vectors (n, 3) to the partners, zero without a partner, and the mask (n,) of points that have one."""
+    """Return vectors (n, 3) to the partners, zero without one, and the mask (n,) of points that have a partner."""
     distances, nearest = tree.query(moved_m, distance_upper_bound=limit_m)
     paired = np.isfinite(distances)
     return np.where(paired[:, None], moved_m - tree.data[np.where(paired, nearest, 0)], 0.0), paired
@@ -292,7 +292,7 @@ def register_by_odometry(views: Sequence[PreparedView]) -> list[registered.Regis
 
 
 def _image(o3d: Any, view: PreparedView, canvas: Lens) -> Any:
-    """The view's target as Open3D's intensity and depth on the canvas, both without distortion."""
+    """Return the view's target as Open3D's intensity and depth on the canvas, both without distortion."""
     cloud = view.view.cloud
     lens = cloud.lens
     assert lens is not None and cloud.rgb is not None
@@ -300,7 +300,7 @@ def _image(o3d: Any, view: PreparedView, canvas: Lens) -> Any:
     pixels = lens.project(np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1))
     u, v = (pixels - [cloud.region.col0, cloud.region.row0]).astype(np.float32).transpose(2, 0, 1)
     z = np.where(view.inside, cloud.points_m[..., 2], 0.0).astype(np.float32)
-    # depth is not interpolated, because the mean of target and nothing is neither
+    # depth is not interpolated, because a mean of target and background is neither
     depth = cv2.remap(z, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
     colour = cv2.remap(cloud.rgb, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     images = (o3d.geometry.Image(np.ascontiguousarray(image)) for image in (colour, depth))

@@ -1,8 +1,8 @@
-"""Registration of views by the method that its settings name, and the judgement whether it can be trusted.
+"""Registration of views by the method that the settings name, and the judgement whether it can be trusted.
 
 Errors that a whole view shares (an offset, wiggling, the lens) show as a distance between registered views that noise
-does not explain. They widen the covariance and are noted; a view is refused only where they would blur the merged map
-by more than `BLUR_M`, or by more than a pixel where pixels are coarser."""
+does not explain. They widen the covariance and are noted; a view is refused only if they would blur the merged map by
+more than `BLUR_M`, or by more than a pixel where pixels are coarser."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, invert, transform_points
 
 FALSE_ALARM_SIGMAS = 3.09
-"""Multiple of the residual's own scatter: a good registration is refused once in a thousand."""
+"""Multiple of the residual's own scatter beyond which a view is refused; a good one is, once in a thousand."""
 MEDIAN_SCATTER = 1.65
-"""Relative error of a standard deviation from the median, over that from the mean square (1 / sqrt(0.37))."""
+"""Relative error of a standard deviation from the median, over that from the mean square: 1 / sqrt(0.37)."""
 BLUR_M = 2.0 * MM
-"""Distance between registered views beyond which a map is blurred too much: twice the noise of a single frame."""
+"""Distance between registered views that blurs a map too much: twice the noise of a single frame."""
 UNDETERMINED_PITCHES = 3.0
-"""A predicted error over the target beyond this, and beyond `BLUR_M`, puts every point on a wrong pixel."""
+"""A predicted error over the target of more pitches, and above `BLUR_M`, puts every point on a wrong pixel."""
 MAX_JUMP_DEG, MAX_JUMP_M = 30.0, 0.1
-"""Ten times the error that a nominal pose usually has (some degrees, about 10 mm)."""
+"""Ten times the usual error of a nominal pose (some degrees, about 10 mm)."""
 UNJUDGED_AGREEMENT = ("nominal", "odometry")
-"""Methods that never look at the reference's surface: what they leave is noted, not refused."""
+"""Methods that never look at the reference's surface: the distance that they leave is noted, not refused."""
 TRIMMED = 0.9
-"""Share of the fiducial points, the nearest ones, that must agree: a colour rule lets stray pixels through."""
+"""Share of the fiducial points, nearest first, that must agree: a colour rule lets stray pixels through."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Agreement:
 def _agreement(
     reference: PreparedView, ours: registered.Sampling, view: PreparedView, T_reference_view: np.ndarray
 ) -> Agreement:
-    """The agreement of a view placed by ``T_reference_view`` with the reference's target, sampled as ``ours``."""
+    """Return the agreement of a view placed by ``T_reference_view`` with the reference's target, sampled as ours."""
     from scipy.spatial import cKDTree
 
     theirs, points, marks = registered.sampling_of(view), reference.points_m, reference.mark_points_m
@@ -141,7 +141,7 @@ def _jump(registration: registered.Registration, reference: PreparedView, view: 
 
 def _apart(agreement: Agreement) -> str:
     """Return the reason why surfaces or marks are too far apart to be merged; empty where they are not."""
-    # views may differ by their noise beside BLUR_M, or a pixel where it is larger
+    # views may differ by their noise and BLUR_M, or by a pixel where that is larger
     blur = float(np.hypot(agreement.noise_m, max(BLUR_M, agreement.pitch_m)))
     limit = blur * (1 + agreement.scatter)
     marks_limit = float(np.hypot(blur, agreement.grids_m)) * (1 + agreement.marks_scatter)
@@ -227,7 +227,7 @@ def _pair(reference: PreparedView, view: PreparedView, config: AnyRegistration) 
     elif config.method == "marks":
         found = register_by_marks(reference, view)
     else:
-        # nobody has said how good the guess is
+        # nobody has stated how good the guess is
         guess = registered.guess_of(reference, view)
         found = registered.Registration(view.view.name, "nominal", np.eye(4) if guess is None else guess)
     return replace(found, seconds=perf_counter() - started)

@@ -12,7 +12,7 @@ from detectors.views import PreparedView
 from harness.vocabulary.geometry import MM, Cloud, invert, transform_points
 
 CLUSTER_PITCHES = 5.0
-"""Side of the cubes within which errors are taken to be common: the window of the widest depth filter."""
+"""Side of the cubes within which errors are taken to be common: that of the window of the widest depth filter."""
 UNKNOWN_COVARIANCE = np.full((6, 6), np.nan)
 SLIDES = "not determined: the points can slide or turn without matching worse, as they can in a flat or smooth surface"
 

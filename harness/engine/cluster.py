@@ -102,7 +102,7 @@ class ClusterEngine:
         self._nonce = secrets.token_hex(16)  # identifies this driver to the nodes
         # a file that shows whether a node sees the folder; the cache of renders treats it as a leftover
         self._probe = folder.absolute() / f".{self._nonce[:16]}.seen.part.npz"
-        self._told: set[str] = set()
+        self._printed: set[str] = set()
         self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> ClusterEngine:
@@ -204,8 +204,7 @@ class ClusterEngine:
                 self._heed(*self._events.get_nowait())
 
     def _look_for_nodes(self) -> None:
-        """Ask new nodes to describe themselves, and give up those that are gone. Raises UserError without a
-        scheduler."""
+        """Ask new nodes to describe themselves, give up those that are gone. Raises UserError without a scheduler."""
         there = None
         if self._client.status == "running":
             with contextlib.suppress(OSError):
@@ -254,7 +253,7 @@ class ClusterEngine:
             self._refuse(address, UserError(f"{where} cannot run tofpod: {type(answer).__name__}: {answer}", fix=fix))
         elif isinstance(answer, BaseException):
             # it died in the meantime, or the network failed; this says nothing about its installation
-            self._tell_once(f"{where} did not state its version ({type(answer).__name__}: {answer}); it is not used")
+            self._print_once(f"{where} did not state its version ({type(answer).__name__}: {answer}); it is not used")
         elif answer.python.split(".")[:2] != list(platform.python_version_tuple()[:2]):
             message = f"{where} runs Python {answer.python}, this machine {platform.python_version()}"
             self._refuse(address, UserError(message, fix="use the same Python on all"))
@@ -270,7 +269,7 @@ class ClusterEngine:
 
     def _refuse(self, address: str, why: UserError) -> None:
         self._refused[address] = why
-        self._tell_once(f"{why.message}; it is not used")
+        self._print_once(f"{why.message}; it is not used")
 
     def _gone(self, address: str) -> None:
         """Give up a node and pass its jobs to others."""
@@ -305,15 +304,15 @@ class ClusterEngine:
         if lacking != self._lacking:
             self._lacking, self._lacking_since = lacking, time.monotonic()
         if lacking == "worker" and self._scheduler.startswith("jobqueue:"):
-            self._tell_once(f"waiting for workers of {self._scheduler}, as long as its queue takes")
+            self._print_once(f"waiting for workers of {self._scheduler}, as long as its queue takes")
         elif lacking:
-            self._tell_once(f"waiting for a {lacking} at {self._scheduler}, at most {WAIT_FOR_NODES_S:.0f} s")
+            self._print_once(f"waiting for a {lacking} at {self._scheduler}, at most {WAIT_FOR_NODES_S:.0f} s")
             if time.monotonic() - self._lacking_since > WAIT_FOR_NODES_S:
                 raise UserError(f"no {lacking} connected to {self._scheduler} within {WAIT_FOR_NODES_S:.0f} s", fix=fix)
 
-    def _tell_once(self, message: str) -> None:
-        if message not in self._told:
-            self._told.add(message)
+    def _print_once(self, message: str) -> None:
+        if message not in self._printed:
+            self._printed.add(message)
             print(message, file=sys.stderr, flush=True)
 
 

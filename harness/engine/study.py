@@ -44,8 +44,7 @@ MOST_FAILURES, FAILURE = 200, ("what", "state", "why")  # failures to list; the 
 
 
 def run_study(experiment: Experiment, out: Path, options: EngineOptions, command: str) -> int:
-    """Run an experiment, write tables and report, print a summary; for a shard, only the journal. Returns 0, 1 or
-    130."""
+    """Run an experiment, write tables and report, print a summary; of a shard only the journal. Returns 0, 1, 130."""
     began = time.monotonic()
     origin = record(command)  # recorded now: a commit during the sweep does not change the code that runs
     origin["started"] = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
@@ -66,7 +65,7 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
                 done = outcome.trials
                 counts = f"{done.done} trials done, {done.found} found, {done.failed} failed"
                 print(f"shard {options.shard}: {counts}")
-                _tell_failures(outcome)
+                _print_failures(outcome)
                 print(f"journal: {folder / 'journal'}")
                 print("when all shards have run: python -m harness.merge, then the same command without --shard")
                 return 1 if outcome.failures else 0
@@ -89,7 +88,7 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
         return 130
     point_to(folder)
     show([*(f"warning: {text}" for text in provenance["warnings"]), *shown])
-    _tell_failures(outcome)
+    _print_failures(outcome)
     print(f"report: {folder / REPORT.name}")
     return 1 if outcome.failures else 0
 
@@ -189,7 +188,7 @@ def _counts(outcome: Outcome) -> dict[str, int]:
     return {state: counts[state] for state in STATES if counts[state]}
 
 
-def _tell_failures(outcome: Outcome) -> None:
+def _print_failures(outcome: Outcome) -> None:
     if counts := _counts(outcome):
         totals = ", ".join(f"{count} {state}" for state, count in counts.items())
         again = "the same command, with --retry-failed, runs them again"

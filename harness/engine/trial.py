@@ -159,7 +159,7 @@ class MapMaker:
     ) -> None:
         self._set_ups, self._clouds = set_ups, clouds
         self._made: dict[str, Any] = {}
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         stands, numbers = tuple(set_up.target.pose for set_up in set_ups), range(len(set_ups))
         self.truth = tuple(T_reference_view_of(stands, number) for number in numbers)
         self.guesses = tuple(guessed_T_reference_view(poses, stands, number, *labels) for number in numbers)
@@ -208,9 +208,9 @@ class MapMaker:
     def registration_rows(self, mapping: MappingConfig, frames: int) -> list[dict[str, Any]]:
         """Return a row for each view but the first (columns: `REGISTRATIONS`), once for each registration."""
         key = self._registration_key(mapping, frames)
-        if key in self._told or self.count(mapping) == 1:
+        if key in self._reported or self.count(mapping) == 1:
             return []
-        self._told.add(key)
+        self._reported.add(key)
         found = zip(self.prepared(mapping, frames), self.registrations(mapping, frames), strict=True)
         return [self._row(number, view, registration) for number, (view, registration) in enumerate(found) if number]
 

@@ -26,7 +26,7 @@ AXES = {
 }
 """The axes of a surface, and the columns of the table of limits that hold their values."""
 UNKNOWN_VARIANCE = 0.25
-"""Variance of ln a90 where an interval has no positive lower end: a factor of 1.65 either way."""
+"""Variance of ln a90 where an interval has no positive lower end: a factor of 1.65 in either direction."""
 TOLERANCE = 1e-9
 
 
@@ -95,7 +95,7 @@ class LimitSurface:
         return Answer(a90, low, high, largest_mm)
 
     def _near(self, axis: int, value: float) -> np.ndarray:
-        """Nodes of the cell that holds a value: its neighbours on the axis, or those at the value itself."""
+        """Return the nodes of the cell that holds a value: its neighbours on the axis, or those at the value itself."""
         values = np.array(list(self.grid.values())[axis])
         low = values[values <= value + TOLERANCE].max()
         high = values[values >= value - TOLERANCE].min()
@@ -145,14 +145,14 @@ def _surface(camera: str, kind: str, detector: str, rows: pd.DataFrame, axes: Se
 
 
 def _scaled(places: np.ndarray, grid: Sequence[Sequence[float]]) -> np.ndarray:
-    """Places (n, k) as logarithms between -1 and 1 over the grid; 0 on an axis with one value."""
+    """Return places (n, k) as logarithms between -1 and 1 over the grid; 0 on an axis with a single value."""
     ends = np.log([[values[0], values[-1]] for values in grid])
     half = np.maximum(np.diff(ends, axis=1)[:, 0] / 2, TOLERANCE)
     return np.asarray((np.log(places) - ends.mean(axis=1)) / half)
 
 
 def _terms(counts: Sequence[int], known: int) -> tuple[tuple[int, ...], ...]:
-    """Products of axes: squares where an axis has three values, then products of two; none for too few set-ups."""
+    """Return products of axes: squares where an axis has three values, then products of two; few set-ups get none."""
     varied = [axis for axis, count in enumerate(counts) if count > 1]
     plane: list[tuple[int, ...]] = [(), *((axis,) for axis in varied)]
     further: list[tuple[int, ...]] = [(axis, axis) for axis in varied if counts[axis] > 2]

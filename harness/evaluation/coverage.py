@@ -19,15 +19,15 @@ from harness.evaluation.pod.statement import POD
 from harness.vocabulary.errors import UserError
 
 BEYOND_DEG = 3.0
-"""Angle by which a patch may be steeper than every damage that was inspected."""
+"""Angle by which a patch may be steeper than all damage that was inspected."""
 FAR = 1.5
-"""Score over the threshold beyond which it counts only that it is beyond: the law is to hold near the threshold."""
+"""Ratio of score to threshold above which the score itself is ignored: the law is to hold near the threshold."""
 GROWTHS = np.linspace(0.0, 4.0, 17)
 """Powers of 1 / cosine with which the scatter may grow."""
 LOOSE = 2.0
-"""Size found nine times in ten over that found half of the time, from which on limits are called rough."""
+"""Ratio of the sizes found nine times in ten and half of the time from which limits are called rough."""
 FEWEST = 20
-"""Damages without which nothing is learnt."""
+"""Number of damages without which nothing is learnt."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class Patches:
     areas_m2: np.ndarray
 
     def share(self, some: np.ndarray) -> float:
-        """Return the share of the area that some patches (n,) bool have."""
+        """Return the share of the area that belongs to ``some`` (n,) bool of the patches."""
         return float(self.areas_m2[some].sum() / self.areas_m2.sum())
 
 
@@ -120,7 +120,7 @@ class Findable:
 
 
 def _design(size_mm: np.ndarray, cosine: np.ndarray, range_m: np.ndarray) -> np.ndarray:
-    """(n, 5): what the logarithm of the signal is linear in."""
+    """Return (n, 5): the terms in which the logarithm of the signal is linear."""
     return np.column_stack([np.ones(len(size_mm)), np.log(size_mm), cosine, cosine**2, np.log(range_m)])
 
 
@@ -139,7 +139,7 @@ def findable(some: ScoredDamage, threshold: float) -> Findable:
     signal = np.log(np.minimum(np.where(below, threshold, score), far) * some.seen.deviation_m[judged])
 
     def fitted(growth: float) -> tuple[float, CensoredFit]:
-        """The log-likelihood with a scatter proportional to cosine^-growth, and the fit of rows divided by that."""
+        """Return the log-likelihood with a scatter proportional to cosine^-growth, and the fit of rows over that."""
         weight = cosine**growth
         fit = fit_censored(design * weight[:, None], signal * weight, below, above)
         return fit.log_likelihood + float(np.log(weight[~(below | above)]).sum()), fit

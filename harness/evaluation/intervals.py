@@ -1,4 +1,4 @@
-"""Intervals, two-sided at `CONFIDENCE` unless told otherwise; false calls per area, and the threshold for a rate.
+"""Intervals, two-sided at `CONFIDENCE` unless stated otherwise; false calls per area, and the threshold for a rate.
 
 Sources: Wilson 1927 and Clopper and Pearson 1934 (proportions), Garwood 1936 (Poisson), Student and Welch (means),
 Efron and Tibshirani 1993 (percentile bootstrap). Not covered: repeats of one set-up are repeats of the noise."""
@@ -54,20 +54,20 @@ UNKNOWN = Interval(np.nan, np.nan)
 
 
 def wilson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Wilson's score interval of a proportion, element by element: (low, high), NaN where ``trials`` is 0. Coverage is
-    near nominal on average over the proportion; `clopper_pearson` is never below nominal and wider."""
+    """Return Wilson's score interval of a proportion, element by element: (low, high), NaN where ``trials`` is 0.
+    Coverage is near nominal on average over the proportion; `clopper_pearson` is never below nominal and wider."""
     k, n = np.broadcast_arrays(np.asarray(successes, float), np.asarray(trials, float))
     z2 = special.ndtri(UPPER) ** 2
     with np.errstate(invalid="ignore", divide="ignore"):
         centre = (k + z2 / 2) / (n + z2)
         half = np.sqrt(z2) / (n + z2) * np.sqrt(k * (n - k) / n + z2 / 4)
-    # Rounding would leave 1e-17 where the end is exactly 0 or 1.
+    # rounding would leave 1e-17 where the end is exactly 0 or 1
     low, high = np.where(k == 0, 0.0, centre - half), np.where(k == n, 1.0, centre + half)
     return np.where(n > 0, low, np.nan), np.where(n > 0, high, np.nan)
 
 
 def clopper_pearson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Clopper and Pearson's exact interval of a proportion, element by element; NaN where ``trials`` is 0."""
+    """Return Clopper and Pearson's exact interval of a proportion, element by element; NaN where ``trials`` is 0."""
     k, n = np.broadcast_arrays(np.asarray(successes, float), np.asarray(trials, float))
     low = np.where(k == 0, 0.0, special.betaincinv(k, n - k + 1, 1 - UPPER))
     high = np.where(k == n, 1.0, special.betaincinv(k + 1, n - k, UPPER))
@@ -75,7 +75,7 @@ def clopper_pearson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray
 
 
 def poisson_rate(count: ArrayLike, exposure: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Garwood's exact interval of a Poisson rate, ``count`` events in ``exposure`` (runs, areas), NaN where 0."""
+    """Return Garwood's exact interval of a Poisson rate, ``count`` in ``exposure`` (runs, areas), NaN where 0."""
     k, time = np.broadcast_arrays(np.asarray(count, float), np.asarray(exposure, float))
     low = np.where(k == 0, 0.0, special.gammaincinv(k, 1 - UPPER))
     high = special.gammaincinv(k + 1, UPPER)
@@ -84,7 +84,7 @@ def poisson_rate(count: ArrayLike, exposure: ArrayLike) -> tuple[np.ndarray, np.
 
 
 def mean_t(mean: ArrayLike, std: ArrayLike, n: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Student's interval from a sample's mean, standard deviation (n - 1) and size; NaN below two values."""
+    """Return Student's interval from a sample's mean, standard deviation (n - 1) and size; NaN below two values."""
     m, s, k = np.broadcast_arrays(np.asarray(mean, float), np.asarray(std, float), np.asarray(n, float))
     size = np.where(k >= 2, k, np.nan)
     half = special.stdtrit(size - 1, UPPER) * s / np.sqrt(size)
@@ -92,7 +92,7 @@ def mean_t(mean: ArrayLike, std: ArrayLike, n: ArrayLike) -> tuple[np.ndarray, n
 
 
 def mean_difference(first: ArrayLike, second: ArrayLike) -> Interval:
-    """Welch's interval of mean(first) - mean(second); a point if neither varies, unknown below two values each."""
+    """Return Welch's interval of mean(first) - mean(second); a point if neither varies, unknown below two values."""
     from scipy import stats
 
     a, b = np.asarray(first, float), np.asarray(second, float)
@@ -137,7 +137,7 @@ def percentiles(draws: np.ndarray, confidence: float = CONFIDENCE) -> Interval:
 
 
 SITES_PER_TARGET = 3
-"""MIL-HDBK-1823A: unflawed sites for each flawed one, at least."""
+"""Least number of unflawed sites for each flawed one, by MIL-HDBK-1823A."""
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ def threshold_for_rate(
     if np.any(np.isnan(scores)) or np.any(np.isposinf(scores)):
         raise UserError("not every highest score is a number", legal="a finite score, or -inf for no finding")
     n, wanted = len(scores), -float(np.expm1(-rate_per_m2 * area_m2))
-    # The margin is for rounding where (n + 1) * wanted is a whole number.
+    # the margin is for rounding where (n + 1) * wanted is a whole number
     k = min(int(np.floor((n + 1) * wanted * (1 + 1e-12))) - 1, n - 1)
     if k < 0:
         what = f"{n} hole-free runs of {area_m2:.2g} m² are too few for a rate of {rate_per_m2:g} per m² of false calls"

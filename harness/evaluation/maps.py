@@ -23,15 +23,15 @@ if TYPE_CHECKING:
     import pandas as pd
 
 VIEWS, REGISTRATION, MERGE = "mapping.views", "mapping.registration.method", "mapping.merge.kind"
-"""The axes that this room knows by name."""
+"""The axes of a study of maps that have a meaning of their own here."""
 CAMERA_UNIT = "source.camera.unit_seed"
 MANY = 50
-"""Frames a view that maps are compared with, where they have them."""
+"""Number of frames a view at which maps are compared, where they have as many."""
 THESIS_REGISTRATION, THESIS_MERGE = "cpd", "grid"
 LARGE_MM = 25.4 * 3 / 8
-"""Diameter from which on two views are said to size better than one."""
+"""Diameter from which two views are said to size better than a single view."""
 FEWEST_BOTH = 2
-"""Repeats in which a hole must be measured in both maps to be compared."""
+"""Number of repeats in which a hole must be measured in both maps to be compared."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,8 @@ def maps_of(tables: ResultTables) -> list[MapSetUp]:
 
 
 def compare_maps(tables: ResultTables, summary: pd.DataFrame) -> pd.DataFrame:
-    """Rows of `compare_set_ups` for all that have a map, with the fields of `MapSetUp`; over runs on the damaged board
-    mean ``views_left_out``, median ``seconds_map``, and ``surface_std_mm``: the surface noise's deviation."""
+    """Return rows of `compare_set_ups` for all that have a map, with the fields of `MapSetUp`; over runs on the damaged
+    board mean ``views_left_out``, median ``seconds_map``, and the surface noise's deviation ``surface_std_mm``."""
     import pandas as pd
 
     maps = pd.DataFrame([asdict(one) for one in maps_of(tables)])
@@ -89,7 +89,7 @@ def compare_maps(tables: ResultTables, summary: pd.DataFrame) -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class Change:
-    """A mean difference (second less first) with its interval over ``n`` repeats."""
+    """A mean difference (second less first), with its interval over ``n`` repeats."""
 
     mean: float
     interval: Interval
@@ -102,7 +102,7 @@ class Change:
 
 
 def change_of(differences: np.ndarray) -> Change:
-    """Average differences, one for each repeat, NaN left out, with Student's interval; unknown below two."""
+    """Average differences of repeats, NaN left out, with Student's interval; it is unknown below two."""
     known = differences[np.isfinite(differences)]
     if len(known) < 2:
         return Change(np.nan, UNKNOWN, 0)
@@ -142,8 +142,8 @@ def size_errors(first: pd.DataFrame, second: pd.DataFrame, measure: Measure = "e
 
 
 def run_ratio(first: pd.DataFrame, second: pd.DataFrame, column: str) -> Change:
-    """Paired change of the natural logarithm of a column of the table of runs on the damaged board: ``exp`` of it is a
-    ratio."""
+    """Return the paired change of the natural logarithm of a column of the table of runs on the damaged board; its
+    ``exp`` is a ratio."""
     return change_of(np.log((_by_repeat(second)[column] / _by_repeat(first)[column]).to_numpy(float)))
 
 
@@ -177,14 +177,14 @@ class MapCase:
         return [one for one in self.maps if not one.is_variation]
 
     def variant(self, views: int, registration: str, merge: str) -> str | None:
-        """Name the set-up. All registrations of a single view are the same, so any of them serves."""
+        """Name the set-up. All registrations of a single view are the same, so that any of them serves."""
         alike = [one for one in self.set_ups if (one.views, one.merge) == (views, merge)]
         named = [one for one in alike if one.registration == registration]
         chosen = named or (alike if views == 1 else [])
         return chosen[0].variant if chosen else None
 
     def frames(self, variant: str) -> list[int]:
-        """List the numbers of frames that this variant was finished with, ascending."""
+        """List the numbers of frames with which this variant was finished, ascending."""
         return sorted(int(n) for n in self.summary["frames"][self.summary["variant"] == variant].unique())
 
     def common_frames(self, *variants: str | None) -> int | None:
@@ -195,7 +195,7 @@ class MapCase:
         return MANY if MANY in shared else max(shared, default=None)
 
     def named(self, views: int, registration: str, merge: str, frames: int | None = None) -> Map | None:
-        """Find the map of that name with so many frames, by default as `common_frames` chooses."""
+        """Find the map of that name with so many frames, by default those that `common_frames` chooses."""
         variant = self.variant(views, registration, merge)
         chosen = self.common_frames(variant) if frames is None else frames
         if variant is None or chosen is None or chosen not in self.frames(variant):
@@ -203,25 +203,25 @@ class MapCase:
         return Map(variant, chosen, views)
 
     def single(self, frames: int | None = None) -> Map | None:
-        """Find one view alone, by the thesis' merging where that was tried."""
+        """Find the map of a single view, by the thesis' merging where that was tried."""
         merges = [THESIS_MERGE, *(one.merge for one in self.set_ups)]
         singles = (self.named(1, THESIS_REGISTRATION, merge, frames) for merge in dict.fromkeys(merges))
         return next((one for one in singles if one is not None), None)
 
     def holes(self, one: Map) -> pd.DataFrame:
-        """Rows of the table of holes of one map."""
+        """Return the rows of one map in the table of holes."""
         return _rows(with_columns(self.tables.holes), one)
 
     def runs(self, one: Map) -> pd.DataFrame:
-        """Rows of the table of runs of one map."""
+        """Return the rows of one map in the table of runs."""
         return _rows(self.tables.runs, one)
 
     def status(self, one: Map) -> dict[str, HoleState]:
-        """State of each hole."""
+        """Return the state of each hole."""
         return found_holes(self.summary, one.variant, one.frames)
 
     def registrations(self, frames: int) -> pd.DataFrame:
-        """Registrations of the set-ups with so many frames."""
+        """Return the registrations of the set-ups with so many frames."""
         rows = self.tables.registrations
         return rows[(rows["frames"] == frames) & rows["variant"].isin([one.variant for one in self.set_ups])]
 
@@ -308,7 +308,7 @@ def ratio_text(change: Change) -> str:
 
 PARTS = ("in_plane", "across")
 UNIT = ["frames", "repeat", "role"]
-"""One draw of noise and of nominal poses: what intervals resample."""
+"""The columns of one draw of noise and of nominal poses, which intervals resample."""
 MOST_REASONS = 3
 
 
@@ -320,7 +320,7 @@ def of_map(registrations: pd.DataFrame, method: str, views: int) -> pd.DataFrame
     rows = registrations[(registrations["method"] == method) & (registrations["view"] < views)]
     if VIEWS not in rows:
         return rows
-    # "all views" counts as more than any number.
+    # "all views" counts as more than any number
     apart = pd.to_numeric(rows[VIEWS], errors="coerce").fillna(np.inf).sub(views).abs()
     order = rows.assign(_apart=apart).sort_values("_apart", kind="stable")
     return order.drop_duplicates([*UNIT, "view"]).drop(columns="_apart").sort_index()

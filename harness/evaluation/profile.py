@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 
 FEWEST_PIXELS = 12
-"""Valid pixels inside the outline below which two shapes cannot be told apart: one ring of pixels is the whole hole."""
+"""Fewest valid pixels inside the outline to distinguish two shapes; with fewer, one ring is the whole hole."""
 FEWEST_VALID = 0.5
-"""Share of valid pixels inside the outline below which those left speak of one side of the hole only."""
+"""Least share of valid pixels inside the outline: fewer may show only one side of the hole."""
 CLEARLY = 0.8
 """A shape fits clearly better when its rms misfit is at most this share of the other's (fixed beforehand)."""
 

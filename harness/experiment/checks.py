@@ -74,7 +74,7 @@ def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Proble
     if config.sensitivity is not None:
         fix = "sweep the key, or run the study once for each value with --set"
         yield Problem("a study cannot have a sensitivity", source.key_place_of(("sensitivity",)), fix=fix)
-    # what is a hit and which rate of false calls is wanted are the study's rules, the same for all its set-ups
+    # what counts as a hit and which rate of false calls is wanted are rules of the study, the same for all set-ups
     for path in config.sweep:
         if path.split(".")[0] == "matching" or path == "threshold" or path.startswith("threshold.calibrate"):
             message = f"`{path}` is a rule of the study and cannot be an axis of it"
@@ -100,7 +100,7 @@ def _target_problems(config: ExperimentConfig, simulated: SimulatedSource, sourc
     drawn = simulated.target if isinstance(simulated.target, DrawnTargetConfig) else None
     try:
         target = _declared(simulated.target)
-    except UserError as error:  # that includes a family of boards that are too full for their damage
+    except UserError as error:  # this includes a family of boards that are too full for their damage
         yield Problem(error.message, source.place_of(TARGET), legal=error.legal, fix=error.fix)
         return
     if found := _unseen(simulated.camera, simulated.views, simulated.target):
@@ -191,7 +191,7 @@ def _flat_field_problems(config: ExperimentConfig, simulated: SimulatedSource, s
     try:
         flat_field, optics = config.capture.flat_field, camera_of(simulated.camera).optics
     except UserError:
-        return  # told with the target's pose
+        return  # reported with the target's pose
     if flat_field is not None and not optics.nearest_m < flat_field.distance_m < optics.farthest_m:
         place = source.place_of(("capture", "flat_field"))
         legal = f"{optics.nearest_m:g} to {optics.farthest_m:g} m"

@@ -118,7 +118,7 @@ FIXED = ("name", "title", "repeats", "study", "sweep", "draws", SWITCHES, "sensi
 
 @dataclass(frozen=True)
 class Setting:
-    """One path set to one value, where in the source that value is written, and what to call it (empty: as it is)."""
+    """One path set to one value, where in the source that value is written, and its name (empty: ``path=value``)."""
 
     path: str
     value: Any
@@ -245,8 +245,8 @@ def _path_problems(path: str, place: Place | None, source: Source, fixed: Iterab
         yield problem
 
 
-def _resolved(draft: Draft, source: Source, all_told: bool) -> tuple[ExperimentConfig | None, list[Problem]]:
-    """Return a point's declaration, or what is wrong with it: at the wrong value, else (``all_told``) at its name."""
+def _resolved(draft: Draft, source: Source, keep_all: bool) -> tuple[ExperimentConfig | None, list[Problem]]:
+    """Return a point's declaration, or what is wrong with it: at the wrong value, else (``keep_all``) at its name."""
     place = source.place_of(draft.named_at)
     located = replace(source, data={k: v for k, v in source.data.items() if k not in ("sweep", "sensitivity")})
     try:
@@ -264,7 +264,7 @@ def _resolved(draft: Draft, source: Source, all_told: bool) -> tuple[ExperimentC
     return config, [
         each if each.place in own else replace(each, message=elsewhere + each.message, place=place)
         for each in found
-        if each.place in own or all_told
+        if each.place in own or keep_all
     ]
 
 

@@ -25,7 +25,7 @@ from harness.vocabulary.provenance import check_version
 
 GAUGE_VERSION = 1
 FEWEST_MARKS = 3
-SIDES = 8  # Directions around a hole in which judged points must lie: else a miss says nothing of its size
+SIDES = 8  # directions around a hole in which judged points must lie; otherwise a miss means nothing
 WORST_FIT_MM = 2.0  # Root mean square distance of marks from their places, beyond which the fit is doubtful
 Length = Annotated[float, Field(gt=0, le=5e3)]
 CoordinateMm = Annotated[float, Field(ge=-5e3, le=5e3)]

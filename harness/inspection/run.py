@@ -123,7 +123,7 @@ def threshold_of(
     return own.threshold, f"from this capture's own null: {calls}", replace(own.evidence, notes=notes)
 
 
-def with_faint_told(judged: Judged, threshold: float) -> Judged:
+def with_faint_warning(judged: Judged, threshold: float) -> Judged:
     """Add a warning where noise explains more of the findings than false calls are expected, in a capture that set its
     own threshold. The logarithm of their number is taken to fall with the square of the score, as normal
     noise's does, through the peaks above the floor and the upper 95 % bound of what is expected at the threshold."""
@@ -142,7 +142,7 @@ def with_faint_told(judged: Judged, threshold: float) -> Judged:
     return replace(judged, evidence=evidence)
 
 
-def with_sizes_told(judged: Judged) -> Judged:
+def with_size_warnings(judged: Judged) -> Judged:
     """Add warnings where findings reach the rim of what is judged, as the rest of them was not seen, and where the room
     behind shows through holes whose rim the camera's filter, as wide as the noise's reach, draws over them."""
     cloud = judged.cloud
@@ -234,7 +234,7 @@ def inspect(arguments: argparse.Namespace) -> int:
     evidence = replace(evidence, warnings=(*doubted, *evidence.warnings))
     threshold, origin, evidence = threshold_of(arguments, detector, cloud, evidence, silent_threshold)
     result = judged(detector, cloud, evidence, threshold)
-    result = with_sizes_told(result if mapped else with_faint_told(result, threshold))
+    result = with_size_warnings(result if mapped else with_faint_warning(result, threshold))
     seen = seen_on(gauge, result, f"{detector.name} {detector.version}", threshold) if gauge else None
     found = (mapped, registrations, detector, settings, result, threshold, origin, seen)
     run = Inspection(arguments, recordings, choices, config, *found)
@@ -275,8 +275,8 @@ def _merged(
     views: Sequence[View],
     choices: Sequence[Choice | None],
 ) -> tuple[Mapped, dict[str, Any]]:
-    """Find targets and marks, told at once as they explain later failures, then register and merge; return also the
-    data of registrations.json. Raises UserError where a view has no target, or for each view that cannot be placed."""
+    """Find targets and marks (printed at once, as they explain later failures), register and merge; return also the
+    data of registrations.json. Raises UserError if a view has no target, or for each view that cannot be placed."""
     from detectors.mapping.merge import Mapped, merge, prepare
     from detectors.registration.by_marks import register_by_marks
     from detectors.registration.register import register
@@ -360,7 +360,7 @@ def _registration_data(mapped: Mapped) -> dict[str, Any]:
 def _print(run: Inspection) -> None:
     cloud, evidence, crop, choice = run.result.cloud, run.result.evidence, run.arguments.crop, run.choices[0]
     recorded = [warning for recording in run.recordings for warning in recording.warnings]
-    # of several views the doubts about their targets were told before they were registered
+    # with several views, doubts about their targets were printed before the registration
     doubts = choice.warnings if run.mapped is None and choice else ()
     of_gauge = run.seen.warnings if run.seen else ()
     told.print_warnings((*recorded, *doubts, *evidence.warnings, *of_gauge))

@@ -45,12 +45,12 @@ from scenes.sensor.unit import taps_of
 
 SEED = 1
 UNIT = CameraConfig(effects=EffectsConfig().model_copy(update={"unit_offset": False, "warm_up_drift": False}))
-"""A simulated unit with the effects that captures of a real one show too."""
+"""Effects of a simulated unit that captures of a real unit show too."""
 STEPS, CLOSE, FARTHEST, FEW_FRAMES = 5, 0.01, 100.0, 12
-"""Steps of the gain's fit, the relative error at which it ends, the largest change, and frames of a step."""
+"""Most steps of the gain's fit, the relative error at which it ends, its largest change, and frames per step."""
 EDGE_SHARE = 2.56
-"""Width of a blurred edge between a tenth and nine tenths of its step, in deviations of the Gaussian."""
-NOT_TOLD = "not determined by the captures"
+"""Width of a blurred edge between a tenth and nine tenths of its step, in standard deviations of the Gaussian."""
+UNKNOWN = "not determined by the captures"
 
 
 def opened_as(camera: str | None, paths: Sequence[Path], intrinsics: str | None, **reading: Any) -> Recording:
@@ -151,16 +151,16 @@ def _step_mm(found: Characteristics) -> float:
 
 def _empirical(found: Characteristics, albedo: float, source: str) -> Iterator[Stated]:
     law, pattern, drops, edge = found.law, found.pattern, found.dropouts, found.edge
-    yield Stated("", "wavelength_nm", 850.0, f"names the albedo of simulated surfaces; {NOT_TOLD}", "M")
+    yield Stated("", "wavelength_nm", 850.0, f"names the albedo of simulated surfaces; {UNKNOWN}", "M")
     for key, value in (("offset_mm", 0.0), ("drift_mm", 0.0), ("drift_min", 20.0), ("drift_ramp", 0.0)):
-        yield Stated("unit", key, value, f"constant error and drift after power-on are {NOT_TOLD}", "M")
+        yield Stated("unit", key, value, f"constant error and drift after power-on are {UNKNOWN}", "M")
     recorded = (law.light_at_1m, source) if found.has_amplitude else (1.0, "amplitudes are not recorded", "M")
     yield Stated("light", "amplitude_at_1m", *recorded)
     yield Stated("light", "albedo", albedo, "assumed of the recorded surface", "M")
     yield Stated("noise", "range_mm", law.range_m / MM, source)
     yield Stated("noise", "sigma_mm", law.sigma_m / MM, source)
     for key, value, error in zip(("range_exponent", "brightness_exponent"), law.exponents, law.errors, strict=True):
-        origin = (f"standard error {error:.2g}; {source}", "O") if np.isfinite(error) else (f"assumed: {NOT_TOLD}", "M")
+        origin = (f"standard error {error:.2g}; {source}", "O") if np.isfinite(error) else (f"assumed: {UNKNOWN}", "M")
         yield Stated("noise", key, value, *origin)
     doubt = "not determined without a flat surface" if pattern is None else "; ".join((source, *pattern.field.warnings))
     yield Stated("fixed_pattern", "deviation_mm", 0.0 if pattern is None else pattern.field.rms_m / MM, doubt)
@@ -170,13 +170,13 @@ def _empirical(found: Characteristics, albedo: float, source: str) -> Iterator[S
         yield Stated(section, "columns", taps_of(both[0]), reason)
     yield Stated("dropouts", "amplitude", np.nan_to_num(drops.amplitude, nan=1.0), source)
     yield Stated("dropouts", "share", drops.share, f"of {int(drops.pixels.sum())} pixels on surfaces; {source}")
-    origin = (f"{edge.lines} lines of pixels across edges; {source}", "O") if edge else (f"edges are {NOT_TOLD}", "M")
+    origin = (f"{edge.lines} lines of pixels across edges; {source}", "O") if edge else (f"edges are {UNKNOWN}", "M")
     blurred = edge is not None and edge.flying_px > 0.05
     yield Stated("edge", "gap_px", edge.gap_px if edge else 0.0, *origin)
     yield Stated("edge", "blur_px", (edge.gap_px + edge.flying_px) / EDGE_SHARE if edge and blurred else 0.0, *origin)
     yield Stated("edge", "least_step_mm", 20.0, "smaller steps are taken to cost no return; not measured", "M")
-    yield Stated("engine", "min_range_mm", 0.0, f"limits of range are {NOT_TOLD}", "M")
-    yield Stated("engine", "max_range_mm", 20_000.0, f"limits of range are {NOT_TOLD}", "M")
+    yield Stated("engine", "min_range_mm", 0.0, f"limits of range are {UNKNOWN}", "M")
+    yield Stated("engine", "max_range_mm", 20_000.0, f"limits of range are {UNKNOWN}", "M")
 
 
 # ---------------------------------------------------------------- a known camera's model, refitted

@@ -26,29 +26,29 @@ from harness.vocabulary.geometry import MM, Cloud, Lens
 from scenes.closed_form import Plane
 
 TOLERANCE_M, LEAST_PLANE_PX = 8 * MM, 2000
-"""A point this near to a plane is on it: a nominal lens bows real walls by 3 mm rms. Pixels of the smallest plane."""
+"""Distance within which a point is on a plane (a nominal lens bows real walls by 3 mm rms); pixels of the least one."""
 EDGE_PX, WIDEST_PX, LEAST_STEP_M = 3, 24, 20 * MM
-"""Pixels nearer to a plane's rim are left out: the camera's filter mixes in what is beyond. Farthest pixels that two
-surfaces at an edge lie apart, and the least step of depth there."""
+"""Pixels nearer to a plane's rim are left out, because the camera's filter mixes in what lies beyond. Then: farthest
+pixels that two surfaces at an edge lie apart, and the least step of depth there."""
 LEAST_BIN_PX = 300
 """Some 12 windows of 5 x 5: the deviation of 20 frames is then known to 5 %."""
 MOST_FRAMES = 300
-"""Frames of a capture that are held in memory: 440 MB of 640 x 576 pixels."""
+"""Most frames of a capture that are held in memory: 440 MB of 640 x 576 pixels."""
 RANGE_CELLS, LIGHT_CELLS, ANGLE_CELL_DEG = 1.08, 1.25, 10.0
-"""Ratios of the ends of a cell of range and of brightness, and width of a cell of angle."""
+"""Ratios of the ends of a cell of range and of a cell of brightness, and width of a cell of angle."""
 TELLING_RATIO = 1.25
-"""Ratio of the largest and the smallest range, or brightness, from which on they tell an exponent."""
+"""Ratio of the largest to the smallest range, or brightness, from which they determine an exponent."""
 LAGS, PATTERN_LAGS, CORRELATED_FRAMES = 12, 40, 16
-"""Pixels to which the correlations of noise and of pattern are followed, and frames that tell the former."""
+"""Pixels over which correlations of noise and pattern are followed, and frames that determine the former."""
 JUMP_M, JUMP_SIGMAS = 3 * MM, 6.0
-"""A frame jumps if it is displaced by more than both: ten times the wander of a static Azure Kinect."""
+"""A frame jumps if its displacement exceeds both: ten times the wander of a static Azure Kinect."""
 ASSUMED = np.array([0.0, 2.0, -0.5])
-"""Exponents where captures do not tell them: of range (read noise, a disparity's error), of brightness (shot noise)."""
+"""Exponents assumed if captures do not determine them: of range (read noise, disparity) and brightness (shot noise)."""
 UNSURE = 0.5
-"""Standard error beyond which an exponent is not told."""
+"""Largest standard error of an exponent that is reported."""
 SLOW, WIDE_PX, COARSE = 0.15, 6.5, 0.35
-"""Correlation of successive frames, reach of neighbours' correlation, and noise by rounding steps, beyond which the
-recording was averaged, smoothed or rounded before it was stored."""
+"""Correlation of successive frames, reach of neighbours' correlation, and ratio of noise to rounding step that show
+that the recording was averaged, smoothed or rounded before it was stored."""
 
 
 @dataclass(frozen=True)
@@ -67,30 +67,30 @@ class StillCapture:
 
     @cached_property
     def steady(self) -> np.ndarray:
-        """(h, w) bool: pixels of the surfaces, without their rims, that most frames give a range."""
+        """Pixels (h, w) bool of the surfaces, without their rims, that have a range in most frames."""
         often = np.isfinite(self.z_m).mean(axis=0) > 0.5
         return often & np.any([inner(mask) for _, mask in self.planes], axis=0) if self.planes else often
 
     @cached_property
     def offsets_m(self) -> np.ndarray:
-        """(n,) displacement of each frame as a whole against the mean of all, metres of z."""
+        """Displacement (n,) of each frame as a whole against the mean of all, in metres of z."""
         middle = np.nanmean(self.z_m[:, self.steady], axis=0, dtype=np.float64)
         return np.array([np.nanmean(z[self.steady] - middle) for z in self.z_m])
 
     @cached_property
     def drift_m(self) -> float:
-        """Change of the frames' displacement over the capture by its robust slope (Theil and Sen)."""
+        """Change of the frames' displacement over the capture, by its robust slope (Theil and Sen)."""
         return float(stats.theilslopes(self.offsets_m)[0]) * (len(self.z_m) - 1)
 
     @cached_property
     def apart_m(self) -> np.ndarray:
-        """(n,) displacement of the frames without the drift."""
+        """Displacement (n,) of the frames without the drift."""
         apart = self.offsets_m - self.drift_m * np.linspace(0, 1, len(self.z_m))
         return np.asarray(apart - np.median(apart))
 
     @cached_property
     def kept(self) -> np.ndarray:
-        """(n,) bool: frames that do not jump."""
+        """Frames (n,) bool that do not jump."""
         return np.abs(self.apart_m) <= max(JUMP_M, JUMP_SIGMAS * 1.4826 * float(np.median(np.abs(self.apart_m))))
 
     @cached_property
@@ -99,7 +99,7 @@ class StillCapture:
 
     @cached_property
     def mean_m(self) -> np.ndarray:
-        """(h, w) mean z of the frames that do not jump; NaN where there is none."""
+        """Mean z (h, w) of the frames that do not jump; NaN where there is none."""
         known = np.isfinite(self._moved_m).any(axis=0)
         mean_m = np.full(known.shape, np.nan)
         mean_m[known] = np.nanmean(self._moved_m[:, known], axis=0)
@@ -107,24 +107,24 @@ class StillCapture:
 
     @cached_property
     def noise_m(self) -> np.ndarray:
-        """(n, h, w) float32: deviations from the mean, displacements of frames taken off; without jumping frames."""
+        """Deviations (n, h, w) float32 from the mean, without frames' displacements and without frames that jump."""
         return np.asarray(self._moved_m - self.mean_m.astype(np.float32))
 
     @cached_property
     def variance_m2(self) -> np.ndarray:
-        """(h, w) temporal variance of z; NaN where unknown."""
+        """Temporal variance (h, w) of z; NaN where unknown."""
         count = np.isfinite(self.noise_m).sum(axis=0)
         square = np.nansum(self.noise_m**2, axis=0, dtype=np.float64)
         return np.where(count > 1, square / np.maximum(count - 1, 1), np.nan)
 
     @cached_property
     def stretch(self) -> np.ndarray:
-        """(h, w) distance along the ray by that along the axis."""
+        """Distance (h, w) along the ray over that along the axis."""
         return np.asarray(np.sqrt(1 + (self.slopes**2).sum(axis=-1)))
 
     @cached_property
     def cosine(self) -> np.ndarray:
-        """(h, w) of the angle of incidence on the planes, 1 elsewhere."""
+        """Cosine (h, w) of the angle of incidence on the planes; 1 elsewhere."""
         cosine = np.ones(self.stretch.shape)
         for plane, mask in self.planes:
             along = plane.normal[2] + self.slopes[mask] @ plane.normal[:2]
@@ -133,7 +133,7 @@ class StillCapture:
 
     @cached_property
     def shapes_m(self) -> tuple[np.ndarray, ...]:
-        """z (h, w) of each flat surface as a smooth fit, with its relief and the lens' error, and beyond its pixels."""
+        """Smooth fit z (h, w) of each flat surface, with its relief and the lens' error, also beyond its pixels."""
         shapes_m = []
         for plane, mask in self.planes:
             use, flat_m = mask & np.isfinite(self.mean_m), plane.z_along_m(self.slopes)
@@ -272,7 +272,7 @@ def noise_law(cells: Sequence[NoiseCell]) -> RangeLaw:
         doubtful[0] = False
         if not doubtful.any():
             break
-        # on one slanted surface range and brightness change together: the one that is known less is not varied
+        # on one slanted surface range and brightness change together: the exponent that is known less is not varied
         worst = int(np.argmax(np.where(doubtful, errors, -1.0)))
         varied[worst], law[worst] = False, ASSUMED[worst] if errors[worst] > UNSURE else 0.0
     facing, number = y - law[2] * columns[:, 2], np.floor(log_r / np.log(RANGE_CELLS) + 1e-9)
@@ -334,7 +334,7 @@ class SurfaceFigures:
 
     @property
     def where(self) -> str:
-        """Name of the surface."""
+        """The name of the surface."""
         return f"{self.capture}, surface {self.number} at {self.distance_m:.2f} m, {self.angle_deg:.0f} deg"
 
 
@@ -344,7 +344,7 @@ def surfaces_of(capture: StillCapture) -> Iterator[SurfaceFigures]:
         pixels = np.flatnonzero((inner(mask) & capture.steady).ravel())
         if len(pixels) < LEAST_BIN_PX:
             continue
-        few = pixels[:: max(1, len(pixels) // 20_000)]  # tell the same to a per cent
+        few = pixels[:: max(1, len(pixels) // 20_000)]  # these tell the same to a per cent
         z_m, noise = (stack.reshape(-1, mask.size)[:, few] for stack in (capture.z_m[capture.kept], capture.noise_m))
         mean_m, slopes = capture.mean_m.ravel()[few], capture.slopes.reshape(-1, 2)[few]
         temporal = bench.jackknifed(noise[:, None], lambda part: bench.temporal_sigma_m(part) / MM)
@@ -382,7 +382,7 @@ def edge_of(captures: Sequence[StillCapture]) -> EdgeFigures | None:
         labels = np.zeros(capture.stretch.shape, int)
         share = np.isfinite(capture.z_m).mean(axis=0)
         for number, (plane, mask) in enumerate(capture.planes, start=1):
-            # of a simulated capture other pixels than those of the mask may be lost or off the surface
+            # in a simulated capture other pixels than the mask's may be lost or off the surface
             off_m = np.abs(capture.mean_m - plane.z_along_m(capture.slopes))
             labels[mask & (share >= 0.5) & (off_m <= bench.GROWN * TOLERANCE_M)] = number
         images = labels, share, capture.mean_m
@@ -395,7 +395,7 @@ def edge_of(captures: Sequence[StillCapture]) -> EdgeFigures | None:
                     counts = (1 - between).sum(), between.sum(), abs(z_m[row, first] - z_m[row, last])
                     if counts[2] > LEAST_STEP_M:
                         lines[capture.name, frozenset(line[[last, first]])][axis].append(counts)
-    # along the axis that cuts across more of the edge: the other one meets it aslant
+    # take the axis that cuts across more of the edge: the other one meets it aslant
     rows = np.array([row for both in lines.values() for row in max(both, key=len)])
     if len(rows) < LEAST_BIN_PX // 10:
         return None
@@ -427,12 +427,12 @@ class Characteristics:
 
     @property
     def frames(self) -> int:
-        """Frames of all captures."""
+        """The frames of all captures."""
         return sum(len(capture.z_m) for capture in self.captures)
 
     @property
     def jumps_m(self) -> np.ndarray:
-        """(k,) displacement of the frames that jump."""
+        """Displacement (k,) of the frames that jump."""
         return np.concatenate([np.abs(capture.apart_m[~capture.kept]) for capture in self.captures])
 
     @property

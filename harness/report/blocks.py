@@ -59,7 +59,7 @@ def template(name: str, folder: Path | None = None) -> Template:
 def page(
     title: str, answer: str, body: Iterable[Markup], under: Iterable[Markup] = (), warnings: Iterable[str] = ()
 ) -> str:
-    """A whole page: ``title``, ``warnings``, the ``answer`` in large letters, what stands ``under`` it, the body."""
+    """A whole page: ``title``, ``warnings``, the ``answer`` in large letters, what follows ``under`` it, the body."""
     parts = {"body": joined(body), "under": joined(under), "warnings": list(warnings)}
     return template("page.html").render(title=title, answer=answer, **parts)
 
@@ -147,7 +147,7 @@ def plain(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value, default=str)
 
 
-# Okabe and Ito's palette (Color Universal Design, 2008): told apart with any of the common colour blindnesses.
+# Okabe and Ito's palette (Color Universal Design, 2008): distinguishable with all common colour blindnesses
 BLUE, ORANGE, GREEN, RED, SKY, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7"
 INK, GREY, PALE = "#1d2530", "#6b7480", "#e9ecef"
 DAMAGE = "#ff00ff"
@@ -175,7 +175,7 @@ COLOURS, MARKERS = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE), "osD^vP"
 
 def svg(name: str, size_in: tuple[float, float], alt: str, draw: Callable[[Figure], None]) -> str:
     """Draw a figure of ``size_in`` (width, height) inches; the text of an inline ``<svg>`` with ``alt`` as its label,
-    and the values of its lines for a pointer that stands on them. ``name`` seeds the ids inside, so that several
+    and the values of its lines for a pointer over them. ``name`` seeds the ids inside, so that several
     figures live on one page; no date, no random number gets in."""
     buffer = io.StringIO()
     drawn = _save(buffer, size_in, draw, name, format="svg", metadata={"Date": None, "Creator": None})

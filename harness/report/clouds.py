@@ -152,7 +152,7 @@ def _example_cut(one: StudyExample, titles: Mapping[Where, str]) -> Cut:
 
 
 def _cuts(name: str, rows: Sequence[Sequence[Cut | None]], alt: str) -> str:
-    """Damages on one scale of colours; the axes are in mm from the middle of each cut."""
+    """Draw damages on one scale of colours; the axes are in mm from the middle of each cut."""
     cuts = [cut for line in rows for cut in line if cut is not None]
     norm = residual_norm(np.concatenate([cut.residual_mm.ravel() for cut in cuts]))
 

@@ -1,4 +1,4 @@
-"""A comparison of two studies: one table for terminal and page, one sentence for all, data for programs."""
+"""Presents a comparison of two studies: as a table for terminal and page, as a sentence, and as data for programs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from harness.tables.text import Grid, Tone, mm, p_value
 from harness.vocabulary.files import jsonable
 
 COMPARISON_VERSION = 1
-SAID: tuple[Mark, ...] = ("newly failing", "newly working", "no limit", "not comparable")
+EXPLAINED: tuple[Mark, ...] = ("newly failing", "newly working", "no limit", "not comparable")
 TONES: dict[Mark, Tone] = {"worse": "bad", "newly failing": "bad", "better": "good", "newly working": "good"}
 TONES |= {"only in first": "open", "not comparable": "open"}
 
@@ -66,21 +66,21 @@ COMPARED = Table(
     kind="limits compared",
 )
 TESTS = (
-    "Lost, won: inspections that the first alone, and the second alone, found. The p beside them is twice the smaller "
-    "of two: of a sign-flip test of hits, with boards, not damages, as the units, and of Student's t of the change of "
-    "a90 over 500 draws of boards; where the studies have different boards, the share of draws of a90. The p of false "
-    "calls is of a sign-flip test where frames and threshold are the same; "
-    "else it allows for the luck of each calibration. Signal: median change of the signals of damage over the signal "
-    "from which damage is found; its p is of a normal test with the scatter over boards and of both calibrations. All "
-    "are one-sided, of being worse, and adjusted. 95 %: of the change of a90, boards drawn again."
+    "Lost, won: inspections with a hit in the first study only, and in the second only. The p beside them is twice the "
+    "smaller of two: that of a sign-flip test of hits with boards (not damages) as units, and that of Student's t of "
+    "the change of a90 over 500 draws of boards. If the studies have different boards, it is the share of draws of "
+    "a90. The p of false calls is that of a sign-flip test if frames and threshold are the same; otherwise it allows "
+    "for the error of each calibration. Signal: median change of the signals of damage, relative to the signal from "
+    "which damage is found; its p is that of a normal test with the scatter over boards and of both calibrations. All "
+    "p are one-sided (for being worse) and adjusted. 95 %: interval of the change of a90 over draws of boards."
 )
 
 
 def compare_html(comparison: Comparison, command: str) -> str:
-    """The page as text: answer, table, where both studies come from. It needs no network."""
+    """Return the page as text: answer, table, and the origin of both studies. It needs no network."""
     names = " and ".join(dict.fromkeys((comparison.first.name, comparison.second.name)))
     origins = zip(("study", "commit", "seed"), _origin(comparison.first), _origin(comparison.second), strict=True)
-    words = fold("What verdicts and columns say", note(rule(comparison)), note(TESTS))
+    words = fold("Meaning of verdicts and columns", note(rule(comparison)), note(TESTS))
     body = [heading("Set-ups"), COMPARED.grid(comparison.rows).html(), words, heading("Origin")]
     body += [Grid.of(("", "first", "second"), origins, left=3).html(), *command_of(command)]
     under = [note(f"{remark[0].upper()}{remark[1:]}.") for remark in remarks(comparison)]
@@ -88,24 +88,23 @@ def compare_html(comparison: Comparison, command: str) -> str:
 
 
 def compare_parts(comparison: Comparison) -> list[str | Grid]:
-    """Return what a terminal shows: table, remarks, the answer."""
+    """Return the parts for a terminal: table, remarks and answer."""
     return [COMPARED.grid(comparison.rows), "", *remarks(comparison), answer(comparison)]
 
 
 def rule(comparison: Comparison) -> str:
-    """Return what the marks mean."""
+    """Return the meaning of the marks."""
     return (
-        f"Worse (+): a90, the rate of false calls, or what is needed over the signals, has grown by more than "
-        f"{100 * (MARGIN - 1):.0f} %, and a test "
-        f"says that it is not by chance (p < {comparison.alpha:g} by Holm over all set-ups and questions). Better "
-        "(-): likewise for a90. ~: beyond that margin, but it may be chance. !: no limit any more, or more failed "
-        "trials. *: a limit for the first time. x: not comparable. < and >: in the first, in the second "
-        "study only."
+        f"Worse (+): a90, the rate of false calls, or the threshold over the signals has grown by more than "
+        f"{100 * (MARGIN - 1):.0f} %, and a test shows that this is not by chance (p < {comparison.alpha:g}, adjusted "
+        "by Holm's method over all set-ups). Better (-): the opposite for a90. ~: beyond that margin, but possibly by "
+        "chance. !: the limit is lost, or more trials failed. *: a limit for the first time. x: not comparable. < and "
+        ">: only in the first study, only in the second."
     )
 
 
 def answer(comparison: Comparison) -> str:
-    """The comparison in one sentence."""
+    """Return the comparison in one sentence."""
     rows = comparison.rows
     worse = [row for row in rows if row.is_worse]
     if worse:
@@ -117,8 +116,8 @@ def answer(comparison: Comparison) -> str:
 
 
 def remarks(comparison: Comparison) -> list[str]:
-    """Reasons of the marks in `SAID`, and what differs between the studies."""
-    reasons = [f"{row.label}: {row.mark}, {row.why}" for row in comparison.rows if row.mark in SAID and row.why]
+    """Return the reasons for the marks in `EXPLAINED`, and the differences between the studies."""
+    reasons = [f"{row.label}: {row.mark}, {row.why}" for row in comparison.rows if row.mark in EXPLAINED and row.why]
     pairs = [row for row in comparison.rows if row.first is not None and row.second is not None]
     by_change: dict[str, list[str]] = {}
     for row in pairs:
@@ -129,7 +128,7 @@ def remarks(comparison: Comparison) -> list[str]:
 
 
 def compare_data(comparison: Comparison) -> dict[str, Any]:
-    """The comparison as JSON's types; what is not a number is None."""
+    """Return the comparison as JSON's types; numbers that are not finite become None."""
     data: dict[str, Any] = {"comparison_version": COMPARISON_VERSION}
     for name, study in (("first", comparison.first), ("second", comparison.second)):
         data[name] = {"name": study.name, "digest": study.digest, "commit": study.provenance.get("commit")}

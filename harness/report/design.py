@@ -205,7 +205,7 @@ def save_design_png(path: Path, design: StudyDesign) -> None:
 
 
 def _draw(canvas: Figure, design: StudyDesign) -> None:
-    """The limit to expect against the number of targets (median, 10-90 %), and the sizes on the guessed curve."""
+    """Draw the expected limit against the number of targets (median, 10-90 %), and the sizes on the guessed curve."""
     (left, right), (low, high), plan = canvas.subplots(1, 2), design.range_of_sizes, design.recommended
     places, true_size = np.arange(len(design.plans)), plan.true_size
     # infinite where none is demonstrated

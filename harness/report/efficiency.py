@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
 STYLES = ("-", "--", "-.", ":")
 CLASSES = 8
-"""Classes of d' with equally many damages, whose shares of hits are drawn."""
+"""Number of classes of d', with equally many damages, whose shares of hits are drawn."""
 LEFT = 0.5
-"""Left end of the axis of d': what has less is found by chance alone."""
+"""Left end of the axis of d': damage with less is found by chance alone."""
 READ = (
     "Efficiency: (d' at which the ideal observer finds the share / d' at which the detector does) squared, by depth "
     "alone. d' is the ideal observer's signal at a damage over the deviation of its statistic. The ideal observer "

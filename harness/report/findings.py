@@ -167,7 +167,7 @@ def ply_bytes(cloud: Cloud, detections: Sequence[Detection]) -> bytes:
 MODELLED = ("diameter", "diameter_se", "depth", "depth_se", "centre", "centre_se")
 WIDTH_IN, DPI = 11.0, 150
 TAKEN, OTHERS = "#ff00ff", ("#ff9f1c", "#2ec4b6", "#ffee32", "#4cc9f0", "#f94144", "#90be6d", "#bdb2ff")
-"""Colours that stand apart from grey and from one another, also for people who see red and green alike."""
+"""Colours that can be told from grey and from one another, also with red-green blindness."""
 Box = tuple[float, float, float, float]
 
 
@@ -273,7 +273,7 @@ def _height_in(box: Box) -> float:
 
 
 def _around(cloud: Cloud, part: np.ndarray) -> Box:
-    """(left, right, bottom, top) of a part (h, w) bool of the cloud's grid and a twelfth of it around."""
+    """Return (left, right, bottom, top) of a part (h, w) bool of the cloud's grid with a twelfth of it around."""
     left, right, bottom, top = _edges(cloud)
     rows, columns = np.nonzero(part)
     if not cloud.organised or not len(rows):
@@ -286,7 +286,7 @@ def _around(cloud: Cloud, part: np.ndarray) -> Box:
 
 
 def _edges(cloud: Cloud) -> Box:
-    """(left, right, bottom, top) of the axes: sensor pixels, or millimetres without a grid; down is positive."""
+    """Return (left, right, bottom, top) of the axes: sensor pixels, or millimetres without a grid; down is positive."""
     if cloud.organised:
         region = cloud.region
         return region.col0 - 0.5, region.col1 - 0.5, region.row1 - 0.5, region.row0 - 0.5
@@ -324,7 +324,7 @@ def _bytes(rgb: Any) -> np.ndarray:
 
 
 def _view(grid: Cloud) -> np.ndarray:
-    """(h, w, 3) bytes: colour, else amplitude, else depth."""
+    """Return (h, w, 3) bytes: colour, else amplitude, else depth."""
     if grid.rgb is not None and np.isfinite(grid.rgb).any():
         return _bytes(grid.rgb)
     values = -grid.points_m[..., 2]

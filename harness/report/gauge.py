@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 MM_PER_INCH = 25.4
 PAPER_MM = {"A4": (210.0, 297.0), "A3": (297.0, 420.0), "letter": (215.9, 279.4)}
 MARGIN_MM, FOOT_MM, OVERLAP_MM = 10.0, 12.0, 10.0
-"""Unprinted rim of a sheet, height of the line with the scale bar, and what neighbouring tiles show both."""
+"""Unprinted rim of a sheet, height of the line with the scale bar, and strip that neighbouring tiles share."""
 SCALE_MM = 100.0
 
 
@@ -94,7 +94,7 @@ def template_pdf(boards: Any, dictionary: str, paper: str) -> bytes:
 
 
 def _frame(axes: Axes, at: tuple[float, float, float, float], title: str) -> None:
-    """Clip what lies beyond a tile, and draw its cutting corners, scale bar and name."""
+    """Clip the parts beyond a tile, and draw its cutting corners, scale bar and name."""
     from matplotlib.patches import Rectangle
 
     left, low, wide, high = at

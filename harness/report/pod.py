@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_MARKS = 2000
-"""Marks of inspections that a figure draws one by one; more of them are one picture within it."""
+"""Most inspections that a figure draws as single marks; more of them form one picture within it."""
 STRIPE = 0.10
 """Height of the stripes above 1 and below 0 in which hits and misses are spread, in units of POD."""
 VALIDITY = (
@@ -115,7 +115,7 @@ def _bound_text(bound: Bound, unit: str, digits: int = 2) -> str:
 
 
 def _digits(statement: PodStatement) -> int:
-    """Three digits where a90 and its bound are so near that the third says something, else two."""
+    """Return three digits where a90 and its bound are so near that the third says something, else two."""
     return 3 if 2 * (statement.bound.value - statement.a90) <= ROUGH * statement.a90 else 2
 
 
@@ -153,7 +153,7 @@ def plain(text: str) -> str:
 
 
 def _plan(statement: PodStatement) -> tuple[tuple[float, float], Callable[[Figure], None]]:
-    """Size in inches, and what draws it: one panel, or two where there are signals to see."""
+    """Write the figure as a PNG: one panel, or two where there are signals to see."""
 
     def draw(figure: Figure) -> None:
         panels = figure.subplots(1, 2 if statement.signal else 1, squeeze=False)[0]
@@ -249,7 +249,7 @@ def draw_signals(axes: Axes, statement: PodStatement) -> None:
 
 
 def _log_sizes(axes: Axes, sizes: np.ndarray) -> None:
-    """A logarithmic axis whose numbers are written out."""
+    """Set a logarithmic axis whose numbers are written out."""
     axes.set_xscale("log")
     plain_numbers(axes.xaxis, (1, 2, 5) if sizes[-1] / sizes[0] < 1000 else (1,))
 

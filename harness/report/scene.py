@@ -11,7 +11,7 @@ from harness.report.blocks import template
 from harness.vocabulary.path_names import camera_title, value_text
 
 BEHIND = ("source.target.backing.distance_mm", "source.target.backing_distance_mm")
-"""Paths that say how far behind a declared target a surface stands."""
+"""Paths that say how far a surface stands behind a declared target."""
 
 
 def scene_svg(facts: Mapping[str, Any]) -> Markup:
@@ -33,7 +33,7 @@ def scene_svg(facts: Mapping[str, Any]) -> Markup:
 
 
 def _values(facts: Mapping[str, Any], path: str) -> list[Any]:
-    """The values of a setting: those of its axis, or the one of the experiment; empty where it has none."""
+    """Return the values of a setting: those of its axis, or the experiment's single value; empty where it has none."""
     if path in (axes := facts.get("sweep") or {}):
         return [value for value in axes[path] if value is not None]
     value: Any = facts

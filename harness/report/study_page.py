@@ -102,7 +102,7 @@ def depth_limits_figure(results: Sequence[SetUpResult]) -> str:
 
 
 def _span(limits: Sequence[SetUpLimit]) -> tuple[float, float]:
-    """The sizes inspected with 4 % of them on either side; of a single size a tenth of it."""
+    """Return the range of sizes inspected with 4 % of it on either side; of a single size a tenth of it."""
     sizes = np.concatenate([limit.record.inspected.size_mm for limit in limits])
     if not len(sizes):
         return 0.0, 1.0
@@ -206,7 +206,7 @@ def axis_figure(axis: study.AxisGroup, name: str) -> str:
             axes.set_xscale("log")
             axes.minorticks_off()
         labels = [f"{value:g}" for value in axis.values] if axis.numeric else [
-            plain(fill(shorten(axis.told(value), 60, placeholder=" …"), 18, break_long_words=False))
+            plain(fill(shorten(axis.words(value), 60, placeholder=" …"), 18, break_long_words=False))
             for value in axis.values
         ]  # fmt: skip
         axes.set_xticks(places, labels)
@@ -305,7 +305,7 @@ def _axis_caption(group: study.AxisGroup) -> str:
 
 
 def _surface_notes(result: StudyResult) -> list[str]:
-    """Reasons why there is no surface over diameter and depth, or what to know beside one, with their set-ups."""
+    """Return reasons why there is no surface over diameter and depth, or what to know beside it, with their set-ups."""
     reasons: dict[str, list[str]] = {}
     for one in result.set_ups:
         why = f"No surface: {one.surface_why}" if one.surface is None else one.surface.note

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 Summaries = Mapping[Table, "pd.DataFrame"]
 LISTS = ("found", "undecided", "reasons")
-"""Columns whose values are lists, until they are written."""
+"""Columns whose values are lists until they are written."""
 
 
 def is_thesis(facts: Mapping[str, Any]) -> bool:

@@ -14,7 +14,7 @@ from harness.vocabulary.files import write_text
 
 MOST_POINTS = 150_000
 VIEW_COLOURS = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE, "#F0E442", "#332288", "#882255", "#44AA99")
-"""Okabe and Ito's, then four of Tol's muted ones; further views begin anew."""
+"""Okabe and Ito's colours, then four of Tol's muted ones; further views begin anew."""
 SEVERAL_CODE = 255
 RESIDUAL_STEP_MM = 0.01
 NO_RESIDUAL = -32768
@@ -82,7 +82,7 @@ def packed(scene: Scene3d) -> dict[str, Any]:
     points = scene.points_mm[kept].astype(float) * turn
     low, high = points.min(axis=0), points.max(axis=0)
     step = np.maximum((high - low) / 65535, 1e-9)
-    # how far apart points lie across the line of sight, were they spread evenly over what they span
+    # mean distance of points across the line of sight if they were spread evenly over their extent
     span = high[:2] - low[:2]
     pitch = float(np.sqrt(max(span[0] * span[1], 1e-6) / len(points)))
     residual = view = None
@@ -126,7 +126,7 @@ def packed(scene: Scene3d) -> dict[str, Any]:
 
 
 def _kept(scene: Scene3d) -> np.ndarray:
-    """Indices of the points to show, ascending."""
+    """Return the indices of the points to show, ascending."""
     finite = np.flatnonzero(np.isfinite(scene.points_mm).all(axis=1))
     if not len(finite):
         raise ValueError("no finite point to show")

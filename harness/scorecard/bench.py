@@ -24,7 +24,7 @@ from scenes.sensor.source import SimulatedUnit
 
 SEED = 1
 NOISE = NO_EFFECTS.model_copy(update={"noise": True, "ambient": True, "saturation": True})
-"""The noise of each pixel, which the calibration point speaks of, without traits of a unit or of a frame."""
+"""Noise of each pixel, to which the calibration point refers, without traits of a unit or of a frame."""
 STEADY = EffectsConfig().model_copy(update={"frame_jumps": False})
 PATTERNED = NOISE.model_copy(update={"fixed_pattern": True})
 GROUPS = 10
@@ -87,7 +87,7 @@ class FrameStack:
 
 @dataclass(frozen=True)
 class Reading:
-    """A value and its two-sided 95 % interval (unknown where nothing repeats); ``nan`` where there was no data."""
+    """A value and its two-sided 95 % interval (unknown where nothing repeats); ``nan`` where there are no data."""
 
     value: float
     interval: Interval = UNKNOWN
@@ -97,8 +97,8 @@ NOTHING = Reading(float("nan"))
 
 
 def jackknifed(frames: np.ndarray, statistic: Callable[[np.ndarray], float], groups: int = GROUPS) -> Reading:
-    """``statistic`` of ``frames`` (n, ...) with Student's interval from the delete-a-group jackknife over frames, which
-    must be independent; unknown below 4 frames. Source: Efron and Tibshirani 1993, chapter 11."""
+    """Return ``statistic`` of ``frames`` (n, ...) with Student's interval from the delete-a-group jackknife over
+    frames, which must be independent; unknown below 4 frames. Source: Efron and Tibshirani 1993, chapter 11."""
     from scipy.stats import t
 
     value, g = float(statistic(frames)), min(groups, len(frames) // 2)
@@ -111,7 +111,7 @@ def jackknifed(frames: np.ndarray, statistic: Callable[[np.ndarray], float], gro
 
 
 def mean_of(values: ArrayLike) -> Reading:
-    """The mean of independent values with Student's interval; values that are NaN are left out."""
+    """Return the mean of independent values with Student's interval; values that are NaN are left out."""
     known = np.asarray(values, float)
     known = known[np.isfinite(known)]
     if known.size < 2:
@@ -121,7 +121,7 @@ def mean_of(values: ArrayLike) -> Reading:
 
 
 def share_of(hits: np.ndarray, pixels_each: float) -> Reading:
-    """The share of true values among ``hits`` with Wilson's interval, ``pixels_each`` neighbours counting as one."""
+    """Return the share of true ``hits`` with Wilson's interval, ``pixels_each`` neighbours counting as one."""
     trials = hits.size / pixels_each
     low, high = wilson(hits.mean() * trials, trials)
     return Reading(float(hits.mean()), Interval(float(low), float(high)))
@@ -136,10 +136,10 @@ MOST_PLANES = 6
 
 
 def robust_inverse_fit(basis: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients c with 1/z = basis c, and which points count, by Tukey's bisquare on the residuals of z."""
+    """Return coefficients c with 1/z = basis c, and which points count, by Tukey's bisquare on residuals of z."""
     weight = np.ones_like(z)
     for _ in range(15):
-        # an error of z is z^2 times one of 1/z
+        # an error of z is z^2 times an error of 1/z
         row = weight * z**4
         coefficients = np.linalg.lstsq(basis.T @ (basis * row[:, None]), basis.T @ (row / z), rcond=None)[0]
         residual = z - 1 / (basis @ coefficients)
@@ -154,7 +154,7 @@ def _with_ones(slopes: np.ndarray) -> np.ndarray:
 
 
 def fit_plane(z_m: np.ndarray, slopes: np.ndarray) -> Plane:
-    """The plane through points of z (n,) on rays with ``slopes`` (n, 2), robust against a minority of others."""
+    """Return the plane through points of z (n,) on rays with ``slopes`` (n, 2), robust against a minority."""
     (a, b, c), _ = robust_inverse_fit(_with_ones(slopes), z_m)
     return Plane(float(1 / a), float(-b / a), float(-c / a))
 
@@ -162,9 +162,9 @@ def fit_plane(z_m: np.ndarray, slopes: np.ndarray) -> Plane:
 def find_planes(
     z_m: np.ndarray, slopes: np.ndarray, tolerance_m: float, least_px: int
 ) -> list[tuple[Plane, np.ndarray]]:
-    """The planes of a depth image with the connected pixels (h, w) bool on each, largest first, by RANSAC. ``z_m`` (h,
-    w), NaN where unknown. Points within ``tolerance_m`` of a plane belong to it, and connected points up to `GROWN`
-    times as far. Planes of fewer than ``least_px`` pixels are left out. The same image gives the same planes."""
+    """Return the planes of a depth image with the connected pixels (h, w) bool on each, largest first, by RANSAC.
+    ``z_m`` (h, w), NaN where unknown. Points within ``tolerance_m`` of a plane belong to it, and connected points up to
+    `GROWN` times as far. Planes of fewer than ``least_px`` pixels are left out. Equal images give equal planes."""
     basis = _with_ones(slopes)
     left = np.isfinite(z_m) & np.isfinite(slopes).all(axis=-1)
     found: list[tuple[Plane, np.ndarray]] = []
@@ -188,7 +188,7 @@ def find_planes(
 def _best_candidate(
     z_m: np.ndarray, basis: np.ndarray, left: np.ndarray, tolerance_m: float, number: int
 ) -> np.ndarray:
-    """(3,) coefficients of 1/z of the plane through three near points that most of the screened pixels lie on."""
+    """Return (3,) coefficients of 1/z of the plane through three near points with most of the screened pixels."""
     rng = random_stream(0, "planes", number)
     points = np.argwhere(left)
     shift = rng.integers(-TRIPLE_PX, TRIPLE_PX + 1, (CANDIDATES, 3, 2))
@@ -206,7 +206,7 @@ def _best_candidate(
 
 
 def _distance_m(inverse: np.ndarray, basis: np.ndarray, z_m: np.ndarray) -> np.ndarray:
-    """Distance of points from the plane with the coefficients ``inverse`` (..., 3) of 1/z; infinite for NaN."""
+    """Return the distance of points from the plane with coefficients ``inverse`` (..., 3) of 1/z; infinite for NaN."""
     with np.errstate(invalid="ignore"):
         distance = np.abs(z_m * (inverse * basis).sum(axis=-1) - 1) / np.linalg.norm(inverse, axis=-1)
     return np.nan_to_num(distance, nan=np.inf)
@@ -217,18 +217,18 @@ SURFACE_DEGREE = 5
 
 
 def often_valid(z_m: np.ndarray, where: np.ndarray | bool) -> np.ndarray:
-    """(h, w) bool: the pixels of ``where`` that count."""
+    """Return (h, w) bool: the pixels of ``where`` that count."""
     return where & (np.isfinite(z_m).sum(axis=0) >= max(2, len(z_m) / 2))
 
 
 def temporal_sigma_m(z_m: np.ndarray, where: np.ndarray | bool = True) -> float:
-    """Standard deviation over frames (n - 1), rms over the pixels that count; NaN where none does."""
+    """Return the standard deviation over frames (n - 1), rms over the pixels that count; NaN where none does."""
     use = often_valid(z_m, where)
     return float(np.sqrt(np.nanvar(z_m[:, use], axis=0, ddof=1).mean())) if use.any() else float("nan")
 
 
 def deviations(z_m: np.ndarray, where: np.ndarray | bool, keep_jitter: bool) -> np.ndarray:
-    """(n, h, w) deviations from each pixel's mean (less each frame's unless kept), 0 at pixels that do not count."""
+    """Return deviations (n, h, w) from pixel means (less each frame's unless kept), 0 at pixels that do not count."""
     use = often_valid(z_m, where)
     d = np.zeros_like(z_m)
     d[:, use] = z_m[:, use] - np.nanmean(z_m[:, use], axis=0)
@@ -238,7 +238,7 @@ def deviations(z_m: np.ndarray, where: np.ndarray | bool, keep_jitter: bool) -> 
 
 
 def covariance(d: np.ndarray, where: np.ndarray, lag_x: int, lag_y: int) -> tuple[float, float]:
-    """(mean product, mean square) of pairs of pixels (lag_x, lag_y) apart, both inside ``where``; NaN without pairs."""
+    """Return (mean product, mean square) of pairs of pixels (lag_x, lag_y) apart, both in ``where``; NaN for none."""
     h, w = where.shape
     first, second = (slice(h - lag_y), slice(w - lag_x)), (slice(lag_y, h), slice(lag_x, w))
     both = where[first] & where[second]
@@ -250,13 +250,13 @@ def covariance(d: np.ndarray, where: np.ndarray, lag_x: int, lag_y: int) -> tupl
 
 
 def correlation(d: np.ndarray, where: np.ndarray, lag_x: int, lag_y: int) -> float:
-    """Correlation of deviations of pixels (lag_x, lag_y) apart; NaN where there is none."""
+    """Return the correlation of deviations of pixels (lag_x, lag_y) apart; NaN where there is none."""
     product, square = covariance(d, where, lag_x, lag_y)
     return product / square if square > 0 else float("nan")
 
 
 def correlation_at(z_m: np.ndarray, where: np.ndarray | bool, lag_x: int, lag_y: int) -> float:
-    """Correlation of the temporal noise of pixels (lag_x, lag_y) apart, with what a whole frame has in common."""
+    """Return the correlation of the temporal noise of pixels (lag_x, lag_y) apart, with what a frame shares."""
     return correlation(deviations(z_m, where, keep_jitter=True), often_valid(z_m, where), lag_x, lag_y)
 
 
@@ -269,8 +269,8 @@ class FixedPattern:
 
 
 def fixed_pattern(z_m: np.ndarray, where: np.ndarray, slopes: np.ndarray, lags: int = 20) -> FixedPattern:
-    """The fixed pattern of a wall: average, minus a robust surface of degree 5 in 1/z, minus left temporal noise.
-    ``z_m`` (n, h, w), every pixel of ``where`` valid in every frame; ``slopes`` (h, w, 2)."""
+    """Return the fixed pattern of a wall: average, minus a robust surface of degree 5 in 1/z, minus left temporal
+    noise. ``z_m`` (n, h, w), every pixel of ``where`` valid in every frame; ``slopes`` (h, w, 2)."""
     average = z_m.mean(axis=0)[where]
     # Legendre products up to total degree 5 over the slopes, scaled to -1..1
     middle, half = slopes[where].mean(axis=0), np.ptp(slopes[where], axis=0) / 2

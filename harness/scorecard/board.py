@@ -1,12 +1,12 @@
-"""A declared drilled board beside a real capture of it: noise, fixed pattern, depth of the holes, detections.
+"""Compares a declared drilled board with a real capture of it: noise, fixed pattern, depth of the holes, detections.
 
-Every set-up of an experiment is simulated and, where the capture was aligned to the colour camera, resampled onto its
-pixels. One analysis is applied to both, about each declared hole: a quadratic surface is fitted to a ring around it,
-and the hole's peak is the largest deviation behind that surface near its centre. Detectors see whole images. Nothing is
-fitted: set-ups are declared, and all of them are shown.
+Every set-up of an experiment is simulated and, if the capture was aligned to the colour camera, resampled to its
+pixels. The same analysis is applied to both around each declared hole: a quadratic surface is fitted to a ring around
+it, and the hole's peak is the largest deviation behind that surface near its centre. Detectors see whole images. No
+parameter is fitted: set-ups are declared, and all of them are shown.
 
-Not modelled: objects on the board, the board's relief, what the maker's alignment does between two surfaces (here the
-depth image is interpolated linearly where the board's plane projects to)."""
+Not modelled: objects on the board, the board's relief, and the maker's alignment between two surfaces (here the depth
+image is interpolated linearly where the board's plane projects to)."""
 
 from __future__ import annotations
 
@@ -44,30 +44,30 @@ if TYPE_CHECKING:
     from detectors.recordings import Recording
 
 PEAK_MM, RING_MM = 6.0, (6.5, 13.5)
-"""Distances from a hole's centre on the board: where its peak is looked for, and the ring of the face around it."""
+"""Distances from a hole's centre on the board: the largest for its peak, and those of the ring of face around it."""
 OFF_RING = 4.0
-"""Robust standard deviations of a ring from which on a pixel of it is something else, such as a tag."""
+"""Pixels of a ring farther off, in robust standard deviations, are something else, such as a tag."""
 PATTERN_PX, ANGLES_DEG = (3, 6, 12), (0, 20, 35, 60)
 CLOSE = 0.3
-"""A ratio this far from 1 counts as agreement."""
+"""Largest difference of a ratio from 1 that counts as agreement."""
 HOW = (
-    "The board is declared, its view rendered with light between its surfaces, the camera simulated as its file "
-    "stands, and the frames resampled onto the capture's pixels. The same analysis is applied to both, in rings of "
-    "6.5 to 13.5 mm about the holes, each less a quadratic surface; a hole's peak is the largest deviation within 6 mm "
-    "of its centre. Nothing is fitted. Things that lie on the real board, its relief and what the camera's maker does "
-    "to pixels between two surfaces are not simulated; detectors see whole images, with one threshold for both."
+    "The board is declared, its view is rendered with light between its surfaces, the camera is simulated with its "
+    "file unchanged, and the frames are resampled to the capture's pixels. The same analysis is applied to both: rings "
+    "of 6.5 to 13.5 mm around the holes, each minus a quadratic surface; a hole's peak is the largest deviation within "
+    "6 mm of its centre. No parameter is fitted. Objects on the real board, its relief, and the maker's treatment of "
+    "pixels between two surfaces are not simulated. Detectors see whole images, with the same threshold for both."
 )
 CAPTION = (
-    "Peak of each hole behind the face around it. Means over holes have Student's 95 % intervals, temporal deviations "
-    "those of a jackknife over frames."
+    "Peak of each hole behind the face around it. Means over holes have Student's 95 % intervals; temporal deviations "
+    "have those of a jackknife over frames."
 )
 Readings = dict[tuple[str, str, str], tuple[Reading, int]]
-"""Readings, each with its number of pixels or holes, by quantity, condition and unit."""
+"""Readings with their number of pixels or holes, by quantity, condition and unit."""
 
 
 @dataclass(frozen=True)
 class Image:
-    """Pixels on which board and capture are compared: their lens, and the board's and the depth camera's frames."""
+    """The pixels on which board and capture are compared: their lens, and the board's and depth camera's frames."""
 
     lens: Lens
     T_image_board: np.ndarray
@@ -75,18 +75,18 @@ class Image:
 
     @cached_property
     def rays(self) -> np.ndarray:
-        """(h, w, 3): each pixel's ray, of z = 1."""
+        """The rays (h, w, 3) of the pixels, with z = 1."""
         return np.concatenate([self.lens.region_slopes(self.lens.whole), np.ones((*self.lens.whole.shape, 1))], axis=-1)
 
     @cached_property
     def plan_mm(self) -> np.ndarray:
-        """(h, w, 2): where each pixel's ray meets the board's plane, board frame."""
+        """The points (h, w, 2) where each pixel's ray meets the board's plane, in the board's frame."""
         T_board_image = invert(self.T_image_board)
         rays, start = self.rays @ T_board_image[:3, :3].T, T_board_image[:3, 3]
         return np.asarray((start[:2] - rays[..., :2] * (start[2] / rays[..., 2:])) / MM)
 
     def resampled(self, z_m: np.ndarray, camera: AnyCamera) -> np.ndarray:
-        """Return frames (n, h, w) of the depth camera as aligned to this image, z in whole steps of its output."""
+        """Return frames (n, h, w) of the depth camera, aligned to this image, with z in whole steps of its output."""
         import cv2
 
         plane = np.concatenate([self.plan_mm * MM, np.zeros((*self.lens.whole.shape, 1))], axis=-1)
@@ -99,8 +99,8 @@ class Image:
 
 
 def image_of(target: TargetConfig, camera: AnyCamera, lens: Lens | None) -> Image:
-    """Return the compared image: the depth camera's own without a capture or where the capture has its size, else that
-    of the camera's colour camera. Raises UserError where the file of the camera says nothing of one."""
+    """Return the image to compare: the depth camera's own if there is no capture or the capture has its size, otherwise
+    that of the camera's colour camera. Raises UserError if the camera's file has no colour camera."""
     own, T_depth_board = camera.nominal_lens, target.pose.T_camera_board
     if lens is None or (lens.width, lens.height) == (own.width, own.height):
         return Image(lens or own, T_depth_board, np.eye(4))
@@ -118,7 +118,7 @@ def measured(
     z_m: np.ndarray, image: Image, target: TargetConfig, config: ExperimentConfig, detectors: dict[str, dict[str, Any]]
 ) -> tuple[Readings, np.ndarray]:
     """Measure frames (n, h, w) on the image's pixels; ``detectors``: settings by name, at the experiment's threshold.
-    Returns readings and holes' peaks in mm (n,), NaN where not all in view. Raises UserError where none is."""
+    Returns readings and holes' peaks in mm (n,), NaN where not all in view. Raises UserError if none is in view."""
     cloud, noises = _cloud(z_m, image), []
     centres, (height, width) = np.array([hole.centre_mm for hole in target.holes]), image.lens.whole.shape
     peaks = np.full(len(centres), np.nan)
@@ -167,14 +167,14 @@ def measured(
 
 
 def _angles_deg(target: TargetConfig) -> np.ndarray:
-    """Return (n,) how far each hole lies off the depth camera's axis."""
+    """Return the angle (n,) of each hole from the depth camera's axis."""
     centres = np.array([[*hole.centre_m, 0.0] for hole in target.holes])
     places = transform_points(target.pose.T_camera_board, centres)
     return np.degrees(np.arctan2(np.linalg.norm(places[:, :2], axis=-1), places[:, 2]))
 
 
 def _cloud(z_m: np.ndarray, image: Image) -> Cloud:
-    """Return the average of frames as a detector sees it."""
+    """Return the average of frames as a cloud for detectors."""
     count = np.isfinite(z_m).sum(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         z = np.nansum(z_m, axis=0) / count
@@ -184,8 +184,8 @@ def _cloud(z_m: np.ndarray, image: Image) -> Cloud:
 
 
 def run_board(options: argparse.Namespace, recording: Recording | None, command: str) -> int:
-    """Compare, print, write capture.csv, capture.html and provenance.json. Returns 0. Raises UserError where the
-    experiment declares no board before a simulated camera, or the capture cannot be compared with it."""
+    """Compare and print; write capture.csv, capture.html and provenance.json. Returns 0. Raises UserError if the
+    experiment declares no board in front of a simulated camera, or the capture cannot be compared with it."""
     experiment = load_experiment(options.board)
     points = list({point.frames_key: point for point in experiment.points}.values())
     detectors = {point.config.detector.name: point.config.detector.settings for point in experiment.points}
@@ -211,12 +211,12 @@ def run_board(options: argparse.Namespace, recording: Recording | None, command:
             known = real[key][0] if key in real else Reading(float("nan"))
             rows.append(Beside(label, *key, count, known, value))
         print(f"simulated: {label}", flush=True)
-    answer = _answer(rows) if recording else "No capture is given: the simulation stands alone."
+    answer = _answer(rows) if recording else "No capture is given, so there is nothing to compare with."
     print("\n".join([answer, *remarks]))
     drawn = svg("peaks", (7.2, 4.4), "Peaks of the holes", lambda canvas: _draw(canvas, target, judged))
     body = [figure({"peaks": drawn}, "peaks", CAPTION), heading("All numbers"), BESIDE.grid(rows).html()]
     under = [*map(note, remarks), paragraph(f"{frames} frames of each set-up. {HOW}")]
-    title = f"{config.title or config.name} beside the simulated {camera.title}"
+    title = f"{config.title or config.name} compared with the simulated {camera.title}"
     show([BESIDE.grid(rows)])
     write_table(options.out, BESIDE, BESIDE.frame(rows))
     write_text(options.out / "capture.html", page(title, answer, [*body, *command_of(command)], under))
@@ -242,7 +242,7 @@ def _simulated(point: Point, image: Image, frames: int, options: argparse.Namesp
 
 
 def _answer(rows: list[Beside]) -> str:
-    """Return in a sentence which set-up comes nearest, and what of it is off."""
+    """Return a sentence that names the set-up closest to the capture, and its figures that differ."""
     ratios: dict[str, dict[str, float]] = {}
     for row in rows:
         if row.measured.value > 0 and np.isfinite(row.simulated.value):
@@ -252,11 +252,11 @@ def _answer(rows: list[Beside]) -> str:
     best = min(off, key=lambda where: (len(off[where]), sum(abs(np.log(r)) for r in ratios[where].values())))
     share = f"{len(ratios[best]) - len(off[best])} of {len(ratios[best])} figures within {100 * CLOSE:.0f} %"
     rest = "".join(f"; {what}: {ratio:.2f} of the capture's" for what, ratio in off[best].items())
-    return f"Of {len(ratios)} set-ups, {best} comes nearest: {share} of the capture{rest}."
+    return f"Of {len(ratios)} set-ups, {best} is closest: {share} of the capture{rest}."
 
 
 def _draw(figure: Canvas, target: TargetConfig, judged: dict[str, tuple[Readings, np.ndarray]]) -> None:
-    """Peaks of the holes against their angle from the depth camera's axis."""
+    """Draw the peaks of the holes against their angle from the depth camera's axis."""
     axes = figure.subplots()
     for number, (label, (_, peaks_mm)) in enumerate(judged.items()):
         colour, size = ("black", 60) if label == "capture" else (COLOURS[number % len(COLOURS)], 10)

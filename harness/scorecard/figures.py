@@ -34,10 +34,10 @@ from scenes.sensor.camera import camera_names
 
 FIGURES_FILE = Path(__file__).with_name("figures.yaml")
 NEAR = 0.25
-"""A figure of reality passes within this share of a published value; a bound must hold."""
-SAID_EVERY_S = 10.0
+"""A figure of reality passes within this share of a published value; a published bound must hold."""
+PROGRESS_EVERY_S = 10.0
 Request = tuple[str, str, Config]
-"""A camera, a quantity, and its conditions."""
+"""The camera, the quantity and its conditions."""
 
 
 class Published(Config):
@@ -62,17 +62,17 @@ class Published(Config):
 
     @property
     def ends(self) -> tuple[float, float]:
-        """The lowest and the highest value that agree with what was published; infinite where there is no bound."""
+        """The lowest and highest value that agree with what was published; infinite where there is no bound."""
         low, high = (self.above, self.below) if self.value is None else (self.value, self.value)
         return (-float("inf") if low is None else low), (float("inf") if high is None else high)
 
     def limits(self, near: float, tolerance: float = 0.0) -> tuple[float, float]:
-        """Lowest and highest value that passes: ``tolerance`` beyond the ends, or the share ``near`` of it if more."""
+        """Lowest and highest value that pass: ``tolerance`` beyond the ends, or the share ``near`` of it if more."""
         slack = max(tolerance, near * abs(self.value or 0.0))
         return self.ends[0] - slack, self.ends[1] + slack
 
     def in_words(self) -> str:
-        """``1.42 ± 0.05``, ``below 17``, ``0.15 to 0.35``."""
+        """Text such as ``1.42 ± 0.05``, ``below 17`` or ``0.15 to 0.35``."""
         if self.value is not None:
             return f"{self.value:g} ± {self.tolerance:g}"
         ends = (("above", self.above), ("below", self.below))
@@ -104,32 +104,32 @@ class Figure(Config):
 
     @property
     def use(self) -> Literal["blind", "calibration", "code"]:
-        """Blind: it tests the model against real cameras and was not used for it."""
+        """Use of the figure: a blind one tests the model against real cameras and did not shape it."""
         return "code" if self.kind == "code" else "calibration" if self.calibration else "blind"
 
     @cached_property
     def measures(self) -> Quantity:
-        """The quantity of its name."""
+        """The quantity that the figure names."""
         return QUANTITIES[self.quantity]
 
     @cached_property
     def request(self) -> Request:
-        """Camera, quantity and complete conditions of what is to be measured."""
+        """The camera, quantity and complete conditions of the measurement."""
         return self.camera, self.quantity, self.measures.conditions.from_data(self.conditions)
 
     def what(self) -> str:
-        """``temporal deviation, 1.5 m, albedo 0.8``."""
+        """Text such as ``temporal deviation, 1.5 m, albedo 0.8``."""
         return f"{self.measures.title}, {in_words(self.request[2])}"
 
 
 class FiguresFile(Config):
-    """The file: a list of figures."""
+    """The file of figures: a list."""
 
     figures: Annotated[tuple[Figure, ...], Field(min_length=1)]
 
 
 def read_figures(path: Path = FIGURES_FILE) -> tuple[Figure, ...]:
-    """The figures of a file. Raises UserError naming each key that is missing, unknown or impossible, and where."""
+    """Read a file of figures. Raises UserError naming each key that is missing, unknown or impossible, and where."""
     source = read_yaml(path)
     entries, problems = child(source.data, "figures"), list[Problem]()
     first: dict[str, int] = {}
@@ -153,14 +153,14 @@ def read_figures(path: Path = FIGURES_FILE) -> tuple[Figure, ...]:
 
 @dataclass(frozen=True)
 class Score:
-    """One figure and what the simulation gave."""
+    """One figure and the simulated value."""
 
     figure: Figure
     simulated: Reading
 
     @property
     def ratio(self) -> float:
-        """Simulated by published, or by the nearer bound; NaN where that is 0."""
+        """The simulated over the published value, or over the nearer bound; NaN where that is 0."""
         value = self.simulated.value
         nearest = min(self.figure.published.ends, key=lambda end: abs(end - value))
         return value / nearest if nearest else float("nan")
@@ -184,7 +184,7 @@ class Score:
 
     @property
     def verdict(self) -> str:
-        """``pass``, ``pass (tolerance)``, ``fail`` as the file says, or ``FAIL (new)``."""
+        """The verdict: ``pass``, ``pass (tolerance)``, ``fail`` as the file says, or ``FAIL (new)``."""
         if self.passes:
             return "pass (tolerance)" if self.passes_by_tolerance else "pass"
         return "FAIL (new)" if self.fell_behind else "fail"
@@ -204,7 +204,7 @@ def measured(requests: Iterable[Request], effort: Effort, jobs: int) -> dict[Req
         found = mapped(measure_group, groups, [effort] * len(groups))
         for group, readings in zip(groups, found, strict=True):
             results |= zip(group, readings, strict=True)
-            if time.monotonic() - last_s > SAID_EVERY_S:
+            if time.monotonic() - last_s > PROGRESS_EVERY_S:
                 last_s = time.monotonic()
                 print(f"measured {len(results)} of {sum(map(len, groups))} numbers", file=sys.stderr, flush=True)
     return results
@@ -232,7 +232,7 @@ class Beside:
 
 
 def number(value: float) -> str:
-    """Three significant digits; ``none`` where there is no value."""
+    """Return three significant digits, or ``none`` where there is no value."""
     if np.isnan(value):
         return "none"
     if 0.0995 <= abs(value) < 99.95:
@@ -246,7 +246,7 @@ def _interval(between: Interval) -> str:
 
 
 def _reading(name: str, low: str, high: str, note: str) -> tuple[Column, ...]:
-    """A reading: its value and its interval's ends in three columns of a file, and in two of a page."""
+    """Return a reading: its value and its interval's ends in three columns of a file, and in two of a page."""
     return (
         Column(name, name, f"{name}.value", note, number),
         Column(low, "", f"{name}.interval.low", "lower end of its 95 % interval"),

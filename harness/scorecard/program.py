@@ -41,7 +41,7 @@ CAPTION = (
     "hollow: the camera's file was fitted to it. Bounds, and values of 0, have no ratio."
 )
 FAMILIES = {"azure": "Azure Kinect", "femto": "Femto", "kinect": "Kinect v2", "realsense": "RealSense L515"}
-"""Families of cameras by the first word of their names; all others are counted together."""
+"""Families of cameras by the first word of their names; all other cameras are counted together."""
 
 
 def run_scorecard(options: argparse.Namespace, command: str) -> int:
@@ -85,7 +85,7 @@ def _page(
     provenance: Mapping[str, object],
     command: str,
 ) -> str:
-    """The page: the ratios' picture, figures of cameras, checks of the code, what the quantities mean."""
+    """Return the page: the picture of ratios, figures of cameras, checks of the code, what the quantities mean."""
     body = [heading("Simulated beside published")]
     real = [score for score in scores if score.figure.kind == "reality"]
     ratios = [score for score in real if score.figure.published.value is not None and score.ratio > 0]
@@ -131,7 +131,7 @@ def _draw(canvas: Canvas, scores: Sequence[scoring.Score]) -> None:
 
 
 def _answer(scores: Sequence[scoring.Score]) -> str:
-    """Tell how many blind figures hold, in all and by family, and how many of the others."""
+    """Return how many blind figures hold, in all and by family, and how many of the others."""
 
     def share(chosen: Sequence[scoring.Score]) -> str:
         return f"{sum(score.passes for score in chosen)} of {len(chosen)}"

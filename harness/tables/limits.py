@@ -318,6 +318,6 @@ def _reason(bound: Bound) -> str:
 
 
 def _sizes(*limits: SetUpLimit) -> str:
-    """`` (4.3 to 15.9 mm)``: the sizes inspected; empty without any."""
+    """Return `` (4.3 to 15.9 mm)``: the sizes inspected; empty without any."""
     low, high = _ends_mm(*limits)
     return "" if np.isnan(low) else f" ({low:.3g} to {high:.3g} mm)"

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LISTS_AT_ONCE = 1_000
-"""Rows with lists whose elements become rows of a file at a time, some 5 MB."""
+"""Number of rows with lists whose elements become rows of a file at a time, some 5 MB."""
 UNITS = {"_per_m2": "1/m²", "_m2": "m²", "_mm3": "mm³", "_mm": "mm", "_m": "m", "_s": "s", "_mb": "MB", "_px": "pixels"}
 
 
@@ -242,7 +242,7 @@ def write_table(folder: Path, table: Table, frame: pd.DataFrame, about: Mapping[
 
 
 def _unfolded(frame: pd.DataFrame, lists: Sequence[str]) -> pd.DataFrame:
-    """One row for each element of the rows' ``lists``."""
+    """Return one row for each element of the rows' ``lists``."""
     if not lists or frame.empty:
         return frame
     rows = np.repeat(np.arange(len(frame)), frame[lists[0]].map(len))

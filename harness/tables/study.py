@@ -30,9 +30,9 @@ from harness.tables.text import Grid
 from harness.vocabulary.path_names import camera_title, differing, names_of, on_one_line, unit_of, value_text
 
 BLOB_PX = 5.0
-"""Distance on the sensor up to which two highest scores belong to one blob: the width of a camera's filter."""
+"""Distance on the sensor within which two highest scores belong to one blob: the width of a camera's filter."""
 HIGH_THRESHOLD = 10.0
-"""Deviations: the highest of a hole-free board is 4 with Gaussian noise, 5 to 6 with a fixed pattern."""
+"""Standard deviations: a hole-free board's highest score is 4 with Gaussian noise, 5 to 6 with a fixed pattern."""
 OFF_BOARD = "off the board"
 SHOWN_ROWS = 60
 BOUND = "upper bound of a90 at 95 % confidence; empty where not demonstrated"
@@ -171,7 +171,7 @@ class AxisGroup:
         """True where the values have places on a scale."""
         return all(line.numeric for line in self.lines.values())
 
-    def told(self, value: Any) -> str:
+    def words(self, value: Any) -> str:
         """Return a value in words; of a mapping, only the keys in which the values differ."""
         return axis_value(self.path, differing(value, self.values))
 
@@ -253,7 +253,7 @@ AXES = Table(
         Column("axis", "", "group.path", "dotted path of the axis"),
         Column("line", "set-ups", "line", "values of the line's set-ups on the other axes"),
         Column("value", "", lambda one: on_one_line(one.value), "value on the axis"),
-        Column("", "value", lambda one: one.group.told(one.value)),
+        Column("", "value", lambda one: one.group.words(one.value)),
         replace(SET_UP_OF, label=""),
         Column("a50_mm", "a50 (mm)", lambda one: a50_of(one.limit), f"{FOUND_50}, with interval", interval=True),
         Column("a90_mm", "a90 (mm)", lambda one: a90_of(one.limit), f"{FOUND_90}, with interval", interval=True),

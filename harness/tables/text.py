@@ -103,7 +103,7 @@ Tone = Literal["", "good", "key", "bad", "open", "changed"]
 COLOURS = {"good": "green", "key": "bold green", "bad": "bold red", "open": "yellow"}
 """Colours of a terminal; the text says the same without them."""
 ROUGH = 0.1
-"""Width of an interval over the value from which on a third digit says nothing."""
+"""Ratio of an interval's width to the value from which a third digit means nothing."""
 CLASSES = {"good": "good", "key": "key", "bad": "none", "open": "open", "changed": "changed"}
 
 

@@ -273,8 +273,7 @@ def scatter_ratio(holes: pd.DataFrame, first: str, second: str) -> tuple[float, 
 
 
 def _found(case: Case, frames: int, expected: frozenset[str], unexpected: frozenset[str]) -> tuple[Answer, str]:
-    """Judge whether the expected holes of the thesis are found and the unexpected ones missed; return the counts
-    too."""
+    """Judge whether expected holes of the thesis are found and unexpected ones missed; return the counts too."""
     status = found_holes(case.summary, case.variant, frames)
     if set(status) != set(THESIS_HOLES):
         why = f"no trial has {frames} frames" if not status else "the target is not the thesis' row of eleven holes"

@@ -36,5 +36,5 @@ class Config(BaseModel):
 
 
 def _as_tuple(value: Any) -> Any:
-    """Lists within lists become tuples within tuples; what is inside a mapping is the business of its own model."""
+    """Turn lists within lists into tuples within tuples; the model of a mapping converts its own lists."""
     return tuple(_as_tuple(item) for item in value) if isinstance(value, list) else value

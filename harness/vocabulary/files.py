@@ -68,7 +68,7 @@ def shipped(kind: str) -> Path:
 
 
 _LOCK, _WANTED, _BEFORE = threading.Lock(), list[int](), list[tuple[int, int]]()
-"""The limits that each place inside `limited_memory` wants, and the process's own from before the first of them."""
+"""Limits that the places inside `limited_memory` want, and the process's own limit from before the first of them."""
 
 
 @contextmanager
@@ -126,7 +126,7 @@ def strict_json(content: bytes | str, *, nan: bool = False) -> Any:
 
 NOT_WRITABLE = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.ENOENT}
 NOT_WRITABLE |= {errno.ENAMETOOLONG, errno.EINVAL}
-"""Errors of a place where no file can be made (ENOENT for one inside /proc)."""
+"""Error numbers of a place where no file can be made (ENOENT for a place inside /proc)."""
 
 
 @contextmanager

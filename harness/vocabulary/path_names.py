@@ -13,13 +13,13 @@ from typing import Any
 
 UNITS = {"_mrad": "mrad", "_deg": "°", "_mm": "mm", "_nm": "nm", "_px": "px", "_hz": "Hz", "_m": "m"}
 """Endings of keys that name a unit, longer ones first."""
-CHOICES = ("name", "kind", "method")  # Keys that say which of several; what it is of stands before them
-NAMED = ("camera", "detector", "damage")  # Axes whose values say by themselves what they are
+CHOICES = ("name", "kind", "method")  # keys that choose one of several kinds; the key before them says of what
+NAMED = ("camera", "detector", "damage")  # axes whose values explain themselves
 LONGEST = 60  # Characters of a value that a table can show
 
 
 def names_of(paths: Iterable[str]) -> dict[str, str]:
-    """Return a name for each path, without unit: its last key that says something; the path if it is not unique."""
+    """Return a name for each path, without unit: its last meaningful key, or the whole path if that is not unique."""
     short = {path: _split(path)[0] for path in paths}
     return {path: name if list(short.values()).count(name) == 1 else path for path, name in short.items()}
 

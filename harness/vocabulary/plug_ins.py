@@ -12,7 +12,7 @@ from typing import Any
 
 from harness.vocabulary.errors import UserError
 
-OWN = "tofpod"  # The package that the built-in ones come from, as it is told
+OWN = "tofpod"  # name of the package of the built-in ones
 
 
 @dataclass(frozen=True)

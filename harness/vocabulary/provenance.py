@@ -59,8 +59,8 @@ def record(command: str) -> dict[str, Any]:
     return {"command": command, "commit": commit, "dirty": dirty, "versions": versions(), "machine": machine}
 
 
-RESULTS_VERSION = 1  # Of files without a version of their own; raised when the tables' meaning changes
-GENERATOR = f"tofpod results {RESULTS_VERSION}"  # Stands in pages
+RESULTS_VERSION = 1  # of files without their own version; increased when the tables' meaning changes
+GENERATOR = f"tofpod results {RESULTS_VERSION}"  # written into pages
 STAMP = re.compile(r"#\s*tofpod (\w+)(.*)")
 
 
@@ -142,7 +142,7 @@ def reached_sources(modules: tuple[str, ...]) -> tuple[Path, ...]:
 
 @cache
 def _content(path: Path) -> bytes:
-    """A source as this process first read it: a later edit is not what it has loaded, nor what forks for it."""
+    """Return a source as this process first read it: later edits have no effect on it, nor on forks of it."""
     return path.read_bytes()
 
 
@@ -154,14 +154,14 @@ def _source_of(name: str) -> Path | None:
 
 
 def _imported(text: str) -> Iterator[str]:
-    """Every dotted name that absolute imports may mean: of ``from a import b`` both ``a`` and ``a.b``."""
+    """Yield every dotted name that absolute imports may mean: of ``from a import b`` both ``a`` and ``a.b``."""
     for start, names, plain in IMPORT.findall(text):
         words = [name.split()[0] for name in (names or plain).strip("()\n ").split(",") if name.strip()]
         yield from ([start, *(f"{start}.{word}" for word in words)] if start else words)
 
 
 def _foreign_sources(module: str) -> Iterable[tuple[str, Path]]:
-    """(name to show, file) of the sources of the package that a module of another project belongs to."""
+    """Yield (name to show, file) of the sources of the package that a module of another project belongs to."""
     try:
         spec = importlib.util.find_spec(module.partition(".")[0])
     except (ImportError, ValueError):

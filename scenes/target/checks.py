@@ -18,7 +18,7 @@ THICKEST_BEND = 0.5  # thickness over the smallest radius of curvature; the back
 WIDEST_BEND = 0.25  # a damage's radius over the radius of curvature there: the truth's volumes are good to its square
 SHALLOWEST_BEND = 0.5  # the radius of a dent's ball over the same: at 1 a face that bends away has no rim
 MOST_TURN = 0.8  # cosine between the face's normals at a flaw's centre, along which depth counts, and at its rim
-LEAST_WEB_MM = 0.01  # between two damages or a damage and the edge: a circle's polygon sticks out by 2.5 um at 1 in
+LEAST_WEB_MM = 0.01  # between two damages, or damage and edge: a circle's polygon sticks out by 2.5 um at 1 in
 NEAREST_M = 0.05  # least distance of the board from the lens plane
 _TURN = np.linspace(0, 2 * np.pi, 64, endpoint=False)
 _CIRCLE = np.column_stack([np.cos(_TURN), np.sin(_TURN)])
@@ -121,8 +121,8 @@ def _damage_problems(damage: custom.AnyDamage, board: custom.BoardConfig, face: 
     if isinstance(damage, custom.DentConfig) and damage.depth_mm > damage.diameter_mm / 2:
         radius = f"its radius {damage.diameter_mm / 2:g} mm"
         problems.append(f"{name}: depth {depth_mm:g} mm is more than {radius}, the limit of a spherical cap")
-    # The rim, at the face and at the bottom of the damage, against the board's edge in plan. The side walls follow the
-    # normals of the edge, so below the face the limits move by the depth times the normal there.
+    # compare the rim of the damage, at the face and at its bottom, with the board's edge in plan; the side walls follow
+    # the edge's normals, so that below the face the limits move by the depth times the normal there
     centre, axis = face.point(x, y), face.normal(x, y)
     if not isinstance(damage, FlawConfig):
         across = np.cross(axis, [0.0, 1.0, 0.0])

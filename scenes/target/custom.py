@@ -314,7 +314,7 @@ class PoseConfig(Config):
 
 
 class SetUpConfig(Config):
-    """Surroundings of a board, and its pose. Without ``backing`` or ``room`` nothing stands there."""
+    """Surroundings of a board, and its pose. Without ``backing`` or ``room``, that space is empty."""
 
     name: str
     flaws: Annotated[

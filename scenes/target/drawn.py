@@ -1,8 +1,8 @@
 """A family of boards, drawn at random, on which a detection limit is measured.
 
-Each board has so many damages of random size, depth and place, its own grain, and stands before the camera in a random
-pose. Every quantity of every board has a random stream of its own, named by the family's seed, the board's purpose and
-its number. So a board does not depend on the number of other boards, and at another distance, albedo, kind of hole or
+Each board has a number of damages of random size, depth and place, its own grain, and a random pose in front of the
+camera. Every quantity of every board has its own random stream, named by the family's seed, the board's purpose and its
+number. So a board does not depend on the number of other boards, and at another distance, albedo, kind of hole or
 depth the boards keep their places, sizes and tilts: their results are paired.
 
 Not modelled: damage that is correlated (a row, a cluster), several kinds on one board."""
@@ -26,9 +26,9 @@ from scenes.target import custom, flaws
 from scenes.target.checks import LEAST_WEB_MM, SHALLOWEST_BEND, WIDEST_BEND, off_tape_mm
 from scenes.target.truth import OUTLINE_STEPS, backing_corners_board_m, face_grid_m, face_of, outline_board_m
 
-Purpose = Literal["learning", "calibration", "hole_free", "damaged"]  # of boards; each has boards of its own
+Purpose = Literal["learning", "calibration", "hole_free", "damaged"]  # purposes of boards; no two share boards
 NEAREST_M, FARTHEST_M = 0.1, 10.0  # limits of a pose's distance, jitter included
-WIDEST_BACKING_MM = 1e4  # that a declaration allows
+WIDEST_BACKING_MM = 1e4  # largest backing in a declaration
 ATTEMPTS, TRIES = 50, 400
 """Boards begun anew, and places tried for each damage: where discs ``apart_mm`` wide are to cover 40 % of the free area
 (random placement reaches 54.7 % at most), one attempt in three or more fills a board."""
@@ -154,8 +154,7 @@ else:
 
 class DrawnTargetConfig(Config):
     """A family of random boards. Offsets, tilts, roll and jitter of the pose are drawn uniformly between plus and minus
-    the given value. ``drawn`` returns the full declaration of any board, ``declare`` that of the first damaged
-    board."""
+    the given value. ``drawn`` returns the full declaration of a board, ``declare`` that of the first damaged one."""
 
     name: Literal["drawn"] = "drawn"
     seed: flaws.Seed = Field(1, description="draws the boards; the experiment's own seed draws the noise")

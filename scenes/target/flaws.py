@@ -89,8 +89,7 @@ class _FlawConfig(PlacedConfig):
 
 
 class _LongConfig(_FlawConfig):
-    """A damage along a line. ``wander_mm`` is the deviation of the line from a straight one; ``seed`` draws its
-    waves."""
+    """A damage along a line. ``wander_mm``: deviation of the line from a straight one; ``seed`` draws its waves."""
 
     length_mm: Extent
     width_mm: Extent
@@ -221,8 +220,7 @@ AnyFlawConfig = Annotated[FlawConfig, Field(discriminator="kind")]
 
 
 def _disc(radius_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return s and t of a square grid mapped onto a disc, its border on the rim, and each point's share of the
-    radius."""
+    """Return s and t of a square grid mapped onto a disc, border on the rim, and each point's share of the radius."""
     u, v = np.meshgrid(np.linspace(-1, 1, ROUND + 1), np.linspace(-1, 1, ROUND + 1))
     s, t = u * np.sqrt(1 - v**2 / 2), v * np.sqrt(1 - u**2 / 2)
     return radius_m * s, radius_m * t, np.minimum(np.hypot(s, t), 1.0)

@@ -21,14 +21,14 @@ from harness.evaluation.pod.hit_miss import rows_of_target
 from harness.vocabulary.errors import UserError
 
 LEAST_TARGETS = 40
-"""MIL-HDBK-1823A: independent targets that an a-hat study should have at least."""
+"""Least number of independent targets of an a-hat study, by MIL-HDBK-1823A."""
 SAME = 1e-9
 """Share of the largest signal within which signals differ by rounding alone; scatter below this share of the signals'
 largest deviation is a line drawn by rounding, with no likelihood."""
 LEVEL = 0.05
-"""p-value below which a diagnostic speaks against an assumption."""
+"""A diagnostic with a smaller p-value contradicts an assumption."""
 LEAST = 8
-"""Signals between the limits below which Anderson and Darling's approximation of p does not hold."""
+"""Fewest signals between the limits for which Anderson and Darling's approximation of p holds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +208,7 @@ def fit_censored(design: np.ndarray, y: np.ndarray, below: np.ndarray, above: np
     rows = np.where(above, -1.0, 1.0)[:, None] * np.column_stack([-q, rest / scale])
 
     def value_and_information(at: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        """Log-likelihood, its gradient and its negative Hessian."""
+        """Return the log-likelihood, its gradient and its negative Hessian."""
         if at[-1] <= 0:
             return -np.inf, np.zeros(p + 1), np.eye(p + 1)
         s = rows @ at
@@ -296,7 +296,7 @@ def residual_scores(fit: AhatFit) -> np.ndarray:
 
 
 def _anderson_darling(z: np.ndarray) -> tuple[float, float]:
-    """The statistic, mean and variance estimated, and p by D'Agostino and Stephens 1986, table 4.9."""
+    """Return the statistic, mean and variance estimated, and p by D'Agostino and Stephens 1986, table 4.9."""
     ordered, n = np.sort((z - z.mean()) / z.std(ddof=1)), len(z)
     logs = special.log_ndtr(ordered) + special.log_ndtr(-ordered[::-1])
     a = (-n - float(np.mean((2 * np.arange(1, n + 1) - 1) * logs))) * (1 + 0.75 / n + 2.25 / n**2)

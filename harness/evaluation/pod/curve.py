@@ -25,22 +25,22 @@ _F_AND_INVERSE: dict[str, tuple[Callable[[np.ndarray], np.ndarray], Callable[[np
 }
 LINKS = tuple(_F_AND_INVERSE)
 CELLS = 2**17
-"""Curves times targets at a time, or boards drawn again times theirs: 1 MB an array."""
+"""Number of curves times targets at a time, or of boards drawn again times theirs: 1 MB an array."""
 
 
 def link_cdf(link: str, t: np.ndarray) -> np.ndarray:
-    """F(t) of one of `LINKS`: logistic, normal, 1 - exp(-exp(t)) (cloglog), exp(-exp(-t)) (loglog)."""
+    """Return F(t) of one of `LINKS`: logistic, normal, 1 - exp(-exp(t)) (cloglog), exp(-exp(-t)) (loglog)."""
     with np.errstate(over="ignore"):
         return np.asarray(_F_AND_INVERSE[link][0](np.asarray(t, float)))
 
 
 def link_ppf(link: str, p: np.ndarray) -> np.ndarray:
-    """F^-1(p) of one of `LINKS`."""
+    """Return F^-1(p) of one of `LINKS`."""
     return np.asarray(_F_AND_INVERSE[link][1](np.asarray(p, float)))
 
 
 def logs_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """ln F, ln(1 - F) and ln f (the density) at the predictor, each of its shape and exact in both tails."""
+    """Return ln F, ln(1 - F) and ln f (the density) at the predictor, each of its shape and exact in both tails."""
     t = np.clip(predictor, -LARGEST_PREDICTOR, LARGEST_PREDICTOR)
     if link == "logit":
         tail = np.log1p(np.exp(-np.abs(t)))
@@ -55,9 +55,9 @@ def logs_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def slopes_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """f / F, f / (1 - F) and d ln f / dt at t = predictor, each of its shape."""
+    """Return f / F, f / (1 - F) and d ln f / dt at t = predictor, each of its shape."""
     t = np.clip(predictor, -LARGEST_PREDICTOR, LARGEST_PREDICTOR)
-    if link == "logit":  # the commonest, and the ratios are the shares themselves
+    if link == "logit":  # the most usual link, for which the ratios are the shares themselves
         hit, miss = special.expit(t), special.expit(-t)
         return miss, hit, miss - hit
     log_hit, log_miss, log_density = logs_of_link(link, t)
@@ -76,12 +76,12 @@ class PodCurve:
     covariance: np.ndarray
 
     def pod(self, size: np.ndarray) -> np.ndarray:
-        """POD at sizes of any shape."""
+        """Return the POD at sizes of any shape."""
         x = np.log(size) if self.log_size else np.asarray(size, float)
         return link_cdf(self.link, (x - self.mu) / self.sigma)
 
     def size_at(self, pod: float) -> float:
-        """The size with this POD."""
+        """Return the size with this POD."""
         x = self.mu + self.sigma * float(link_ppf(self.link, np.array(pod)))
         return float(np.exp(x)) if self.log_size else x
 
@@ -103,13 +103,13 @@ class Bound:
 
 
 STEPS, PLAIN_STEPS = 200, 12
-"""Steps and halvings of a problem at most, and Newton steps that are tried first; five or six are usual."""
+"""Most steps and halvings of a problem, and Newton steps that are tried first; five or six are usual."""
 TOLERANCE = 1e-7
-"""A step smaller than this has arrived: Newton's errors are squared with every step."""
+"""The search has arrived at a step below this: Newton's errors are squared with every step."""
 CLIMBED = 6
-"""Steep starts of which the search for a penalised maximum climbs."""
+"""Number of steep starts from which the search for a penalised maximum climbs."""
 PENALISED_SLOPES = np.linspace(np.log(1e-8), np.log(1e4), 140)
-"""Natural logarithms of the slopes that a penalised profile is searched at first."""
+"""Natural logarithms of the slopes with which the search of a penalised profile begins."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,11 +127,11 @@ class HitsAndMisses:
 
     @property
     def z(self) -> np.ndarray:
-        """(n,) sizes: the design's second column."""
+        """The sizes (n,): the design's second column."""
         return np.asarray(self.design[:, 1])
 
     def value(self, b: np.ndarray) -> np.ndarray:
-        """(Penalised) log-likelihood (...) at coefficients (..., p); of several studies (d,) at (d, p)."""
+        """Return the (penalised) log-likelihood (...) at coefficients (..., p); of several studies (d,) at (d, p)."""
         found, missed, density = logs = logs_of_link(self.link, b @ self.design.T + self.offset)
         value = (self.hits * found + self.misses * missed).sum(axis=-1)
         if self.penalty is not None:
@@ -143,8 +143,8 @@ class HitsAndMisses:
         return np.asarray(value)
 
     def step(self, b: np.ndarray) -> np.ndarray:
-        """(d, p) Newton steps of (d,) studies at b (d, p), scoring steps under a penalty; where the information is
-        singular, in studies that have run off to infinity, without meaning."""
+        """Return Newton steps (d, p) of (d,) studies at b (d, p), scoring steps under a penalty; they mean nothing
+        where the information is singular, in studies that have run off to infinity."""
         up, down, bend = slopes_of_link(self.link, b @ self.design.T + self.offset)
         slope = self.hits * up - self.misses * down
         with np.errstate(all="ignore"):
@@ -171,12 +171,12 @@ class HitsAndMisses:
             return np.asarray(np.linalg.solve(information + ridge, (slope @ self.design)[:, :, None])[:, :, 0])
 
     def of(self, rows: np.ndarray) -> HitsAndMisses:
-        """Some of several studies."""
+        """Return some of several studies."""
         penalty = None if self.penalty is None else np.broadcast_to(self.penalty, len(self.hits))[rows]
         return replace(self, hits=self.hits[rows], misses=self.misses[rows], penalty=penalty)
 
     def climb(self, places: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Values and steps of the studies ``which``, for `ascend`."""
+        """Return values and steps of the studies ``which``, for `ascend`."""
         some = self.of(which)
         value = some.value(places)
         return np.where(np.isfinite(value), value, -np.inf), some.step(places)
@@ -280,7 +280,7 @@ def flat_maximum(data: HitsAndMisses, highest: float) -> float:
 
 
 def _largest(function: Callable[[np.ndarray], np.ndarray], grid: np.ndarray) -> float:
-    """Largest value of a function of one number, refined between the best place of a grid and its neighbours."""
+    """Return the largest value of a function of a number, refined between the best of a grid and its neighbours."""
     best = int(np.argmax(function(grid)))
     ends = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
     how: dict[str, Any] = {"bounds": ends, "method": "bounded", "options": {"xatol": 1e-9}}

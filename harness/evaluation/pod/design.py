@@ -33,8 +33,8 @@ class StudyPlan:
 
 
 def curve_through(a50: float, a90: float, link: str = "logit", *, log_size: bool = False) -> PodCurve:
-    """The curve of ``link`` with POD 0.5 at ``a50`` and 0.9 at ``a90`` (any one unit); its covariance is zero.
-    UserError where it would not rise, and for sizes that are not above 0."""
+    """Return the curve of ``link`` with POD 0.5 at ``a50`` and 0.9 at ``a90`` (any one unit); its covariance is zero.
+    Raises UserError where it would not rise, and for sizes that are not above 0."""
     if not (np.isfinite([a50, a90]).all() and 0 < a50 < a90):
         what = f"a50 {a50:g} and a90 {a90:g}: the probability of detection must grow with size"
         raise UserError(what, legal="0 < a50 < a90", fix="a50 is found 50 % of the time and a90 90 %, so a90 is larger")
@@ -45,7 +45,7 @@ def curve_through(a50: float, a90: float, link: str = "logit", *, log_size: bool
 
 
 def even_sizes(number: int, range_of_sizes: tuple[float, float]) -> np.ndarray:
-    """Ascending sizes (number,): midpoints of equal parts of the range, so that no target is spent on its ends."""
+    """Return ascending sizes (number,), midpoints of equal parts of the range: no target is spent on its ends."""
     low, high = range_of_sizes
     return low + (high - low) * (np.arange(number) + 0.5) / number
 
@@ -62,10 +62,10 @@ def design(
         for study, hits in enumerate(stream.random((studies, number)) < guess.pod(sizes)):
             try:
                 fit = fit_hit_miss(sizes, hits, link=guess.link, log_size=guess.log_size)
-            except UserError:  # All or nothing found, or POD does not grow with size: nothing is demonstrated.
+            except UserError:  # all or nothing found, or POD does not grow with size: nothing is demonstrated
                 continue
             bounds[study] = bound(fit, POD, CONFIDENCE).value
-        # Order statistics, as there is no mean between a number and infinity.
+        # order statistics, because there is no mean between a number and infinity
         low, median, high = np.quantile(bounds, [0.1, 0.5, 0.9], method="inverted_cdf").tolist()
         facts = (number, studies, guess.size_at(POD))
         plans.append(StudyPlan(*facts, median, low, high, float(np.mean(np.isfinite(bounds))), sizes))
@@ -76,7 +76,7 @@ def recommend(plans: Sequence[StudyPlan], goal: float | None = None) -> tuple[St
     """Choose the plan with the fewest targets, `LEAST_TARGETS` or more if any plan has them, of whose studies nine of
     ten demonstrate ``goal`` (None: no wish); the most targets where none do. Beside it: whether they do."""
     most = max(plan.targets for plan in plans)
-    # Below the handbook's minimum the most targets are nearest to it.
+    # below the handbook's minimum the largest number of targets is nearest to it
     allowed = sorted((plan for plan in plans if plan.targets >= min(LEAST_TARGETS, most)), key=lambda one: one.targets)
     reaching = [plan for plan in allowed if goal is None or plan.high <= goal]
     return (reaching or allowed[-1:])[0], None if goal is None else bool(reaching)
@@ -104,7 +104,7 @@ def hole_free(rate_per_m2: float, board_m2: float, confidence: float = 0.95) -> 
         raise UserError(f"{rate_per_m2:g} false calls per m2 on boards of {board_m2:g} m2", legal="both above 0")
     calling = -float(np.expm1(-rate_per_m2 * board_m2))
     fewest = max(int(np.ceil(1 / calling * (1 - 1e-12))) - 1, 1)
-    # Any distinct scores: what the rule says of its rates does not depend on them.
+    # any distinct scores: the rule's rates do not depend on them
     threshold = threshold_for_rate(np.arange(float(fewest)), board_m2, rate_per_m2, confidence)
     area_m2 = float(stats.chi2.ppf(confidence, 2) / 2 / rate_per_m2)
     silent = area_m2, int(np.ceil(area_m2 / board_m2 * (1 - 1e-12)))

@@ -24,9 +24,9 @@ FEWEST_ROWS = 10
 SEPARATORS = (",", ";", "\t")
 HITS = dict.fromkeys(("1", "yes", "y", "true", "t", "hit", "h", "found", "detected"), 1.0)
 HITS |= dict.fromkeys(("0", "no", "n", "false", "f", "miss", "m", "missed", "not found", "not detected"), 0.0)
-"""Words for a hit and a miss, whatever their case."""
+"""Words for a hit and a miss, in upper or lower case."""
 NOTHING = ("", "na", "n/a", "nan", "null", "none", "-", "#n/a")
-"""Cells that stand for no value, whatever their case."""
+"""Cells that mean "no value", in upper or lower case."""
 NUMBER = re.compile(r"[+-]?(\d[\d.,'\u2019\u00a0\u202f ]*|[.,]\d+)([eE][+-]?\d+)?")
 GROUPED = re.compile(r"[+-]?\d{1,3}([.,])\d{3}")
 LEGAL = "a header row with column names, then one row per inspection"
@@ -111,7 +111,7 @@ def texts_of(read: Inspections, column: str) -> np.ndarray:
 
 
 def _require_one_size(read: Inspections) -> None:
-    """Refuse a target that stands in the file with two sizes."""
+    """Refuse a target that the file gives two sizes."""
     assert read.target is not None
     first: dict[str, int] = {}
     for k, name in enumerate(read.target.tolist()):

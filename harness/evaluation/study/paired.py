@@ -1,4 +1,4 @@
-"""Two set-ups compared: hits, a90, signals and false calls. Boards are the units: damages of one board share its
+"""Comparison of two set-ups by hits, a90, signals and false calls. Boards are the units: damages of one board share its
 render, its pose and its surface. The tests of hits and limits do not know that each set-up drew its own calibration of
 the threshold; those of signals and of false calls do. The first of two one-sided p values is for being worse."""
 
@@ -44,7 +44,7 @@ def hits_change(first: Inspected, second: Inspected) -> HitsChange | None:
 
 
 def shared_rows(first: Inspected, second: Inspected) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (k,) of ``first`` and of ``second`` that are the same inspection."""
+    """Return the rows (k,) of ``first`` and of ``second`` that are the same inspection."""
     keys = (zip(t.board.tolist(), t.hole.tolist(), t.repeat.tolist(), strict=True) for t in (first, second))
     at, there = ({key: row for row, key in enumerate(one)} for one in keys)
     shared = [key for key in at if key in there]
@@ -61,7 +61,7 @@ def sign_flip(gained: np.ndarray) -> Tails:
 
 
 def _tails(chance: np.ndarray, observed: int) -> Tails:
-    """(P(<= observed), P(>= observed)) of a distribution over 0, 1, ..."""
+    """Return (P(<= observed), P(>= observed)) of a distribution over 0, 1, ..."""
     return min(1.0, float(chance[: observed + 1].sum())), min(1.0, float(chance[observed:].sum()))
 
 
@@ -81,7 +81,7 @@ class LimitChange:
 
 
 KNOWN = 0.9
-"""Share of draws with an a90 from which on their deviation is taken for the change's."""
+"""Share of draws with an a90 from which their deviation is taken as that of the change."""
 
 
 def limit_change(first: SetUpLimit, second: SetUpLimit, same_boards: bool) -> LimitChange:
@@ -89,7 +89,7 @@ def limit_change(first: SetUpLimit, second: SetUpLimit, same_boards: bool) -> Li
     one, two = first.a90_draws_mm, second.a90_draws_mm
     boards = [np.unique(limit.record.inspected.board) for limit in (first, second)]
     paired = same_boards and bool(np.array_equal(boards[0], boards[1])) and len(one) == len(two)
-    with np.errstate(invalid="ignore"):  # NaN, no evidence either way, where both are infinite
+    with np.errstate(invalid="ignore"):  # infinite less infinite gives NaN, no evidence either way
         differences = two - one if paired else (two[:, None] - one[None, :]).ravel()
     tie = 0.5 * float(np.mean(np.isnan(differences) | (differences == 0)))
     weight = 1.0 / (1 + len(one)) if paired else 0.0  # no share of so few draws is evidence below this
@@ -105,7 +105,7 @@ def limit_change(first: SetUpLimit, second: SetUpLimit, same_boards: bool) -> Li
 
 
 SAME = 1e-6
-"""Relative difference of one threshold from machine to machine."""
+"""Relative difference of the same threshold between machines."""
 
 
 @dataclass(frozen=True)
@@ -164,8 +164,8 @@ def found_from(seen: Inspected) -> float:
 
 
 def _threshold_error(record: SetUpRecord) -> float:
-    """Standard error of a calibrated threshold's logarithm: half the distance of the scores one standard deviation of
-    its rank above and below (Woodruff, J. American Statistical Association 47 (1952), 635)."""
+    """Return the standard error of a calibrated threshold's logarithm: half the distance of the scores one standard
+    deviation of its rank above and below (Woodruff, J. American Statistical Association 47 (1952), 635)."""
     if record.calibrated is None or len(record.calibrated.score) < 2:
         return 0.0
     falling = np.sort(np.maximum(record.calibrated.score, 1e-9))[::-1]
@@ -191,12 +191,12 @@ class CallsChange:
 
     @property
     def rates_per_m2(self) -> tuple[float, float]:
-        """False calls per square metre, (first, second)."""
+        """False calls per square metre: (first, second)."""
         return self.calls[0] / self.areas_m2[0], self.calls[1] / self.areas_m2[1]
 
     @property
     def ratio(self) -> float:
-        """Second rate over first: infinite where only the second has calls, 1 where neither has."""
+        """The second rate over the first: infinite where only the second has calls, 1 where neither has."""
         before, now = self.rates_per_m2
         return now / before if before else (np.inf if now else 1.0)
 
@@ -214,8 +214,8 @@ def calls_change(first: SetUpRecord, second: SetUpRecord, wanted_per_m2: float |
         return None
     calls = (int(one.calls.sum()), int(two.calls.sum()))
     (boards_1, calling_1), (boards_2, calling_2) = _calling(one), _calling(two)
-    # Scores on identical frames are alike if the calibration took the same number for threshold, which two ways of
-    # scoring do by chance only where scores are few whole numbers. A given threshold had no luck.
+    # scores on identical frames are alike if the calibration took the same number for threshold, which two scorings do
+    # by chance only where scores are few whole numbers; a given threshold had no luck
     given = not (first.calibration_runs or second.calibration_runs)
     way: Literal["signs", "calibrations", "both"] = "both"
     if first.frames_digest != second.frames_digest:
@@ -244,13 +244,13 @@ def calls_change(first: SetUpRecord, second: SetUpRecord, wanted_per_m2: float |
 
 
 def _calling(table: Unflawed) -> tuple[int, int]:
-    """(boards, those of them that called), in the first repeat of each: repeats of one board are not independent."""
+    """Return (boards, those that called) in the first repeat of each: repeats of one board are not independent."""
     first = table.repeat == table.repeat.min()
     return int(first.sum()), int((table.calls[first] > 0).sum())
 
 
 def _rank(record: SetUpRecord, wanted_per_m2: float | None) -> tuple[int, int] | None:
-    """(r, n + 1 - r): the threshold is the r-th highest of n calibration runs' scores; None where it was given."""
+    """Return (r, n + 1 - r): the threshold is the r-th highest of n calibration scores; None where it was given."""
     n = record.calibration_runs
     if not n:
         return None

@@ -56,7 +56,7 @@ class StoredColumn:
 
 
 def _one_table(table: Any) -> Any:
-    """Refuse columns of different lengths and rows that stand there twice."""
+    """Refuse columns of different lengths, and repeated rows."""
     columns = {name: column for name, column in vars(table).items() if isinstance(column, np.ndarray)}
     lengths = {len(column): f"{name} {len(column)}" for name, column in columns.items()}
     if len(lengths) > 1:
@@ -233,7 +233,7 @@ def read_record(path: Path) -> StudyRecord:
     none, where it is not a record or is damaged (with set-up and field), and where it is of another version."""
     file = Path(path) / "study.json" if Path(path).is_dir() else Path(path)
     try:
-        data = strict_json(bounded_bytes(file, RECORD_BYTES), nan=True)  # its form says where a NaN stands
+        data = strict_json(bounded_bytes(file, RECORD_BYTES), nan=True)  # NaN is allowed in the record's columns
     except OSError as error:
         fix = "name a folder that a sweep with a `study` wrote, such as results/detection_limit/<digest>"
         raise UserError(f"{file}: cannot be read ({error.strerror})", fix=fix) from error

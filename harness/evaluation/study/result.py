@@ -227,7 +227,7 @@ def _damage_words(facts: Mapping[str, Any]) -> str:
 
 
 def _missing(limits: Sequence[SetUpLimit], facts: Mapping[str, Any]) -> tuple[str, ...]:
-    """Name the subjects that no number of this study speaks of."""
+    """Return the subjects that this study does not cover."""
     source, sweep = facts.get("source", {}), facts.get("sweep") or {}
     target = source.get("target", {})
     only = f": all are {KINDS[kind]}" if (kind := _one_kind(facts)) else ""

@@ -36,7 +36,7 @@ class OverUnits:
 
     @property
     def units(self) -> int:
-        """Number of units."""
+        """The number of units."""
         return len(self.a90_mm)
 
 

@@ -1,8 +1,8 @@
-"""The verdict whether a detection limit has become worse: a factor *and* a paired test, as asv judges benchmarks. Worse
-is a set-up whose a90, or rate of false calls, has grown by more than `MARGIN`, or whose signals over the threshold have
-fallen by as much, and than chance explains, by Holm's step-down over the three questions of all set-ups at `ALPHA`; or
-that has no limit any more. On the same boards the tests of hits and of a90 answer for the limit, on other boards the
-bootstrap of a90. See `harness.evaluation.study.paired`."""
+"""The verdict whether a detection limit has become worse: a factor *and* a paired test, as asv judges benchmarks. A
+set-up is worse if its a90, or its rate of false calls, has grown (or its signals over the threshold have fallen) by
+more than `MARGIN` and by more than chance explains, by Holm's step-down over the three questions of all set-ups at
+`ALPHA`; or if it has lost its limit. On the same boards the tests of hits and of a90 decide on the limit, on other
+boards the bootstrap of a90. See `harness.evaluation.study.paired`."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from harness.evaluation.study.record import SetUpRecord, StudyRecord
 from harness.vocabulary.seeds import canonical_json
 
 MARGIN = 1.10
-"""Growth of a90, the rate of false calls, or the threshold over signals up to which nothing is worse, or better."""
+"""Growth of a90, the rate of false calls, or the threshold over signals up to which nothing is worse or better."""
 ALPHA = 0.001
 """Level of a gate's tests, for a whole comparison. As low as this because each set-up's luck with the calibration of
 its threshold is in no test over boards; see `harness.check` for how often the rule fails with it."""
 QUESTIONS = 3
-"""Limit, false calls and signals of a set-up."""
+"""The questions about a set-up: its limit, false calls and signals."""
 
 Mark = Literal[
     "worse", "better", "as good", "not significant", "newly failing", "newly working", "no limit",
     "not comparable", "only in first", "only in second",
 ]  # fmt: skip
 SIGNS: dict[Mark, str] = dict(zip(get_args(Mark), "+- ~!* x<>", strict=True))
-"""asv's signs, where it has one: + is a larger number, which is worse."""
+"""Signs of the marks, asv's where it has one: + means a larger number, which is worse."""
 OTHER_DAMAGE_P = 0.001
-"""Boards drawn anew from one family differ by chance; less likely than this, they are taken for another family."""
+"""Boards drawn anew from one family differ by chance; at a smaller p they are taken for another family."""
 Pair = tuple[SetUpRecord | None, SetUpRecord | None]
 
 
@@ -63,7 +63,7 @@ class ComparedSetUps:
 
     @property
     def is_worse(self) -> bool:
-        """Return whether a gate fails on it."""
+        """True where a gate fails on this set-up."""
         return self.mark in ("worse", "newly failing")
 
 
@@ -77,7 +77,7 @@ class Comparison:
     alpha: float = ALPHA
 
     def marked(self, *marks: Mark) -> tuple[ComparedSetUps, ...]:
-        """Rows with one of these marks."""
+        """Return the rows with one of these marks."""
         return tuple(row for row in self.rows if row.mark in marks)
 
 
@@ -104,7 +104,7 @@ def compare_studies(first: StudyRecord, second: StudyRecord, alpha: float = ALPH
         calls = paired.calls_change(one, other, first.false_calls_per_m2)
         signal = paired.signal_change(one, other) if same else None
         rows.append(ComparedSetUps(before, now, changed, paired.limit_change(before, now, same), hits, calls, signal))
-    # A question that was not asked is no member of the family.
+    # a question that was not asked does not belong to the family of tests
     p_values = [p for row in rows for p in _p_values(row)]
     sides = []
     for side in (0, 1):
@@ -120,7 +120,7 @@ def compare_studies(first: StudyRecord, second: StudyRecord, alpha: float = ALPH
 
 
 def holm(p_values: Iterable[float]) -> np.ndarray:
-    """Adjusted p (n,) by Holm's step-down (1979): those below a level hold together at that level."""
+    """Return adjusted p (n,) by Holm's step-down (1979): those below a level hold together at that level."""
     p = np.asarray(list(p_values), float)
     order = np.argsort(p, kind="stable")
     stepped = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1))
@@ -131,7 +131,7 @@ def holm(p_values: Iterable[float]) -> np.ndarray:
 
 def paired_set_ups(first: StudyRecord, second: StudyRecord) -> tuple[Pair, ...]:
     """Pair set-ups by variant and frames; those left by place on the axes and frames; a single one of each is a pair.
-    In the order of ``first``; what only one study has stands with None, the second's at the end."""
+    In the order of ``first``; set-ups of only one study are paired with None, those of the second at the end."""
     if len(first.set_ups) == len(second.set_ups) == 1:
         return ((first.set_ups[0], second.set_ups[0]),)
     partner: dict[int, SetUpRecord] = {}
@@ -189,7 +189,7 @@ def differences(one: SetUpRecord, other: SetUpRecord) -> tuple[str, ...]:
 
 
 def _p_values(row: ComparedSetUps) -> tuple[Tails | None, Tails | None, Tails | None]:
-    """(worse, better) of the limit, of false calls and of signals."""
+    """Return (worse, better) p values of the limit, of false calls and of signals."""
     calls = None if row.calls is None else (row.calls.more_p, row.calls.fewer_p)
     signal = None if row.signal is None else (row.signal.less_p, row.signal.more_p)
     if row.limit is None:
@@ -201,7 +201,7 @@ def _p_values(row: ComparedSetUps) -> tuple[Tails | None, Tails | None, Tails | 
 
 
 def _verdict(row: ComparedSetUps, alpha: float) -> tuple[Mark, str]:
-    """Mark and reason; what fails comes first, and both ways more than the margin and not by chance."""
+    """Return mark and reason; failures come first. Growth either way must exceed both the margin and chance."""
     first, second, calls = row.first, row.second, row.calls
     assert first is not None and second is not None
     growth, grown = _growth(first, second), f"a90 {first.a90_mm:.2f} → {second.a90_mm:.2f} mm"
@@ -234,7 +234,7 @@ def limit_margin(signal: paired.SignalChange | None) -> float:
 
 
 def _lost(before: SetUpLimit, now: SetUpLimit) -> str:
-    """Say what ``before`` had and ``now`` has not; empty where nothing."""
+    """Name what ``before`` had and ``now`` has not; empty where nothing."""
     if now.record.failed > before.record.failed:
         return f"{now.record.failed} trials failed, {before.record.failed} before"
     if np.isfinite(before.a90_mm) and not np.isfinite(now.a90_mm):
@@ -243,7 +243,7 @@ def _lost(before: SetUpLimit, now: SetUpLimit) -> str:
 
 
 def _growth(first: SetUpLimit, second: SetUpLimit) -> float:
-    """a90 over a90; infinite (0) where a90/95 is demonstrated no more (for the first time); NaN where a limit lacks."""
+    """Return a90 over a90; infinite (0) if a90/95 is demonstrated no more (for the first time); NaN without a limit."""
     before, now = first.a90_95.demonstrated, second.a90_95.demonstrated
     ratio = second.a90_mm / first.a90_mm
     if before == now or not np.isfinite(ratio):

@@ -225,7 +225,7 @@ class _TooMuch(Exception):
 
 
 class _BoundedParser(Parser):
-    """Refuses before composing recurses too deep, scanning gets slow, as it does with depth, or nodes fill memory."""
+    """Refuses a text before composing recurses too deep, scanning slows down with depth, or nodes fill memory."""
 
     depth = nodes = 0
 

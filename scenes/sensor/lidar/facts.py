@@ -121,8 +121,7 @@ class ScannedLidar(CameraFacts):
 
     @cached_property
     def weights(self) -> np.ndarray:
-        """Spectrum (K,) of the correlation's pulse on lines 1..K of the comb; 1 at frequency 0, which is filtered
-        out."""
+        """Spectrum (K,) of the correlation's pulse on lines 1..K of the comb; 1 at frequency 0, which is removed."""
         deviation_s = self.code.correlation_fwhm_ns.value * NS / FWHM_PER_DEVIATION
         last_hz = np.sqrt(-2 * np.log(self.code.band_floor.value)) / (2 * np.pi * deviation_s)
         lines = np.arange(1, int(last_hz * self.period_s) + 1)
