@@ -6,7 +6,6 @@ import argparse
 import json
 import re
 import shlex
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
@@ -204,4 +203,4 @@ def _exactly(surface: LimitSurface, place: Mapping[str, float], about: dict[str,
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

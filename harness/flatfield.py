@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -132,4 +131,4 @@ def _halves(recording: Recording) -> Iterator[Recording]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -146,4 +145,4 @@ def _stated(options: argparse.Namespace) -> PodStatement:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

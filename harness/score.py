@@ -10,7 +10,6 @@ it (Bergmann et al., International Journal of Computer Vision 129 (2021), 1038),
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -251,4 +250,4 @@ def area_under(scores: np.ndarray, found: np.ndarray, false: np.ndarray, limit: 
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())
