@@ -8,17 +8,15 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from scipy.optimize import isotonic_regression
 
 from harness.evaluation.intervals import Interval, percentiles
 from harness.evaluation.summary import false_calls, noise_against_frames
 from harness.tables.trials import EFFECTS, ResultTables
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 MEASURES = ("extent", "model")
 KEYS = ["variant", "frames"]
@@ -115,8 +113,6 @@ def compare_set_ups(
     ``half_*``, of set-ups alone, need ``half_sizes``, a bootstrap; for each measure ``<measure>_*`` of all single
     diameters of found holes against the truth, ``<measure>_place_*`` of distances from the largest hole (none where
     several are); noise of the averaged z on probe pixels, and means over hole-free runs of ``tables.noise``."""
-    import pandas as pd
-
     summary, halved = summary[summary["variant"].isin(variants)], set_ups_of(tables) if half_sizes else []
     groups = summary.groupby(KEYS, sort=False)
     table = pd.DataFrame([_row(tables, part, variant in halved) for (variant, _), part in groups])
