@@ -107,8 +107,6 @@ def _list_results(options: argparse.Namespace) -> int:
 
 
 def _list_cache(options: argparse.Namespace) -> int:
-
-    from harness.vocabulary.files import size_text
     from scenes.render.cache import leftovers, stored_renders
 
     if options.name is not None:
@@ -129,7 +127,6 @@ def _list_cache(options: argparse.Namespace) -> int:
 
 
 def _print_json(value: Any) -> int:
-
     print(json.dumps(value, indent=2, ensure_ascii=False))
     return 0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from harness.inspection.arguments import READING, add_reading, reading_of
+from harness.inspection.arguments import READING, add_reading, opened, reading_of
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program, whole_number
 
@@ -42,7 +42,6 @@ def main(options: argparse.Namespace, command: str) -> int:
             from harness.own_camera.capture import run_capture
 
             return run_capture(options, command)
-        from harness.inspection.arguments import opened
         from harness.scorecard.board import run_board
 
         if options.camera or options.mask:

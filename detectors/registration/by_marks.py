@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import gammaincc
 
 from detectors.marks.mark import Mark, off_line_problem
 from detectors.marks.pairing import SHARED_M, Placement, pair_marks, place
@@ -38,8 +39,6 @@ def register_by_marks(reference: PreparedView, view: PreparedView) -> registered
     """Return the pose of a view relative to the reference, from their trusted marks; ``overlap`` stays NaN. Too few
     marks, marks on a line, and marks that fit nowhere, badly or in several ways are its ``failure``; the transform is
     then the best known, or else the guess, or else the identity."""
-    from scipy.special import gammaincc
-
     guess = registered.guess_of(reference, view)
     ours, theirs, problem, notes = _matched(reference, view)
     if len(ours) < 3:

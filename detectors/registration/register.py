@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from detectors.average import CORRELATED_PIXELS
 from detectors.registration import registered
@@ -61,8 +62,6 @@ def _agreement(
     reference: PreparedView, ours: registered.Sampling, view: PreparedView, T_reference_view: np.ndarray
 ) -> Agreement:
     """The agreement of a view placed by ``T_reference_view`` with the reference's target, sampled as ``ours``."""
-    from scipy.spatial import cKDTree
-
     theirs, points, marks = registered.sampling_of(view), reference.points_m, reference.mark_points_m
     pitch, noise = max(ours.pitch_m, theirs.pitch_m), float(np.hypot(ours.noise_m, theirs.noise_m))
     beside, together, apart, marks_m = np.zeros(1, bool), np.zeros(1, bool), float("nan"), float("nan")

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from detectors.average import CORRELATED_PIXELS
 from detectors.views import PreparedView
@@ -73,8 +75,6 @@ def displacement_jacobian(points_m: np.ndarray, centre_m: np.ndarray) -> np.ndar
 
 def moved_by(motion: np.ndarray, centre_m: np.ndarray) -> np.ndarray:
     """Return the transform (4, 4) of a motion (w, t) about a centre (3,): a turn by the vector w, and a shift by t."""
-    from scipy.spatial.transform import Rotation
-
     T = np.eye(4)
     T[:3, :3] = Rotation.from_rotvec(motion[:3]).as_matrix()
     T[:3, 3] = centre_m - T[:3, :3] @ centre_m + motion[3:]
@@ -218,8 +218,6 @@ def _on_grid(cloud: Cloud, inside: np.ndarray) -> tuple[float, float]:
 
 def _without_grid(points_m: np.ndarray) -> tuple[float, float]:
     """Pitch, and noise by the distances of points to the plane through their 25 nearest; 0 where there are too few."""
-    from scipy.spatial import cKDTree
-
     if len(points_m) < 2:
         return 0.0, 0.0
     # neighbours along the surface: those in space would be chosen by their noise

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from scipy import ndimage, sparse
+from scipy.stats import qmc
 
 from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR, Region, invert, rotate_vectors, transform_points
 from scenes.optics import NoiseFreeView, Optics, RenderConfig, footprint_of, wave_numbers
@@ -132,8 +133,6 @@ def noise_lines(frequencies_hz: tuple[float, ...]) -> list[int]:
 def _sobol(dimensions: int, longest: int, seed: int) -> np.ndarray:
     """Return the low-discrepancy points of all batches as flat float32, in the order batch, point, dimension."""
     rng = np.random.default_rng([seed, 0x1D1EC7])
-    from scipy.stats import qmc  # this import is half of a process's start; only processes that render need it
-
     points = np.stack([qmc.Sobol(dimensions, seed=rng).random(longest) for _ in range(BATCHES)])
     return np.ascontiguousarray(points, np.float32).ravel()
 

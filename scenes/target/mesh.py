@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import trimesh
 from scipy.ndimage import gaussian_filter, map_coordinates, zoom
@@ -64,8 +65,6 @@ def reflectance(pattern: np.ndarray, mean: float, contrast: float) -> np.ndarray
 
 def image_pattern(file: str) -> np.ndarray:
     """Return an image's brightness in linear light over its mean, less 1: (rows, columns), `MAX_TEXELS` at most."""
-    import cv2
-
     try:
         image = cv2.imdecode(np.frombuffer(bounded_bytes(Path(file), MOST_IMAGE_BYTES), np.uint8), cv2.IMREAD_ANYDEPTH)
     except (OSError, cv2.error) as error:
