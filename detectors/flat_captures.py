@@ -68,11 +68,6 @@ class FlatCapture:
         """Root mean square of the frames' noise in the average."""
         return _rms(np.sqrt(self.variance_m2[np.isfinite(self.residual_m)]))
 
-    @property
-    def residual_rms_m(self) -> float:
-        """Root mean square of pattern, shape and noise."""
-        return _rms(self.residual_m[np.isfinite(self.residual_m)])
-
 
 @dataclass(frozen=True)
 class PatternChange:

@@ -84,17 +84,15 @@ def grid_of(kind: str, rows: Sequence[Row]) -> Grid:
         heads = ("version", "what it does")
     lines = []
     for row in rows:
-        cells = _camera_cells(row) if "title" in row else (row.get("version") or "-", row.get("about", ""))
+        cells = (row.get("version") or "-", row.get("about", ""))
+        if "title" in row:
+            near, far = row["nearest_m"], row["farthest_m"]
+            reach = f"from {near:.4g} m" if far is None else f"{near:.4g} to {far:.4g} m"
+            cells = f"{row['columns']} x {row['rows']}", reach, f"{row['wavelength_nm']:.4g} nm", row["title"]
         if "broken" in row:
             cells = ("-",) * (len(heads) - 1) + (f"broken: {row['broken']}",)
         lines.append((row["name"], f"{row['package']} {row['package_version']}".strip(), *cells))
     return Grid.of(("name", "package", *heads), lines, left=2 + len(heads))
-
-
-def _camera_cells(row: Row) -> tuple[str, ...]:
-    near, far = row["nearest_m"], row["farthest_m"]
-    reach = f"from {near:.4g} m" if far is None else f"{near:.4g} to {far:.4g} m"
-    return f"{row['columns']} x {row['rows']}", reach, f"{row['wavelength_nm']:.4g} nm", row["title"]
 
 
 def _origin(offer: Offer) -> Row:

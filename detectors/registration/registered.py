@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from detectors.average import CORRELATED_PIXELS
+from detectors.noise import sigma_of
 from detectors.views import PreparedView
 from harness.vocabulary.geometry import MM, Cloud, invert, transform_points
 
@@ -114,8 +115,6 @@ def clustered_sandwich(curvature: np.ndarray, scores: np.ndarray, points_m: np.n
 
 NOISE_LAG = 6
 """Pixels between the points of a second difference: beyond the widest depth filter, so that errors are independent."""
-MEDIAN_TO_SIGMA = 1 / 0.6745
-"""Standard deviation of a Gaussian over its median absolute deviation."""
 MIN_OVERLAP = 0.1
 """Share of the view beside the reference's target below which nothing is left to judge the rest by."""
 MOVING_PITCHES = 0.5
@@ -212,7 +211,7 @@ def _on_grid(cloud: Cloud, inside: np.ndarray) -> tuple[float, float]:
     values = np.concatenate(bends)
     values = values[np.isfinite(values)]
     # fewer values say nothing; a second difference of white noise has sqrt(6) of its sigma
-    noise = float(np.median(np.abs(values))) * MEDIAN_TO_SIGMA / np.sqrt(6.0) if len(values) >= 100 else float("nan")
+    noise = sigma_of(values) / np.sqrt(6.0) if len(values) >= 100 else float("nan")
     return max(steps) or float("nan"), noise
 
 
@@ -230,7 +229,7 @@ def _without_grid(points_m: np.ndarray) -> tuple[float, float]:
         return pitch, 0.0
     near = points_m[nearest]
     across = np.einsum("ij,ij->i", thinned(points_m) - near.mean(axis=1), local_normals(near))
-    return pitch, float(np.median(np.abs(across))) * MEDIAN_TO_SIGMA / np.sqrt(1 - 3 / count)
+    return pitch, sigma_of(across) / np.sqrt(1 - 3 / count)
 
 
 def still_moving(step_m: float, pitch_m: float) -> str:

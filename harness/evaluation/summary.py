@@ -48,7 +48,7 @@ def summarise_holes(holes: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFra
     out["detected"] = groups["detected"].sum().astype(int)
     out["rate"] = out["detected"] / out["n"]
     out["rate_low"], out["rate_high"] = intervals.wilson(out["detected"], out["n"])
-    out["status"] = [status_of(low, high) for low, high in zip(out["rate_low"], out["rate_high"], strict=True)]
+    out["status"] = np.select([out["rate_low"] > 0.5, out["rate_high"] < 0.5], ["found", "missed"], "undecided")
     for measure in ("extent", "model"):
         out = pd.concat([out, _measured(groups, out, measure)], axis=1)
     out = pd.concat([out, _fitted(holes, out)], axis=1)
@@ -60,13 +60,6 @@ def summarise_holes(holes: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFra
 def with_columns(holes: pd.DataFrame) -> pd.DataFrame:
     """The table of holes, with its columns where it came without any because no trial on the damaged board ended."""
     return holes if "hole" in holes else holes.reindex(columns=[column.name for column in TRIALS.columns])
-
-
-def status_of(rate_low: float, rate_high: float) -> HoleState:
-    """`FOUND_RULE` for one interval of a detection rate."""
-    if rate_low > 0.5:
-        return "found"
-    return "missed" if rate_high < 0.5 else "undecided"
 
 
 def found_rule(trials: int) -> str:
