@@ -14,6 +14,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import lsqr
 
 from detectors.flat_field import NEAR_ENOUGH, FlatField
 from detectors.noise import LEAST_FRAMES, average_variance_m2, sigma_of
@@ -65,11 +67,6 @@ class FlatCapture:
     def noise_m(self) -> float:
         """Root mean square of the frames' noise in the average."""
         return _rms(np.sqrt(self.variance_m2[np.isfinite(self.residual_m)]))
-
-    @property
-    def residual_rms_m(self) -> float:
-        """Root mean square of pattern, shape and noise together."""
-        return _rms(self.residual_m[np.isfinite(self.residual_m)])
 
 
 @dataclass(frozen=True)
@@ -180,9 +177,6 @@ def _solved(
     of squares of noise, pattern and shape, each over its own variance. The variance follows from beliefs passed between
     pixels and cells, exact but for loops and for what smooth fits take of the shape: before a wall rough by half of an
     Azure Kinect's pattern the true deviation is 1.3 times as large."""
-    from scipy import sparse
-    from scipy.sparse.linalg import lsqr
-
     there = np.isfinite(residuals)
     pixel = np.flatnonzero(there) % there[0].size
     value, noise_m2 = residuals[there], variances[there]

@@ -17,6 +17,8 @@ import cv2
 import numpy as np
 import threadpoolctl
 from pydantic import Field
+from scipy.interpolate import LinearNDInterpolator
+from scipy.spatial import cKDTree
 
 from detectors.average import AverageConfig, average
 from detectors.background import background
@@ -165,8 +167,6 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
 
     def _below(self, points: np.ndarray, central: bool) -> np.ndarray:
         """Return where the rays through points (n, 3) meet the reference (n, 3), by linear interpolation."""
-        from scipy.interpolate import LinearNDInterpolator
-
         (plan, reference), z = (each[:, :2] for each in (points, self._reference_m)), self._reference_m[:, 2]
         if central:
             plan, reference = plan / points[:, 2:], reference / z[:, None]
@@ -267,8 +267,6 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
 
     def _features(self, cloud: Cloud, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the averaged features (n, 33) of the masked points, and their rows and columns (n,)."""
-        from scipy.spatial import cKDTree
-
         settings, points = self.settings, np.ascontiguousarray(cloud.points_m[mask])
         if len(points) <= settings.feature_neighbours:
             raise UserError(f"{len(points)} points are too few for features of {settings.feature_neighbours}")
@@ -306,6 +304,4 @@ def coreset(features: np.ndarray, size: int) -> np.ndarray:
 
 def nearest(features: np.ndarray, memory: np.ndarray) -> np.ndarray:
     """Return the distance (n,) of each feature (n, k) from the nearest in the memory (m, k)."""
-    from scipy.spatial import cKDTree
-
     return np.asarray(cKDTree(memory).query(features)[0])

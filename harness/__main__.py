@@ -103,4 +103,4 @@ def _completion() -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

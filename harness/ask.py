@@ -6,7 +6,6 @@ import argparse
 import json
 import re
 import shlex
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from harness.tables.outputs import ATLAS_PAGE, ATLAS_PICTURE
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.files import shipped
+from harness.vocabulary.files import shipped, write_text
 from harness.vocabulary.meshes import UNITS_M
 from harness.vocabulary.program import program
 
@@ -65,7 +64,6 @@ def main(options: argparse.Namespace, command: str) -> int:
         _answer(options, surfaces, titles, about)
     if options.out is not None:
         from harness.report.atlas import atlas_html, save_atlas_png
-        from harness.vocabulary.files import write_text
 
         rows = curves(surfaces, titles)
         write_table(options.out, ATLAS, ATLAS.frame(rows), about)
@@ -204,4 +202,4 @@ def _exactly(surface: LimitSurface, place: Mapping[str, float], about: dict[str,
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -7,7 +7,7 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-from harness.inspection.arguments import add_reading
+from harness.inspection.arguments import add_reading, read_poses, reading_of, refuse_repeats
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
 
@@ -47,7 +47,6 @@ def main(options: argparse.Namespace, command: str) -> int:
     import numpy as np
 
     from harness.evaluation.study.record import read_record
-    from harness.inspection.arguments import read_poses, reading_of, refuse_repeats
     from harness.inspection.told import print_notes, print_warnings
     from harness.own_camera.camera_file import Stated, camera_of_size, opened_as, simulated, with_lens, write_camera
     from harness.own_camera.certificate import write_certificate
@@ -117,4 +116,4 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -119,4 +119,4 @@ def _baseline(path: Path, *, update: bool) -> StudyRecord | None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

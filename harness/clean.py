@@ -106,4 +106,4 @@ def _agreed(options: argparse.Namespace, what: str, count: int) -> bool:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -67,4 +66,4 @@ def write_comparison(comparison: Comparison, folder: Path, command: str) -> None
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

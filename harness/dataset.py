@@ -163,4 +163,4 @@ def _finish(out: Path, samples: list[Sample], about: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

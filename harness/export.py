@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -136,4 +135,4 @@ def _write_beside(
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

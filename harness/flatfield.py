@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harness.inspection.arguments import add_reading
+from harness.inspection.arguments import add_reading, crop_from_text, opened, read_poses, reading_of, refuse_repeats
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Lens
 from harness.vocabulary.program import program
@@ -79,8 +78,6 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def _draw(figure: Figure, error_m: np.ndarray, title: str) -> None:
-    import numpy as np
-
     axes, limit = figure.subplots(), SHOWN_SIGMAS * float(np.nanstd(error_m)) / MM
     shown = axes.imshow(error_m / MM, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
     axes.set(xlabel="u, px", ylabel="v, px")
@@ -97,7 +94,6 @@ def _captures(options: argparse.Namespace) -> tuple[Lens, list[FlatCapture], lis
     from detectors.crop import crop
     from detectors.flat_captures import flattened
     from detectors.local import LocalConfig
-    from harness.inspection.arguments import crop_from_text, opened, read_poses, reading_of, refuse_repeats
     from harness.vocabulary.declaration.diagnose import settings_of
 
     config = settings_of(LocalConfig, {"crop": crop_from_text(options.crop)}, f"--crop {options.crop}").crop
@@ -132,4 +128,4 @@ def _halves(recording: Recording) -> Iterator[Recording]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

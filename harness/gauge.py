@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -152,4 +151,4 @@ def _laid_out(options: argparse.Namespace, sizes: np.ndarray) -> Gauge:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -213,4 +213,4 @@ def _shares(options: argparse.Namespace, recordings: str, peaks_mm: list[float])
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

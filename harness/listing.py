@@ -15,8 +15,14 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
+from detectors import DETECTORS, detector_type, load_detector
+from harness.engine.journal import SEGMENT_NAME, Journal
+from harness.engine.work import LOCK
 from harness.tables.outputs import EXPERIMENT, JOURNAL, LATEST, LOCK_NAME, PROVENANCE, is_output
 from harness.tables.text import Grid, many
+from harness.vocabulary.declaration.shape import Declared, default_at, every_key, get, kinds_of, legal_at, plain
 from harness.vocabulary.declaration.yaml_source import read_yaml
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, lock, opened_lock, strict_json
@@ -25,6 +31,7 @@ from harness.vocabulary.plug_ins import Offer, PlugIns
 from harness.vocabulary.provenance import RESULTS_VERSION
 from harness.vocabulary.seeds import canonical_json
 from scenes.render.cache import StoredFile, leftovers, longest_unused, stored_renders
+from scenes.sensor.camera import CAMERAS, load_camera, number_paths
 
 BYTES = {"kB": 1e3, "MB": 1e6, "GB": 1e9, "TB": 1e12}  # powers of ten, as disks are sold
 
@@ -44,13 +51,7 @@ SETTABLE = {"detectors": "settings", "cameras": "numbers"}  # kinds of offers, a
 
 def plug_ins(kind: str) -> PlugIns:
     """Return the detectors or the cameras."""
-    if kind == "detectors":
-        from detectors import DETECTORS
-
-        return DETECTORS
-    from scenes.sensor.camera import CAMERAS
-
-    return CAMERAS
+    return DETECTORS if kind == "detectors" else CAMERAS
 
 
 def offered(kind: str) -> list[Row]:
@@ -83,17 +84,15 @@ def grid_of(kind: str, rows: Sequence[Row]) -> Grid:
         heads = ("version", "what it does")
     lines = []
     for row in rows:
-        cells = _camera_cells(row) if "title" in row else (row.get("version") or "-", row.get("about", ""))
+        cells = (row.get("version") or "-", row.get("about", ""))
+        if "title" in row:
+            near, far = row["nearest_m"], row["farthest_m"]
+            reach = f"from {near:.4g} m" if far is None else f"{near:.4g} to {far:.4g} m"
+            cells = f"{row['columns']} x {row['rows']}", reach, f"{row['wavelength_nm']:.4g} nm", row["title"]
         if "broken" in row:
             cells = ("-",) * (len(heads) - 1) + (f"broken: {row['broken']}",)
         lines.append((row["name"], f"{row['package']} {row['package_version']}".strip(), *cells))
     return Grid.of(("name", "package", *heads), lines, left=2 + len(heads))
-
-
-def _camera_cells(row: Row) -> tuple[str, ...]:
-    near, far = row["nearest_m"], row["farthest_m"]
-    reach = f"from {near:.4g} m" if far is None else f"{near:.4g} to {far:.4g} m"
-    return f"{row['columns']} x {row['rows']}", reach, f"{row['wavelength_nm']:.4g} nm", row["title"]
 
 
 def _origin(offer: Offer) -> Row:
@@ -102,16 +101,12 @@ def _origin(offer: Offer) -> Row:
 
 def _facts(kind: str, name: str) -> Row:
     if kind == "detectors":
-        from detectors import detector_type, load_detector
-
         loaded = detector_type(name)
         try:
             version = load_detector(name, {}).version
         except UserError:  # not known without settings
             version = None
         return {"version": version, "about": (inspect.getdoc(loaded) or "").strip().partition("\n")[0]}
-    from scenes.sensor.camera import load_camera
-
     camera = load_camera(name)
     optics = camera.optics
     return {
@@ -126,11 +121,6 @@ def _facts(kind: str, name: str) -> Row:
 
 def _detector_settings(name: str) -> list[dict[str, Any]]:
     """Yield every setting with default and legal values; for one of several kinds, those of the default kind."""
-    from pydantic import ValidationError
-
-    from detectors import detector_type
-    from harness.vocabulary.declaration.shape import Declared, kinds_of, legal_at
-
     settings_type = detector_type(name).settings_type
     try:
         defaults = settings_type().to_data()
@@ -150,9 +140,6 @@ def _detector_settings(name: str) -> list[dict[str, Any]]:
 
 def _numbers(name: str) -> list[dict[str, Any]]:
     """Yield every number of the camera's file with its tag and source."""
-    from harness.vocabulary.declaration.shape import get
-    from scenes.sensor.camera import load_camera, number_paths
-
     data = load_camera(name).to_data()
     numbers = {path: get(data, tuple(path.split("."))) for path in number_paths(data)}
     return [{"path": path, "value": n["value"], "about": f"{n['tag']}: {n['source']}"} for path, n in numbers.items()]
@@ -169,9 +156,7 @@ def leaves(data: Mapping[str, Any], path: tuple[str, ...] = ()) -> Iterator[tupl
 
 def reference() -> str:
     """Return every key of an experiment and of tofpod's detectors in Markdown: legal, default, meaning."""
-    from detectors import detector_type
     from harness.experiment.schema import ExperimentConfig
-    from harness.vocabulary.declaration.shape import default_at, every_key, legal_at, plain
 
     sections = {"Experiments": every_key(ExperimentConfig)}
     for offer in plug_ins("detectors").offers():
@@ -267,8 +252,6 @@ def _limits(run: Path) -> list[dict[str, Any]]:
 
 def described(run: Path) -> dict[str, Any]:
     """Describe a folder of results as JSON's types. ``state``: complete, unfinished, running or broken."""
-    from harness.engine.journal import Journal
-
     size_bytes = 0
     for path in files_below(run):
         with contextlib.suppress(OSError):
@@ -304,8 +287,6 @@ def described(run: Path) -> dict[str, Any]:
 
 def in_use(run: Path) -> bool:
     """Return whether a sweep is running in this folder; False if the system has no locks."""
-    from harness.engine.work import LOCK
-
     try:
         if not (run / LOCK).is_file():
             return False
@@ -388,8 +369,6 @@ def chosen_results(out: Path, name: str) -> list[Path]:
 
 def removable(folder: Path) -> list[StoredFile]:
     """Return the files of a folder of results that tofpod wrote, locks last."""
-    from harness.engine.journal import SEGMENT_NAME
-
     found = []
     for path in sorted(files_below(folder), key=lambda path: LOCK_NAME.fullmatch(path.name) is not None):
         above, name = path.parent.relative_to(folder), UNFINISHED.sub(r"\1\2", path.name)

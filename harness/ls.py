@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -108,8 +107,6 @@ def _list_results(options: argparse.Namespace) -> int:
 
 
 def _list_cache(options: argparse.Namespace) -> int:
-
-    from harness.vocabulary.files import size_text
     from scenes.render.cache import leftovers, stored_renders
 
     if options.name is not None:
@@ -130,10 +127,9 @@ def _list_cache(options: argparse.Namespace) -> int:
 
 
 def _print_json(value: Any) -> int:
-
     print(json.dumps(value, indent=2, ensure_ascii=False))
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

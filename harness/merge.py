@@ -124,4 +124,4 @@ def _refuse_others(folders: list[Path], into: Path) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

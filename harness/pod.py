@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -133,8 +132,10 @@ def _stated(options: argparse.Namespace) -> PodStatement:
         raise UserError("--ahat needs --decision: the POD is that of a signal above it", legal=legal, fix=fix)
     responses = options.hit if of_hits else [options.ahat]
     read = table.read_inspections(options.file, options.size, responses, options.target, hits=of_hits)
-    if of_hits:
-        table.require_hits(read)
+    if of_hits and read.response.min() == read.response.max():
+        kind = "hits" if read.response[0] else "misses"
+        what = f"{read.path}: all {len(read.response)} rows of {read.response_column} are {kind}"
+        raise UserError(f"{what}, and a curve needs both hits and misses", fix="add targets of other sizes")
     if options.log:
         table.require_positive(read, response=False, why="--log")
     if of_hits:
@@ -146,4 +147,4 @@ def _stated(options: argparse.Namespace) -> PodStatement:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

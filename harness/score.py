@@ -11,7 +11,6 @@ it (Bergmann et al., Int. Journal of Computer Vision 129 (2021), 1038), with eac
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -252,4 +251,4 @@ def area_under(scores: np.ndarray, found: np.ndarray, false: np.ndarray, limit: 
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -80,4 +79,4 @@ def declared(what: str | Path | Mapping[str, Any], board: int) -> TargetConfig:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
-from harness.inspection.arguments import READING, add_reading, reading_of
+from harness.inspection.arguments import READING, add_reading, opened, reading_of
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program, whole_number
 
@@ -43,7 +42,6 @@ def main(options: argparse.Namespace, command: str) -> int:
             from harness.own_camera.capture import run_capture
 
             return run_capture(options, command)
-        from harness.inspection.arguments import opened
         from harness.scorecard.board import run_board
 
         if options.camera or options.mask:
@@ -60,4 +58,4 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
+from scipy.spatial.transform import Rotation
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
@@ -152,8 +153,6 @@ def guessed_T_reference_view(
     views: AnyViews, poses: tuple[PoseConfig, ...], number: int, *labels: str | int
 ) -> np.ndarray:
     """Return the 4x4 nominal pose: the exact one with the error that ``views`` states, in random directions."""
-    from scipy.spatial.transform import Rotation
-
     T_reference_view = T_reference_view_of(poses, number)
     if number == 0:
         return T_reference_view

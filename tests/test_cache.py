@@ -158,8 +158,8 @@ def test_folders_links_and_pipes_under_a_renders_name(stored, view, tmp_path):
 
 def test_a_damaged_render_is_rendered_again_and_a_found_one_is_not(tmp_path, view, monkeypatch):
     target, config, rendered = ThesisTargetConfig().declare(), RenderConfig(), []
-    monkeypatch.setattr(cache, "build_target", lambda target: target)
-    monkeypatch.setattr(cache, "render_view", lambda *_: rendered.append(1) or view)
+    monkeypatch.setattr("scenes.target.mesh.build_target", lambda target: target)
+    monkeypatch.setattr("scenes.render.view.render_view", lambda *_: rendered.append(1) or view)
     path = tmp_path / f"{render_key(target, CAMERA.optics, config)}.npz"
     assert cached_view(target, CAMERA.optics, config, tmp_path)[1] is False
     assert cached_view(target, CAMERA.optics, config, tmp_path)[1] is True

@@ -376,7 +376,7 @@ def test_a_full_disk_leaves_the_old_files_or_none(
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("harness.report.findings.save_picture", full)
+    monkeypatch.setattr("harness.report.findings._save", full)
     assert "the disk is full" in failed(capsys, capture, "--out", out)
     assert out.exists() == existing
     assert not existing or [path.read_text() for path in out.iterdir()] == ["old"]

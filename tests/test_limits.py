@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic_tables import World, joined, tables
 
+from harness.evaluation.intervals import percentiles
 from harness.evaluation.set_ups import Ladder, effect_costs, found_limit_mm, half_size, ladder_of
 from harness.evaluation.summary import summarise_holes
 
@@ -53,11 +54,13 @@ def test_half_size_lies_on_the_ladder_and_falls_when_more_is_found(rates):
 
 def test_interval_is_a_point_without_chance_and_covers_with_it():
     certain = ladder([0, 0, 1, 1], copies=3)
-    assert certain.half_interval.low == certain.half_interval.high == 2.5
+    interval = percentiles(certain.half_draws_mm)
+    assert interval.low == interval.high == 2.5
     rng = np.random.default_rng(1)
     sizes, chance = np.repeat(np.arange(1.0, 10), 3), 1 / (1 + np.exp(-(np.repeat(np.arange(1.0, 10), 3) - 5)))
     covered = [
-        (one := Ladder(sizes, rng.random((10, 27)) < chance).half_interval).low <= 5 <= one.high for _ in range(40)
+        (one := percentiles(Ladder(sizes, rng.random((10, 27)) < chance).half_draws_mm)).low <= 5 <= one.high
+        for _ in range(40)
     ]
     # 95 % nominal; 32 of 40 or fewer would have a chance below 0.001
     assert sum(covered) >= 33

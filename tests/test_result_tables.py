@@ -136,4 +136,4 @@ def test_every_declared_column_has_a_name_of_its_own_and_says_what_it_is() -> No
 
 def test_the_description_of_results_is_current() -> None:
     written = (ROOT / "results" / "README.md").read_text()
-    assert written == results_readme(), "python -m harness.tables.readme > results/README.md writes it anew"
+    assert written == "\n".join(results_readme()), "python -m harness.tables.readme > results/README.md writes it anew"

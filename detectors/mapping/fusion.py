@@ -21,6 +21,8 @@ from dataclasses import dataclass
 from itertools import combinations, product
 
 import numpy as np
+from scipy.optimize import nnls
+from scipy.special import gammaincinv
 
 from detectors.average import pixel_medians
 from detectors.mapping import placing
@@ -90,8 +92,6 @@ def _law(
 ) -> tuple[float, float, float, float]:
     """Return (factor of ``first``, sill, length, exponent), all (c,) in standard errors, of the law with the least chi
     square plus Schwarz's penalty: none (if it ``may_vanish``), ``first`` alone, or both terms."""
-    from scipy.optimize import nnls
-
     penalty = float(np.log(max(len(distance), 2)))
     (level,), misfit = nnls(first[:, None], known)
     best = (float(misfit) ** 2 + penalty, float(level), 0.0, 1.0, 1.0)
@@ -311,9 +311,6 @@ def depth_noise(cloud: Cloud, inside: np.ndarray, deviation_m: np.ndarray) -> tu
     Lange and Seitz 2001), or the range to the fourth where a tenth of the points has no amplitude; a pixel's own sample
     variance would favour pixels quiet by chance. ``deviation_m`` (h, w): z less the view's own smooth surface, whose
     squares stand in for the variances of a single frame. Not modelled: noise that frames share, multipath, pattern."""
-    from scipy.optimize import nnls
-    from scipy.stats import chi2
-
     q, valid = (cloud.points_m**2).sum(axis=-1) ** 2, cloud.valid
     if cloud.amplitude is not None:
         known = valid & (np.nan_to_num(cloud.amplitude) > 0)
@@ -332,7 +329,7 @@ def depth_noise(cloud: Cloud, inside: np.ndarray, deviation_m: np.ndarray) -> tu
     if used.any():
         some = slice(None, None, max(1, len(samples) // SAMPLED))
         numbers, where = np.unique(freedom[some], return_inverse=True)
-        samples = samples[some] / (chi2.median(numbers) / numbers)[where]
+        samples = samples[some] / (2.0 * gammaincinv(numbers / 2.0, 0.5) / numbers)[where]
         x = q[used][some]
         # the law goes through the medians of classes of q: robust against damage in the view
         parts = np.array_split(np.argsort(x, kind="stable"), max(1, min(BINS, len(x) // PER_BIN)))

@@ -14,6 +14,7 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from detectors.crop import crop
 from detectors.mapping.fusion import SurfaceMap, fuse
@@ -157,8 +158,6 @@ class Mapped:
     def view_of_points(self) -> np.ndarray:
         """Return (n,) for each point of the merged cloud the index of its view in ``merged.views_used``, or `SEVERAL`:
         of a map as it knows, else by the nearest point, several where another view has one within twice that."""
-        from scipy.spatial import cKDTree
-
         merged = self.merged
         count = merged.cloud.valid.size
         if merged.surface_map is not None:

@@ -12,6 +12,8 @@ from typing import Any
 
 import numba
 import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.spatial import Delaunay
 
 from detectors.registration.registered import Registration
 from detectors.surface import Surface, SurfaceConfig, fit_surface
@@ -63,8 +65,6 @@ class Raster:
 def raster_between(places: np.ndarray, valid: np.ndarray, organised: bool, spacing: float, grid: CellGrid) -> Raster:
     """Place the cells of a grid among the ``valid`` of samples at ``places`` (v, u, 2), on a pixel grid or not (v = 1).
     ``spacing`` of the samples: a cell is divided into parts that are no larger, and takes their mean."""
-    from scipy.sparse import csr_matrix
-
     parts = max(1, round(grid.step / spacing))
     step = grid.step / parts
     corner = np.array([grid.x0, grid.y0]) - 0.5 * (grid.step - step)
@@ -94,8 +94,6 @@ def _of_grid(valid: np.ndarray) -> np.ndarray:
 
 def _of_points(places: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Return (t, 3) indices of samples (n, 2) without a grid: Delaunay's triangles with short edges."""
-    from scipy.spatial import Delaunay
-
     known = np.flatnonzero(valid)
     triangles = known[Delaunay(places[known]).simplices.astype(np.int64)]
     lengths = np.linalg.norm(places[triangles] - places[np.roll(triangles, 1, axis=1)], axis=-1)

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from detectors.recordings.distances import UNITS_M, default_metres, frame_of, refuse_narrow
@@ -84,8 +85,6 @@ def load_mat(path: Path) -> dict[str, np.ndarray]:
 
 def load_picture(path: Path) -> dict[str, np.ndarray]:
     """Return a TIFF's pages, or a PFM, of numbers or x, y, z. Raises UserError for broken files and pictures."""
-    import cv2
-
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # a message below replaces its output
     try:

@@ -20,9 +20,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import gammaincc
 
 from detectors.marks.mark import Mark, off_line_problem
 from detectors.marks.pairing import SHARED_M, Placement, pair_marks, place
+from detectors.noise import sigma_of
 from detectors.registration import registered
 from detectors.surface import BISQUARE_TUNING, SurfaceConfig, fit_surface
 from detectors.views import PreparedView
@@ -38,8 +40,6 @@ def register_by_marks(reference: PreparedView, view: PreparedView) -> registered
     """Return the pose of a view relative to the reference, from their trusted marks; ``overlap`` stays NaN. Too few
     marks, marks on a line, and marks that fit nowhere, badly or in several ways are its ``failure``; the transform is
     then the best known, or else the guess, or else the identity."""
-    from scipy.special import gammaincc
-
     guess = registered.guess_of(reference, view)
     ours, theirs, problem, notes = _matched(reference, view)
     if len(ours) < 3:
@@ -166,7 +166,7 @@ class JointState:
         by_y = (self.basis(x, y + dy) - self.basis(x, y - dy)) @ self.surface / (2 * dy)
         normals = np.stack([-by_x, -by_y, np.ones(len(x))], axis=1)
         by_pose = np.einsum("ni,nij->nj", normals, registered.displacement_jacobian(points, np.zeros(3)))
-        scale = max(data.noise_m, float(np.median(np.abs(residual))) * registered.MEDIAN_TO_SIGMA)
+        scale = max(data.noise_m, sigma_of(residual))
         tukey = np.clip(1 - (residual / scale / BISQUARE_TUNING) ** 2, 0.0, None) ** 2
         return residual, basis, by_pose, tukey / data.sigma_m**2
 

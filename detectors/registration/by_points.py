@@ -20,6 +20,8 @@ from typing import Any
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from detectors.marks.pairing import kabsch
 from detectors.open3d_library import open3d_on_one_thread
@@ -39,8 +41,6 @@ CONVERGED_PITCHES = 0.05
 
 def register_by_icp(reference: PreparedView, view: PreparedView, config: IcpRegistration) -> registered.Registration:
     """Return the registration of a view to the reference by ICP of their fiducial clouds or targets."""
-    from scipy.spatial import cKDTree
-
     fixed, moving, start, notes, few = registered.clouds_of(reference, view, config.points)
     if few:
         return registered.failed(view, "icp", start, few, *notes)
@@ -236,8 +236,6 @@ def posterior_moments(
     the negative sum of the log likelihood over fixed points, up to the Gaussians' factor. ``background``: the uniform
     component as in equation 6 of Myronenko & Song: (2 pi variance)^(3/2) w / (1 - w) m / n. The nearest component's
     weight is divided out, so that nothing underflows at w = 0."""
-    from scipy.spatial.distance import cdist
-
     places = np.column_stack([moving, np.ones(len(moving))])
     products = np.einsum("mi,mj->mij", places, places).reshape(-1, 16)
     moments, objective = [], 0.0

@@ -11,8 +11,10 @@ from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from detectors.average import CORRELATED_PIXELS
+from detectors.noise import sigma_of
 from detectors.registration import registered
 from detectors.registration.by_marks import register_by_marks, register_jointly
 from detectors.registration.by_points import register_by_cpd, register_by_icp, register_by_odometry
@@ -61,8 +63,6 @@ def _agreement(
     reference: PreparedView, ours: registered.Sampling, view: PreparedView, T_reference_view: np.ndarray
 ) -> Agreement:
     """Return the agreement of a view placed by ``T_reference_view`` with the reference's target, sampled as ours."""
-    from scipy.spatial import cKDTree
-
     theirs, points, marks = registered.sampling_of(view), reference.points_m, reference.mark_points_m
     pitch, noise = max(ours.pitch_m, theirs.pitch_m), float(np.hypot(ours.noise_m, theirs.noise_m))
     beside, together, apart, marks_m = np.zeros(1, bool), np.zeros(1, bool), float("nan"), float("nan")
@@ -77,7 +77,7 @@ def _agreement(
         along = np.linalg.norm(placed - across[:, None] * normals - near[:, 0], axis=1)
         beside = along <= pitch
         together = beside & (np.abs(across) <= max(pitch, 3 * noise))
-        apart = float(np.median(np.abs(across[beside]))) * registered.MEDIAN_TO_SIGMA if beside.any() else apart
+        apart = sigma_of(across[beside]) if beside.any() else apart
         if min(len(fiducial), len(marks)) >= 3:
             distances = np.sort(cKDTree(marks).query(fiducial)[0])[: max(int(TRIMMED * len(fiducial)), 1)]
             marks_m = float(np.sqrt(np.mean(distances**2)))

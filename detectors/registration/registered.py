@@ -6,8 +6,11 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from detectors.average import CORRELATED_PIXELS
+from detectors.noise import sigma_of
 from detectors.views import PreparedView
 from harness.vocabulary.geometry import MM, Cloud, invert, transform_points
 
@@ -73,8 +76,6 @@ def displacement_jacobian(points_m: np.ndarray, centre_m: np.ndarray) -> np.ndar
 
 def moved_by(motion: np.ndarray, centre_m: np.ndarray) -> np.ndarray:
     """Return the transform (4, 4) of a motion (w, t) about a centre (3,): a turn by the vector w, and a shift by t."""
-    from scipy.spatial.transform import Rotation
-
     T = np.eye(4)
     T[:3, :3] = Rotation.from_rotvec(motion[:3]).as_matrix()
     T[:3, 3] = centre_m - T[:3, :3] @ centre_m + motion[3:]
@@ -114,8 +115,6 @@ def clustered_sandwich(curvature: np.ndarray, scores: np.ndarray, points_m: np.n
 
 NOISE_LAG = 6
 """Pixels between the points of a second difference: beyond the widest depth filter, so that errors are independent."""
-MEDIAN_TO_SIGMA = 1 / 0.6745
-"""Standard deviation of a Gaussian over its median absolute deviation."""
 MIN_OVERLAP = 0.1
 """Share of the view beside the reference's target below which nothing is left to judge the rest by."""
 MOVING_PITCHES = 0.5
@@ -212,14 +211,12 @@ def _on_grid(cloud: Cloud, inside: np.ndarray) -> tuple[float, float]:
     values = np.concatenate(bends)
     values = values[np.isfinite(values)]
     # fewer values say nothing; a second difference of white noise has sqrt(6) of its sigma
-    noise = float(np.median(np.abs(values))) * MEDIAN_TO_SIGMA / np.sqrt(6.0) if len(values) >= 100 else float("nan")
+    noise = sigma_of(values) / np.sqrt(6.0) if len(values) >= 100 else float("nan")
     return max(steps) or float("nan"), noise
 
 
 def _without_grid(points_m: np.ndarray) -> tuple[float, float]:
     """Pitch, and noise by the distances of points to the plane through their 25 nearest; 0 where there are too few."""
-    from scipy.spatial import cKDTree
-
     if len(points_m) < 2:
         return 0.0, 0.0
     # neighbours along the surface: those in space would be chosen by their noise
@@ -232,7 +229,7 @@ def _without_grid(points_m: np.ndarray) -> tuple[float, float]:
         return pitch, 0.0
     near = points_m[nearest]
     across = np.einsum("ij,ij->i", thinned(points_m) - near.mean(axis=1), local_normals(near))
-    return pitch, float(np.median(np.abs(across))) * MEDIAN_TO_SIGMA / np.sqrt(1 - 3 / count)
+    return pitch, sigma_of(across) / np.sqrt(1 - 3 / count)
 
 
 def still_moving(step_m: float, pitch_m: float) -> str:

@@ -14,14 +14,8 @@ import numpy as np
 from detectors.interface import Calibratable
 from harness.engine.judge import Rows, detector_of
 from harness.engine.trial import TrialTask, cloud_of
-from harness.vocabulary.seeds import canonical_json
 
 LEARNING_BOARDS = 8  # boards to learn from: at 0.7 m, 200,000 pixels each give a spectrum to a few per cent
-
-
-def learns(detector: str, settings: dict[str, object]) -> bool:
-    """Return whether a detector can learn."""
-    return isinstance(detector_of(detector, canonical_json(settings)), Calibratable)
 
 
 def learn(task: TrialTask) -> Rows:

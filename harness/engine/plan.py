@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from detectors import DETECTORS
+from detectors.interface import Calibratable
 from harness.engine.journal import JOURNAL_VERSION
-from harness.engine.learning import LEARNING_BOARDS, learns
+from harness.engine.judge import detector_of
+from harness.engine.learning import LEARNING_BOARDS
 from harness.engine.setup import SetUpRef
 from harness.engine.trial import PointTask, Role, TrialTask
 from harness.engine.work import Shard
@@ -108,7 +110,8 @@ class Group:
     def learners(self) -> tuple[Point, ...]:
         """The points whose detector learns."""
         pairs = ((point, point.config.detector) for point in self.points)
-        return tuple(point for point, detector in pairs if learns(detector.name, detector.settings))
+        made = ((point, detector_of(one.name, canonical_json(one.settings))) for point, one in pairs)
+        return tuple(point for point, detector in made if isinstance(detector, Calibratable))
 
     @cached_property
     def learned(self) -> dict[str, str]:

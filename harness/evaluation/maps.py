@@ -9,18 +9,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from harness.evaluation.intervals import UNKNOWN, Interval, bootstrap, mean_t
 from harness.evaluation.set_ups import compare_set_ups
 from harness.evaluation.summary import HoleState, Measure, found_holes, with_columns
 from harness.tables.trials import ResultTables
 from harness.vocabulary.path_names import value_text
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 VIEWS, REGISTRATION, MERGE = "mapping.views", "mapping.registration.method", "mapping.merge.kind"
 """The axes of a study of maps that have a meaning of their own here."""
@@ -74,8 +72,6 @@ def maps_of(tables: ResultTables) -> list[MapSetUp]:
 def compare_maps(tables: ResultTables, summary: pd.DataFrame) -> pd.DataFrame:
     """Return rows of `compare_set_ups` for all that have a map, with the fields of `MapSetUp`; over runs on the damaged
     board mean ``views_left_out``, median ``seconds_map``, and the surface noise's deviation ``surface_std_mm``."""
-    import pandas as pd
-
     maps = pd.DataFrame([asdict(one) for one in maps_of(tables)])
     compared = compare_set_ups(tables, summary, [str(name) for name in maps["variant"]], half_sizes=False)
     if compared.empty:
@@ -315,8 +311,6 @@ MOST_REASONS = 3
 def of_map(registrations: pd.DataFrame, method: str, views: int) -> pd.DataFrame:
     """Select the registrations that a map of so many views rests on: those of exactly ``views`` first, else of the
     nearest, since a method that registers each view by itself gives the same for any number of views."""
-    import pandas as pd
-
     rows = registrations[(registrations["method"] == method) & (registrations["view"] < views)]
     if VIEWS not in rows:
         return rows
@@ -330,8 +324,6 @@ def summarise_registrations(registrations: pd.DataFrame) -> pd.DataFrame:
     """Make one row per method and number of frames: numbers, failures, and the errors of those that did not fail. For
     both `PARTS` median, root mean square, the predicted one (of the covariances) and the ``_ratio`` of actual to
     predicted (1: honest, above 1: too sure) with a bootstrap over repeats; ``guess_mm``: of the starting guess."""
-    import pandas as pd
-
     groups = registrations.groupby(["method", "frames"], sort=False)
     rows = [{"method": method, "frames": frames} | _summary(part) for (method, frames), part in groups]
     return pd.DataFrame(rows)
@@ -339,8 +331,6 @@ def summarise_registrations(registrations: pd.DataFrame) -> pd.DataFrame:
 
 def by_views(registrations: pd.DataFrame, counts: Sequence[int]) -> pd.DataFrame:
     """Summarise registrations by method and frames for each number of views, which the column ``views`` tells."""
-    import pandas as pd
-
     parts = []
     for method in dict.fromkeys(registrations["method"]):
         for views in counts:

@@ -8,17 +8,15 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from scipy.optimize import isotonic_regression
 
-from harness.evaluation.intervals import Interval, percentiles
+from harness.evaluation.intervals import percentiles
 from harness.evaluation.summary import false_calls, noise_against_frames
 from harness.tables.trials import EFFECTS, ResultTables
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 MEASURES = ("extent", "model")
 KEYS = ["variant", "frames"]
@@ -62,11 +60,6 @@ class Ladder:
             alike = self.diameters_mm == size
             of_holes[:, alike] = rng.multinomial(alike.sum(), np.full(alike.sum(), 1 / alike.sum()), RESAMPLES)
         return self._half_sizes(of_repeats, of_holes)
-
-    @property
-    def half_interval(self) -> Interval:
-        """95 % percentile interval of the 50 % size."""
-        return percentiles(self.half_draws_mm)
 
     def _half_sizes(self, of_repeats: np.ndarray, of_holes: np.ndarray) -> np.ndarray:
         """(n,) 50 % sizes, repeats (n, repeats) and holes (n, h) weighted by how often they were drawn."""
@@ -115,8 +108,6 @@ def compare_set_ups(
     ``half_*``, of set-ups alone, need ``half_sizes``, a bootstrap; for each measure ``<measure>_*`` of all single
     diameters of found holes against the truth, ``<measure>_place_*`` of distances from the largest hole (none where
     several are); noise of the averaged z on probe pixels, and means over hole-free runs of ``tables.noise``."""
-    import pandas as pd
-
     summary, halved = summary[summary["variant"].isin(variants)], set_ups_of(tables) if half_sizes else []
     groups = summary.groupby(KEYS, sort=False)
     table = pd.DataFrame([_row(tables, part, variant in halved) for (variant, _), part in groups])
@@ -153,7 +144,7 @@ def _row(tables: ResultTables, part: pd.DataFrame, half_sizes: bool) -> dict[str
     }
     if half_sizes:
         ladder = ladder_of(trials)
-        interval = ladder.half_interval
+        interval = percentiles(ladder.half_draws_mm)
         row |= {"half_mm": ladder.half_mm, "half_low_mm": interval.low, "half_high_mm": interval.high}
     of_found = trials[trials["hole"].isin(found)]
     largest = int((part["true_diameter_mm"] == part["true_diameter_mm"].max()).sum())

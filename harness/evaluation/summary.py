@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
 from scipy.optimize import nnls
 
 from harness.evaluation import intervals
 from harness.evaluation.intervals import Interval, bootstrap
 from harness.tables.trials import TRIALS, TRUTH
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 HoleState = Literal["found", "missed", "undecided"]
 Measure = Literal["extent", "model"]
@@ -43,8 +41,6 @@ def summarise_holes(holes: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFra
     fit's, whose depth bias is against ``seen_depth_mm`` (behind a through-hole one sees farther);
     ``model_diameter_covered``: share of fits within 1.96 standard errors.
     Means are over the detected trials only: a hole detected in few trials shows the sizes of its lucky trials."""
-    import pandas as pd
-
     holes = with_columns(holes)
     groups = holes.groupby(GROUP, sort=False)
     out = groups[[*axes, *TRUTH_COLUMNS]].first()
@@ -52,7 +48,7 @@ def summarise_holes(holes: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFra
     out["detected"] = groups["detected"].sum().astype(int)
     out["rate"] = out["detected"] / out["n"]
     out["rate_low"], out["rate_high"] = intervals.wilson(out["detected"], out["n"])
-    out["status"] = [status_of(low, high) for low, high in zip(out["rate_low"], out["rate_high"], strict=True)]
+    out["status"] = np.select([out["rate_low"] > 0.5, out["rate_high"] < 0.5], ["found", "missed"], "undecided")
     for measure in ("extent", "model"):
         out = pd.concat([out, _measured(groups, out, measure)], axis=1)
     out = pd.concat([out, _fitted(holes, out)], axis=1)
@@ -64,13 +60,6 @@ def summarise_holes(holes: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFra
 def with_columns(holes: pd.DataFrame) -> pd.DataFrame:
     """The table of holes, with its columns where it came without any because no trial on the damaged board ended."""
     return holes if "hole" in holes else holes.reindex(columns=[column.name for column in TRIALS.columns])
-
-
-def status_of(rate_low: float, rate_high: float) -> HoleState:
-    """`FOUND_RULE` for one interval of a detection rate."""
-    if rate_low > 0.5:
-        return "found"
-    return "missed" if rate_high < 0.5 else "undecided"
 
 
 def found_rule(trials: int) -> str:
@@ -173,8 +162,6 @@ def noise_against_frames(probes: pd.DataFrame) -> pd.DataFrame:
     repeats. ``offset``: mean error. ``pattern``: deviation over pixels of the mean error, less what few repeats leave
     in it. ``systematic``: both together. ``displacement``: deviation over repeats of the whole cloud, in no other
     column. ``guide``: the shortest average's temporal noise falling as 1/sqrt(N). Pixels without a value are out."""
-    import pandas as pd
-
     rows = []
     for (variant, frames), part in probes.groupby(["variant", "frames"], sort=False):
         moments = _moments(part)

@@ -26,7 +26,7 @@ from harness.vocabulary.files import file_digest, inside
 from harness.vocabulary.seeds import digest
 from scenes.optics import RenderConfig
 from scenes.perspectives import AnyViews
-from scenes.sensor.camera import CameraConfig, camera_digest, camera_of, lens_named, lens_names, load_camera
+from scenes.sensor.camera import CameraConfig, camera_of, lens_named, lens_names, load_camera
 from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.thesis import AnyTargetConfig
 
@@ -285,7 +285,7 @@ def point_of(label: str, variant: str, values: Mapping[str, Any], config: Experi
         target = source.target.to_data() if drawn else source.target.declare().to_data()
         camera, work = camera_of(source.camera), source.render.to_data()
         frames = {"kind": source.kind, "target": target, "render": work}
-        frames["camera"] = {**source.camera.to_data(), "name": camera.name, "facts": camera_digest(camera)}
+        frames["camera"] = {**source.camera.to_data(), "name": camera.name, "facts": digest(camera.to_data())}
         frames |= {} if source.views is None else {"views": source.views.to_data()}
     numbers = {key: value for key, value in config.to_data().items() if key not in NO_NUMBERS}
     numbers |= {"source": frames, "detector_version": detector_version(config)}

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from detectors.recordings.depth_images import read_picture
@@ -52,8 +53,6 @@ def run_capture(options: argparse.Namespace, command: str) -> int:
 
 def read_mask(path: Path) -> np.ndarray:
     """Return (h, w) bool: the pixels of an image that are not black. Raises UserError where it cannot be read."""
-    import cv2
-
     try:
         return np.asarray(read_picture(path, cv2.IMREAD_GRAYSCALE) > 0)
     except UserError as error:

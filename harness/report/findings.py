@@ -112,7 +112,7 @@ def write_findings(
     writers: dict[str, Callable[[Path], object]] = {
         outputs.FINDINGS.name: lambda path: path.write_text(csv_text(judged.findings), encoding="utf-8"),
         outputs.FINDINGS_DATA.name: lambda path: path.write_text(json_text(judged, about), encoding="utf-8"),
-        outputs.ANNOTATED.name: lambda path: save_picture(path, cloud, judged.evidence, detections, title),
+        outputs.ANNOTATED.name: lambda path: _save(path, findings_figure(cloud, judged.evidence, detections, title)),
         cloud_name: lambda path: path.write_bytes(ply_bytes(cloud, detections)),
         **(beside or {}),
     }
@@ -169,11 +169,6 @@ WIDTH_IN, DPI = 11.0, 150
 TAKEN, OTHERS = "#ff00ff", ("#ff9f1c", "#2ec4b6", "#ffee32", "#4cc9f0", "#f94144", "#90be6d", "#bdb2ff")
 """Colours that can be told from grey and from one another, also with red-green blindness."""
 Box = tuple[float, float, float, float]
-
-
-def save_picture(path: Path, cloud: Cloud, evidence: Evidence, detections: Sequence[Detection], title: str) -> None:
-    """Write `findings_figure` as a PNG."""
-    _save(path, findings_figure(cloud, evidence, detections, title))
 
 
 def findings_figure(cloud: Cloud, evidence: Evidence, detections: Sequence[Detection], title: str) -> Figure:

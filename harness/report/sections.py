@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+import pandas as pd
 from markupsafe import Markup
 
 from harness.evaluation.maps import label_of
@@ -20,9 +21,6 @@ from harness.tables.text import Cell, Grid, Tone, inches, many, plus_minus
 from harness.tables.trials import CLAIMS, MARKS, SET_UPS, SUMMARY, ResultTables
 from harness.thesis.claims import Verdict
 from harness.vocabulary.path_names import in_words
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 Row = Mapping[str, Any]
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import pandas as pd
 
 from harness.evaluation.maps import by_views, compare_maps, map_cases, maps_of
 from harness.evaluation.set_ups import compare_set_ups, effect_costs, set_ups_of
@@ -15,10 +17,7 @@ from harness.thesis.inference import posterior_of
 from harness.thesis.views import score_views
 from harness.vocabulary.provenance import RESULTS_VERSION
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-Summaries = Mapping[Table, "pd.DataFrame"]
+Summaries = Mapping[Table, pd.DataFrame]
 LISTS = ("found", "undecided", "reasons")
 """Columns whose values are lists until they are written."""
 

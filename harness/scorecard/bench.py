@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import ndimage
+from scipy import ndimage, special
 
-from harness.evaluation.intervals import CONFIDENCE, UNKNOWN, Interval, mean_t, wilson
+from harness.evaluation.intervals import UNKNOWN, UPPER, Interval, mean_t, wilson
 from harness.vocabulary.geometry import MM, Region
 from harness.vocabulary.seeds import random_stream
 from scenes.closed_form import Plane
@@ -99,14 +99,12 @@ NOTHING = Reading(float("nan"))
 def jackknifed(frames: np.ndarray, statistic: Callable[[np.ndarray], float], groups: int = GROUPS) -> Reading:
     """Return ``statistic`` of ``frames`` (n, ...) with Student's interval from the delete-a-group jackknife over
     frames, which must be independent; unknown below 4 frames. Source: Efron and Tibshirani 1993, chapter 11."""
-    from scipy.stats import t
-
     value, g = float(statistic(frames)), min(groups, len(frames) // 2)
     if g < 2 or not np.isfinite(value):
         return Reading(value)
     number = np.arange(len(frames)) % g
     without = np.array([statistic(frames[number != group]) for group in range(g)])
-    half = float(t.ppf(0.5 + CONFIDENCE / 2, g - 1) * np.sqrt((g - 1) * without.var()))
+    half = float(special.stdtrit(g - 1, UPPER) * np.sqrt((g - 1) * without.var()))
     return Reading(value, Interval(value - half, value + half) if np.isfinite(half) else UNKNOWN)
 
 

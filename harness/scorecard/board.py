@@ -16,6 +16,7 @@ from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 from scipy import ndimage
 
@@ -87,8 +88,6 @@ class Image:
 
     def resampled(self, z_m: np.ndarray, camera: AnyCamera) -> np.ndarray:
         """Return frames (n, h, w) of the depth camera, aligned to this image, with z in whole steps of its output."""
-        import cv2
-
         plane = np.concatenate([self.plan_mm * MM, np.zeros((*self.lens.whole.shape, 1))], axis=-1)
         in_depth = transform_points(invert(self.T_image_depth) @ self.T_image_board, plane)
         u, v = np.moveaxis(camera.nominal_lens.project(in_depth).astype(np.float32), -1, 0)

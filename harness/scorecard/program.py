@@ -19,7 +19,8 @@ from harness.tables.text import show
 from harness.vocabulary.files import write_json, write_text
 from harness.vocabulary.path_names import camera_title
 from harness.vocabulary.provenance import RESULTS_VERSION, record
-from scenes.sensor.camera import camera_digest, load_camera
+from harness.vocabulary.seeds import digest
+from scenes.sensor.camera import load_camera
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -58,7 +59,7 @@ def run_scorecard(options: argparse.Namespace, command: str) -> int:
     provenance = {
         "results_version": RESULTS_VERSION,
         **record(command),
-        "cameras": {name: camera_digest(load_camera(name)) for name in titles},
+        "cameras": {name: digest(load_camera(name).to_data()) for name in titles},
         "figures": str(options.figures or scoring.FIGURES_FILE),
         "seconds": round(time.perf_counter() - began, 1),
     }

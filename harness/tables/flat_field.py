@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
+
 from harness.tables.schema import Column, Table
 from harness.vocabulary.geometry import MM
 
@@ -21,7 +23,7 @@ FLAT_CAPTURES = Table(
         Column(
             "residual_mm",
             "residual (mm)",
-            lambda one: one.residual_rms_m / MM,
+            lambda one: float(np.sqrt(np.nanmean(one.residual_m**2))) / MM,
             "root mean square of range minus a smooth fit: pattern, shape and noise",
         ),
     ),

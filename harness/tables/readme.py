@@ -40,12 +40,8 @@ GROUPS = {
 }
 
 
-def results_readme() -> str:
-    """Return the whole text."""
-    return "\n".join([*_lines()])
-
-
-def _lines() -> Iterator[str]:
+def results_readme() -> Iterator[str]:
+    """Yield the lines of the text."""
     yield HEAD
     for of, title in GROUPS.items():
         yield from ("", f"## {title}", "", "| file | content |", "|---|---|")
@@ -76,4 +72,4 @@ def _tables(title: str, tables: Iterable[Table]) -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    print(results_readme(), end="")
+    print("\n".join(results_readme()), end="")

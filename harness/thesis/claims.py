@@ -12,9 +12,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import permutations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
 from scipy.stats import rankdata
 
 from harness.evaluation.intervals import Interval, bootstrap, mean_difference, standardised_bias
@@ -24,9 +25,6 @@ from harness.evaluation.summary import MAIN, found_holes, hole_list, noise_law, 
 from harness.tables.trials import ResultTables
 from harness.vocabulary.declaration.yaml_source import read_yaml
 from harness.vocabulary.path_names import value_text
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 Answer = Literal["borne out", "not borne out", "undecided"]
 FEW = 1

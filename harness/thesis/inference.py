@@ -7,16 +7,13 @@ count as independent given the set-up. All set-ups have the same prior probabili
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
 from harness.evaluation.maps import MANY
 from harness.thesis.claims import CAMERA, FEW, FOUND_WITH_FEW, FOUND_WITH_MANY, THESIS_HOLES
 from harness.vocabulary.path_names import in_words, names_of, value_text
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 FEWEST_SET_UPS = 20
 """Fewest set-ups for which a posterior is computed."""
@@ -32,8 +29,6 @@ def posterior_of(summary: pd.DataFrame, axes: Sequence[str]) -> pd.DataFrame | N
     """Return rows of `harness.tables.trials.POSTERIOR`: every set-up, likeliest first, then every value of each axis.
     Return None for another target, too few set-ups, several cameras, or without both numbers of frames. Shares of a
     fact that only one kind of hole has are those among set-ups of this kind."""
-    import pandas as pd
-
     rows = summary[summary["frames"].isin([FEW, MANY]) & summary["hole"].isin(THESIS_HOLES)]
     whole = rows.groupby("variant")["hole"].transform("size") == 2 * len(THESIS_HOLES)
     rows = rows[whole]

@@ -8,17 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
+import pandas as pd
 
 from harness.evaluation import intervals, maps
 from harness.evaluation.summary import hole_list
 from harness.tables.text import many
 from harness.thesis.claims import FEWEST_PAIRS, FEWEST_UNITS, Answer, Verdict, decide, verdict_of
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 Standing = Literal["ahead", "behind", "level", "open"]
 

@@ -23,9 +23,7 @@ from harness.vocabulary.geometry import Region
 from harness.vocabulary.provenance import source_digest
 from harness.vocabulary.seeds import digest
 from scenes.optics import NoiseFreeView, Optics, RenderConfig
-from scenes.render.view import render_view
 from scenes.target.custom import TargetConfig
-from scenes.target.mesh import build_target
 
 CODE = ("scenes.render.view", "scenes.target.mesh")
 PACKAGES = ("mitsuba", "drjit", "trimesh", "manifold3d", "numba", "numpy", "scipy")
@@ -58,6 +56,9 @@ def cached_view(target: TargetConfig, optics: Optics, config: RenderConfig, fold
         with one_at_a_time(folder / RENDERING, int(key[:8], 16)):
             found = read_view(path)
             if found is None:
+                from scenes.render.view import render_view  # with trimesh, which no trial needs
+                from scenes.target.mesh import build_target
+
                 view = render_view(build_target(target), optics, config)
                 write_view(path, view)
                 return view, False

@@ -128,9 +128,7 @@ class DirectLight(NamedTuple):
 
 def cast(lit: LitScene, slopes: np.ndarray) -> Hits:
     """Cast rays from the lens along ``slopes`` (n, 2) = x/z, y/z."""
-    import drjit as dr
-
-    mi = lit.mi
+    mi, dr = lit.mi, lit.dr
     x, y = (mi.Float(np.ascontiguousarray(each, np.float32)) for each in slopes.T)
     met = lit.meet(mi.Point3f(0.0), dr.normalize(mi.Vector3f(x, y, 1.0)))
     arriving, leg = lit.arriving(met, met.valid)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import trimesh
 
 from harness.vocabulary.errors import UserError
 from scenes.optics import Optics
@@ -99,9 +100,11 @@ class LitScene:
     their compiled kernels. ``surface_of`` (index into ``parts``), ``normal_of`` and ``on_face`` are by triangle;
     ``albedos`` and, if any surface is glossy, ``gloss`` (share and exponent of the lobes) by surface. The part
     ``textured`` has ``texture`` at ``uv_of`` (2, 4), an affine function of position; -1, None and zeros if there is
-    none. ``uv_factors``: the same as data, because constants would compile the kernels anew for each board."""
+    none. ``uv_factors``: the same as data, because constants would compile the kernels anew for each board.
+    ``mi``, ``dr``: Mitsuba and Dr.Jit, loaded."""
 
     mi: Any
+    dr: Any
     scene: Any
     parts: tuple[TargetPart, ...]
     emitter_m: np.ndarray
@@ -119,9 +122,7 @@ class LitScene:
 
     def meet(self, origin: Any, direction: Any) -> Met:
         """Return the first hits of rays along unit directions."""
-        import drjit as dr
-
-        mi = self.mi
+        mi, dr = self.mi, self.dr
         found = self.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction))
         valid, triangle = found.is_valid(), found.prim_index
         normal = dr.gather(mi.Normal3f, self.normal_of, triangle, valid)
@@ -139,8 +140,7 @@ class LitScene:
 
     def albedo(self, met: Met) -> Any:
         """Return the albedo at hits; 0 if a ray met nothing."""
-        import drjit as dr
-
+        dr = self.dr
         plain = dr.gather(self.mi.Float, self.albedos, met.surface, met.valid)
         if self.texture is None:
             return plain
@@ -150,10 +150,9 @@ class LitScene:
     def lobe(self, surface: Any, normal: Any, viewer: Any, direction: Any) -> Any:
         """Return the light that a surface reflects from ``direction`` to ``viewer``, over that of a Lambertian one of
         the same albedo: 1 - share + share (exponent + 2) / 2 cos^exponent. All directions leave the surface."""
-        import drjit as dr
-
         if self.gloss is None:
             return 1.0
+        dr = self.dr
         share, exponent = (dr.gather(self.mi.Float, each, surface) for each in self.gloss)
         cosine = dr.dot(2 * dr.dot(normal, viewer) * normal - viewer, direction)
         return 1 - share + share * (exponent + 2) / 2 * dr.power(dr.maximum(cosine, 1e-6), exponent)
@@ -161,9 +160,7 @@ class LitScene:
     def arriving(self, met: Met, active: Any) -> tuple[Any, Any]:
         """Return the light from the emitter at each hit: (irradiance, distance). The irradiance is cone(direction)
         cos(incidence) / d^2 times the `lobe`: 1 on a facing surface at 1 m, 0 behind an occluder."""
-        import drjit as dr
-
-        mi = self.mi
+        mi, dr = self.mi, self.dr
         emitter = mi.Point3f(*self.emitter_m.tolist())
         towards = emitter - met.place
         squared = dr.squared_norm(towards)
@@ -190,7 +187,6 @@ def lit_scene(
     """Build the scene from a target's parts, each with its albedo at 850 nm and its gloss; at most one has a texture.
     ``on_face``: for each part, which of its triangles (n,) lie on the undamaged face; None means none."""
     import drjit as dr
-    import trimesh
 
     whole: Any = trimesh.util.concatenate([part.mesh for part in parts])
     counts = [len(part.mesh.faces) for part in parts]
@@ -215,6 +211,7 @@ def lit_scene(
     shares, exponents = (mi.Float([part.gloss[k] for part in parts]) for k in (0, 1))
     return LitScene(
         mi=mi,
+        dr=dr,
         scene=mi.load_dict({"type": "scene", "target": mesh}),
         parts=tuple(parts),
         emitter_m=optics.emitter_m,

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from scipy import ndimage, sparse
+from scipy.stats import qmc
 
 from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR, Region, invert, rotate_vectors, transform_points
 from scenes.optics import NoiseFreeView, Optics, RenderConfig, footprint_of, wave_numbers
@@ -52,9 +53,7 @@ def gather_at_points(
     that noise is smooth from point to point. ``bright`` (4, 4): half of the paths continue from their first hit towards
     a rectangle, -1..1 in x and y of this frame: a lit board, which they would seldom meet by chance. First directions
     are drawn mostly from those cells of the hemisphere in which a probe met something."""
-    import drjit as dr
-
-    mi = lit.mi
+    mi, dr = lit.mi, lit.dr
     columns = [mi.Float(np.ascontiguousarray(each, np.float32)) for each in (*points_m.T, *normals.T)]
     board = next((k for k, part in enumerate(lit.parts) if part.name == "board"), 0)
 
@@ -92,9 +91,7 @@ def gather_at_points(
 
 def gather_in_pixels(lit: LitScene, rays: OffFace, work: PathWork, samples: int | np.ndarray) -> np.ndarray:
     """Gather indirect light, the mean over the listed sub-rays of each pixel, with ``samples`` paths, (p,) or one."""
-    import drjit as dr
-
-    mi = lit.mi
+    mi, dr = lit.mi, lit.dr
     across, down = (mi.Float(np.ascontiguousarray(each, np.float32)) for each in rays.slopes.T)
     firsts = mi.UInt32((np.cumsum(rays.counts) - rays.counts).astype(np.uint32))
     counts = mi.UInt32(rays.counts.astype(np.uint32))
@@ -136,8 +133,6 @@ def noise_lines(frequencies_hz: tuple[float, ...]) -> list[int]:
 def _sobol(dimensions: int, longest: int, seed: int) -> np.ndarray:
     """Return the low-discrepancy points of all batches as flat float32, in the order batch, point, dimension."""
     rng = np.random.default_rng([seed, 0x1D1EC7])
-    from scipy.stats import qmc  # this import is half of a process's start; only processes that render need it
-
     points = np.stack([qmc.Sobol(dimensions, seed=rng).random(longest) for _ in range(BATCHES)])
     return np.ascontiguousarray(points, np.float32).ravel()
 
@@ -148,9 +143,7 @@ def _towards(
     """Return a direction from a surface and its weight. It is drawn by its cosine (``turned``) or, in front of the
     rectangle ``bright``, with a probability of a half towards a uniform point of it: a mixture of both densities (Veach
     and Guibas' balance heuristic), so that no weight exceeds 2. ``u1`` and ``u2``: in 0..1."""
-    import drjit as dr
-
-    mi = lit.mi
+    mi, dr = lit.mi, lit.dr
     axis_x, axis_y, middle = bright
     half = [dr.norm(axis) for axis in (axis_x, axis_y)]
     out = dr.normalize(dr.cross(axis_x, axis_y))
@@ -177,9 +170,8 @@ class _Walk:
     points (modulo 1). ``longest``: most points in a batch. What differs between boards is data, not constants."""
 
     def __init__(self, lit: LitScene, start: Any, work: PathWork, on_surface: bool, bright: Any, longest: int) -> None:
-        import drjit as dr
-
-        self.lit, self.start, self.work, self.on_surface, mi = lit, start, work, on_surface, lit.mi
+        self.lit, self.start, self.work, self.on_surface = lit, start, work, on_surface
+        mi, dr = lit.mi, lit.dr
         self.dimensions = START_DIMENSIONS + PER_VERTEX * (work.bounces + 1)
         self.table = mi.Float(_sobol(self.dimensions, longest, work.seed))
         self.batch_points, self.aim = dr.opaque(mi.UInt32, longest), None
@@ -189,9 +181,7 @@ class _Walk:
     def sums(self, lanes: np.ndarray) -> np.ndarray:
         """Return sums over the paths of lanes: (f + 1, n) complex64, intensity last. ``lanes`` (4, n) uint32: each
         follows ``count`` paths of a place and batch, starting at number ``first``."""
-        import drjit as dr
-
-        mi, lines = self.lit.mi, len(self.work.frequencies_hz)
+        mi, dr, lines = self.lit.mi, self.lit.dr, len(self.work.frequencies_hz)
         self.place, self.batch, self.first, self.count = map(mi.UInt32, lanes)
         n, kinds = lanes.shape[1], (mi.UInt32, mi.UInt32, mi.Point3f, mi.Normal3f, mi.Vector3f, mi.Float)
         zeros = [dr.zeros(mi.Float, n) for _ in range(2 * lines + 1)]
@@ -214,9 +204,7 @@ class _Walk:
         totals: list[Any],
     ) -> tuple[Any, ...]:
         """Continue at the next vertex, or begin the next path. ``length``: that up to ``before``, the ray's start."""
-        import drjit as dr
-
-        lit, mi, fresh = self.lit, self.lit.mi, vertex == 0
+        lit, mi, dr, fresh = self.lit, self.lit.mi, self.lit.dr, vertex == 0
         first = self._uniform(sample, 0), self._uniform(sample, 1)
         start_point, origin, start_direction, weight = self.start(self.place, *first)
         before = dr.select(fresh, start_point, before)
@@ -250,12 +238,11 @@ class _Walk:
 
     def _uniform(self, sample: Any, dimension: Any) -> Any:
         """Return a co-ordinate of the low-discrepancy point of each lane's path, shifted by its place's rotation."""
-        import drjit as dr
-
+        mi, dr = self.lit.mi, self.lit.dr
         number = self.batch * self.batch_points + self.first + sample
-        u = dr.gather(self.lit.mi.Float, self.table, number * self.dimensions + dimension)
+        u = dr.gather(mi.Float, self.table, number * self.dimensions + dimension)
         rotation = self.batch + BATCHES * (0 if self.on_surface else self.place)
-        u += self.lit.mi.sample_tea_float32(rotation, dimension + self.work.seed * 1024, 4)
+        u += mi.sample_tea_float32(rotation, dimension + self.work.seed * 1024, 4)
         return u - dr.floor(u)
 
 

@@ -19,7 +19,7 @@ from harness.vocabulary.declaration.yaml_source import DeclarationError, KeyPath
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Lens, OtherLens
 from harness.vocabulary.plug_ins import PlugIns
-from harness.vocabulary.seeds import canonical_json, digest
+from harness.vocabulary.seeds import canonical_json
 from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.empirical.facts import EmpiricalCamera
 from scenes.sensor.lidar.facts import ScannedLidar
@@ -219,8 +219,3 @@ def _stated(data: Mapping[str, Any], prefix: KeyPath = ()) -> Iterator[tuple[Key
 
 
 _camera_at = lru_cache(read_camera)
-
-
-def camera_digest(camera: AnyCamera) -> str:
-    """Return the digest of a camera's numbers, tags and sources."""
-    return digest(camera.to_data())

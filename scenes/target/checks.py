@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import combinations
 
+import cv2
 import numpy as np
 
 from harness.vocabulary.errors import UserError
@@ -186,8 +187,6 @@ def off_tape_mm(tape: custom.TapeConfig, places_mm: np.ndarray) -> np.ndarray:
 
 def _tape_problems(config: custom.TargetConfig) -> list[str]:
     """Find strips off the board, over a damage, or over one another (their upper sides would coincide); in plan."""
-    import cv2
-
     problems = []
     for number, tape in enumerate(config.tapes, start=1):
         (width, height), (x, y) = tape.size_mm, tape.centre_mm

@@ -9,9 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import cv2
 import numpy as np
+import trimesh
 from scipy.ndimage import gaussian_filter, map_coordinates, zoom
 from scipy.optimize import brentq
 
@@ -25,9 +27,6 @@ from scenes.target.custom import DentConfig, HoleConfig, MaterialConfig, MeshCon
 from scenes.target.flaws import FlawConfig, RoundConfig, closed_grid, turned
 from scenes.target.part import part_of
 from scenes.target.truth import Damage, Face, face_of, outline_board_m, planes_of, relief_points, truth_of
-
-if TYPE_CHECKING:
-    import trimesh
 
 TEXEL_MM = 0.6  # finer than a pixel's footprint (1.4 mm at 0.7 m for the finest camera), made in 40 ms
 MAX_TEXELS = 4096  # along a side: a board of metres gets coarser texels instead of gigabytes
@@ -66,8 +65,6 @@ def reflectance(pattern: np.ndarray, mean: float, contrast: float) -> np.ndarray
 
 def image_pattern(file: str) -> np.ndarray:
     """Return an image's brightness in linear light over its mean, less 1: (rows, columns), `MAX_TEXELS` at most."""
-    import cv2
-
     try:
         image = cv2.imdecode(np.frombuffer(bounded_bytes(Path(file), MOST_IMAGE_BYTES), np.uint8), cv2.IMREAD_ANYDEPTH)
     except (OSError, cv2.error) as error:
@@ -145,8 +142,6 @@ class Target:
 
 def build_target(config: TargetConfig) -> Target:
     """Build a declaration. Raises UserError that names every part that does not fit (`scenes.target.checks`)."""
-    import trimesh
-
     check_target(config)
     T_camera_board, board, material = config.pose.T_camera_board, config.board, config.material
     truth, sagitta_m = truth_of(config, T_camera_board), _sagitta_m(config)
@@ -177,8 +172,6 @@ def build_target(config: TargetConfig) -> Target:
 
 def board_solid(config: TargetConfig, truth: tuple[Damage, ...]) -> trimesh.Trimesh:
     """Return the board less its damage, watertight, board frame."""
-    import trimesh
-
     size_m, thickness_m = (config.board.width_mm * MM, config.board.height_mm * MM), config.board.thickness_mm * MM
     face = face_of(config.board)
     added: list[trimesh.Trimesh] = []
@@ -216,8 +209,6 @@ def sheet(
     """Return a watertight sheet over a rectangle in plan, between two parallels of the face (offsets along normals).
     Its facets stay within ``sagitta_m`` of the face; a flat sheet has 12 triangles. ``flat_back``: its lower side is a
     plane. Board frame. Raises UserError where the face needs more than MAX_CELLS."""
-    import trimesh
-
     turn = turned(angle_rad)
 
     def plan(columns: int, rows: int) -> np.ndarray:
@@ -247,8 +238,6 @@ def sheet(
 def solids_of(item: FlawConfig, face: Face, thickness_m: float) -> tuple[list[trimesh.Trimesh], list[trimesh.Trimesh]]:
     """Return the solids that a flaw adds to the board and those that it takes away, in this order, board frame. A
     pressed sheet moves its back too: the volume that one side loses, the other side gains."""
-    import trimesh
-
     points, depth_m, axis, across = relief_points(item, face, thickness_m)
     relief, spare_m = item.relief(), SPARE_M + float(np.ptp(points @ axis))
     if relief.open_row:  # beyond the board's edge
@@ -278,8 +267,6 @@ def solids_of(item: FlawConfig, face: Face, thickness_m: float) -> tuple[list[tr
 def cutter(damage: Damage, declared: HoleConfig | DentConfig) -> trimesh.Trimesh:
     """Return the solid that a damage takes away, board frame; it sticks out of the face, a through-hole's of the back.
     Its radius is the declared one: on a bent face a dent's rim, which the truth holds, is not that of its ball."""
-    import trimesh
-
     depth_m, radius_m = damage.depth_m, declared.radius_m
     # A face or back that bends to a radius of twice the damage's lies 0.27 radius off the tangent plane at the rim.
     spare_m = SPARE_M + 0.5 * radius_m
@@ -319,7 +306,6 @@ def subtract(
     """Return body and what is added, minus cutters, by Manifold, watertight; not by trimesh's wrapper, which rounds to
     float32: 30 nm on a board of 0.6 m, 1e-3 of the facets of a 1/16 in hole."""
     import manifold3d  # type: ignore[import-not-found]
-    import trimesh
 
     longest_m, solids = max(CELL_M, float(np.ptp(body.vertices, axis=0).max()) / MOST_ALONG), []
     for mesh in (body, *added, *cutters):
@@ -360,8 +346,6 @@ def write_truth(target: Target, path: Path) -> None:
 
 
 def _ply(target: Target) -> bytes:
-    import trimesh
-
     coloured = []
     for part in target.parts:
         colours = np.tile(np.append(_srgb_bytes(part.rgb), np.uint8(255)), (len(part.mesh.vertices), 1))
@@ -370,7 +354,6 @@ def _ply(target: Target) -> bytes:
 
 
 def _glb(target: Target) -> bytes:
-    import trimesh
     from PIL import Image
     from trimesh.visual.material import PBRMaterial
 

@@ -132,7 +132,9 @@ def fit_hit_miss(
     log_likelihood = float(single.value(place))
     unscale = np.array([[1.0, -centre / spread], [0.0, 1.0 / spread]])
     b0, b1 = (float(b) for b in unscale @ place)
-    covariance = unscale @ (np.linalg.pinv(_information(single, place)) * repeats) @ unscale.T
+    of_hit, of_miss, density = logs_of_link(link, design @ place)
+    information = (design.T * (weight * np.exp(2.0 * density - of_hit - of_miss))) @ design  # expected, of (b0, b1)
+    covariance = unscale @ (np.linalg.pinv(information) * repeats) @ unscale.T
     slopes = np.array([[-1.0 / b1, b0 / b1**2], [0.0, -1.0 / b1**2]])  # of mu = -b0 / b1 and sigma = 1 / b1
     if targets < n:
         notes += (f"{n} inspections of {targets} targets count as {targets} (variance multiplied by {repeats:.4g})",)
@@ -227,13 +229,6 @@ def _search(
     return likeliest.x, -float(likeliest.fun)
 
 
-def _information(data: HitsAndMisses, place: np.ndarray) -> np.ndarray:
-    """(2, 2) expected information of (b0, b1)."""
-    hit, miss, density = logs_of_link(data.link, data.design @ place)
-    weight = (data.hits + data.misses) * np.exp(2.0 * density - hit - miss)
-    return np.asarray(data.design.T @ (weight[:, None] * data.design))
-
-
 def _checked(size: ArrayLike, hit: ArrayLike, link: str, log_size: bool) -> tuple[np.ndarray, np.ndarray]:
     """x (n,) and hits (n,) as booleans, or the user's mistake."""
     sizes, hits = np.asarray(size, float), np.asarray(hit, float)
@@ -305,12 +300,6 @@ def largest_bound(fits: Sequence[HitMissFit], design_effects: Sequence[float] = 
     effects = design_effects or [1.0] * len(fits)
     bounds = (bound(fit, design_effect=of) for fit, of in zip(fits, effects, strict=True))
     return max(bounds, key=lambda one: one.value)
-
-
-def widest_band(fits: Sequence[HitMissFit], sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Envelope the models' bands at ``sizes`` (n,): the lower edge crosses 90 % at their `largest_bound`."""
-    low, high = zip(*(band(fit, sizes) for fit in fits), strict=True)
-    return np.min(low, axis=0), np.max(high, axis=0)
 
 
 def criterion(confidence: float) -> float:

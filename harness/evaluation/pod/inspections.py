@@ -122,14 +122,6 @@ def _require_one_size(read: Inspections) -> None:
             raise UserError(f"{read.path}: target {name!r} has {where}", fix=fix)
 
 
-def require_hits(read: Inspections) -> None:
-    """Refuse data that are all hits or all misses."""
-    if np.ptp(read.response) == 0:
-        kind = "hits" if read.response[0] else "misses"
-        what = f"{read.path}: all {len(read.response)} rows of {read.response_column} are {kind}"
-        raise UserError(f"{what}, and a curve needs both hits and misses", fix="add targets of other sizes")
-
-
 def require_positive(read: Inspections, response: bool, why: str) -> None:
     """Refuse a size (or a response) that has no logarithm; ``why`` names the option that asks for it."""
     values, column = (read.response, read.response_column) if response else (read.size, read.size_column)

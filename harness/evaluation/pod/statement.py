@@ -92,7 +92,9 @@ class PodStatement:
         """Lower and upper edges (`DRAWN`,) of the band; made when it is drawn, because it takes long."""
         if self.signal:
             return ahat_band(self.signal, self.sizes, CONFIDENCE)
-        return hit_miss.widest_band(self.fits, self.sizes)
+        # the models' envelope, whose lower edge crosses 90 % at their `largest_bound`
+        low, high = zip(*(hit_miss.band(fit, self.sizes) for fit in self.fits), strict=True)
+        return np.min(low, axis=0), np.max(high, axis=0)
 
     @property
     def model(self) -> str:

@@ -94,7 +94,9 @@ def efficiency_of(limit: SetUpLimit, ideal: IdealDamages) -> Efficiency:
     hits, inspections = np.bincount(which, hit), np.bincount(which).astype(float)
     again = weights_in_blocks(DRAWS, (ideal.board[kept], "damaged"))
     weights = np.vstack([np.ones(len(kept)), *(weights for (weights,) in again)])
-    ideal_mm, ideal_index = expected_sizes(size_mm, pod, weights), _means(ideal.needed[:, kept], weights)
+    ideal_mm, known = expected_sizes(size_mm, pod, weights), np.isfinite(ideal.needed[:, kept])
+    with np.errstate(invalid="ignore"):
+        ideal_index = (np.where(known, ideal.needed[:, kept], 0.0) @ weights.T) / (known @ weights.T)
     curve, why, needed = None, "", np.full((2, 1 + DRAWS), np.nan)
     try:
         fit = fit_hit_miss(index[which], hit, link=LINK, log_size=True, inspections=which)
@@ -114,13 +116,6 @@ def efficiency_of(limit: SetUpLimit, ideal: IdealDamages) -> Efficiency:
     board, hole, exact, threshold = (getattr(ideal, name)[kept] for name in ("board", "hole", "index", "threshold"))
     of_damage = (board, hole, size_mm, exact, threshold, pod, hits, inspections)
     return Efficiency(limit, ideal, half, most, *of_damage, curve, why)
-
-
-def _means(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the means (k, d) of values (k, n), without NaN, under each of the weights (d, n)."""
-    known = np.isfinite(values)
-    with np.errstate(invalid="ignore"):
-        return np.asarray((np.where(known, values, 0.0) @ weights.T) / (known @ weights.T))
 
 
 def _level(ideal_mm: np.ndarray, ideal_index: np.ndarray, needed: np.ndarray, all_found: bool) -> Level:
