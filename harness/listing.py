@@ -84,7 +84,7 @@ def grid_of(kind: str, rows: Sequence[Row]) -> Grid:
         heads = ("version", "what it does")
     lines = []
     for row in rows:
-        cells = (row.get("version") or "-", row.get("about", ""))
+        cells: tuple[Any, ...] = (row.get("version") or "-", row.get("about", ""))
         if "title" in row:
             near, far = row["nearest_m"], row["farthest_m"]
             reach = f"from {near:.4g} m" if far is None else f"{near:.4g} to {far:.4g} m"
