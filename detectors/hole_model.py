@@ -110,27 +110,22 @@ def _painted(
     holes: np.ndarray, sights: np.ndarray, metric: np.ndarray, blur_u: float, blur_v: float, h: int, w: int
 ) -> np.ndarray:
     half_u, half_v, layers = 0.5 * blur_u, 0.5 * blur_v, len(sights) * len(NODES)
+    # half-width and half-height in px per metre of radius
+    area = math.sqrt(metric[0, 0] * metric[1, 1] - metric[0, 1] ** 2)
+    half_width, half_height = math.sqrt(metric[1, 1]) / area, math.sqrt(metric[0, 0]) / area
     images, weights, chords = np.zeros((len(holes), h, w)), np.empty(layers), np.empty((2, layers, STRIPS))
     # in each column from ``left`` on, by strip: the sum of the layers, and its integral over the strips above
     across, above = np.empty((w, STRIPS)), np.zeros((w, STRIPS + 1))
-    left = width = 0
     for n in range(len(holes)):
         u, v, radius, depth, wall = holes[n, 0], holes[n, 1], holes[n, 2], holes[n, 3], holes[n, 4]
-        height = radius * math.sqrt(metric[0, 0] / (metric[0, 0] * metric[1, 1] - metric[0, 1] ** 2))
+        reach, height = half_u + radius * half_width, radius * half_height
+        left = max(0, math.ceil(u - reach))
+        width = max(min(w - 1, math.floor(u + reach)) + 1 - left, 0)
         # a hole that is only moved has the chords of the one before; moved along v, its columns of strips too
         is_moved = n > 0 and radius == holes[n - 1, 2] and depth == holes[n - 1, 3] and wall == holes[n - 1, 4]
         if not is_moved:
             _cut(radius, depth, wall, sights, metric, weights, chords)
         if not is_moved or u != holes[n - 1, 0]:
-            first, last = np.inf, -np.inf
-            for k in range(layers):
-                for s in range(STRIPS):
-                    if chords[1, k, s] > chords[0, k, s]:
-                        first, last = min(first, u + chords[0, k, s]), max(last, u + chords[1, k, s])
-            left = width = 0
-            if last > first:
-                left = max(0, math.ceil(first - half_u))
-                width = max(min(w - 1, math.floor(last + half_u)) + 1 - left, 0)
             for c in range(width):
                 low, high, column = left + c - half_u - u, left + c + half_u - u, across[c]
                 for s in range(STRIPS):
@@ -284,9 +279,7 @@ def _descent(  # type: ignore[no-untyped-def]
             for i in range(n):
                 rows[4, i], rows[6, i] = 1.0, left[0, i]
             _whiten(factor, rows[:6])
-            for j in range(7):
-                for k in range(7):
-                    products[j, k] = 0.0
+            products = np.zeros((7, 7))
             for i in range(n):
                 for j in range(7):
                     slope[j] = rows[j, i]
