@@ -26,8 +26,6 @@ NODES, WEIGHTS = np.array([0.5 - 0.15**0.5, 0.5, 0.5 + 0.15**0.5, 1.0]), np.arra
 """Gauss and Legendre's rule of three points on (0, 1), for the integral over the depth of the wall; and its end."""
 STEP = 1e-3
 """Size of differences that stand for derivatives: in pixels, relative for radius and depth, absolute for the wall."""
-MOVED, ROWS = np.array([1, 0, 2, 3, 4]), np.array([1, 0, 2, 3, 5])
-"""Numbers of a hole in the order in which pictures with one of them changed share most, and the derivatives' rows."""
 MOST_STEPS, TOLERANCE = 40, 1e-5  # limits of a descent: its steps, and the relative gain below which it ends
 DAMPING, LEAST_M, SMALLEST = 1e-3, 1e-9, 1e-18
 """Damping of the first step; deviation that is rounding of the arithmetic, and its square."""
@@ -110,37 +108,28 @@ def _painted(
     holes: np.ndarray, sights: np.ndarray, metric: np.ndarray, blur_u: float, blur_v: float, h: int, w: int
 ) -> np.ndarray:
     half_u, half_v, layers = 0.5 * blur_u, 0.5 * blur_v, len(sights) * len(NODES)
+    # half-width and half-height in px per metre of radius
+    area = math.sqrt(metric[0, 0] * metric[1, 1] - metric[0, 1] ** 2)
+    half_width, half_height = math.sqrt(metric[1, 1]) / area, math.sqrt(metric[0, 0]) / area
     images, weights, chords = np.zeros((len(holes), h, w)), np.empty(layers), np.empty((2, layers, STRIPS))
     # in each column from ``left`` on, by strip: the sum of the layers, and its integral over the strips above
     across, above = np.empty((w, STRIPS)), np.zeros((w, STRIPS + 1))
-    left = width = 0
     for n in range(len(holes)):
         u, v, radius, depth, wall = holes[n, 0], holes[n, 1], holes[n, 2], holes[n, 3], holes[n, 4]
-        height = radius * math.sqrt(metric[0, 0] / (metric[0, 0] * metric[1, 1] - metric[0, 1] ** 2))
-        # a hole that is only moved has the chords of the one before; moved along v, its columns of strips too
-        is_moved = n > 0 and radius == holes[n - 1, 2] and depth == holes[n - 1, 3] and wall == holes[n - 1, 4]
-        if not is_moved:
-            _cut(radius, depth, wall, sights, metric, weights, chords)
-        if not is_moved or u != holes[n - 1, 0]:
-            first, last = np.inf, -np.inf
+        reach, height = half_u + radius * half_width, radius * half_height
+        left = max(0, math.ceil(u - reach))
+        width = max(min(w - 1, math.floor(u + reach)) + 1 - left, 0)
+        _cut(radius, depth, wall, sights, metric, weights, chords)
+        for c in range(width):
+            low, high, column = left + c - half_u - u, left + c + half_u - u, across[c]
+            for s in range(STRIPS):
+                column[s] = 0.0
             for k in range(layers):
+                starts, ends, weight = chords[0, k], chords[1, k], weights[k] / (blur_u * blur_v)
                 for s in range(STRIPS):
-                    if chords[1, k, s] > chords[0, k, s]:
-                        first, last = min(first, u + chords[0, k, s]), max(last, u + chords[1, k, s])
-            left = width = 0
-            if last > first:
-                left = max(0, math.ceil(first - half_u))
-                width = max(min(w - 1, math.floor(last + half_u)) + 1 - left, 0)
-            for c in range(width):
-                low, high, column = left + c - half_u - u, left + c + half_u - u, across[c]
-                for s in range(STRIPS):
-                    column[s] = 0.0
-                for k in range(layers):
-                    starts, ends, weight = chords[0, k], chords[1, k], weights[k] / (blur_u * blur_v)
-                    for s in range(STRIPS):
-                        column[s] += weight * max(min(ends[s], high) - max(starts[s], low), 0.0)
-                for s in range(STRIPS):
-                    above[c, s + 1] = above[c, s] + height * (EDGES[s + 1] - EDGES[s]) * column[s]
+                    column[s] += weight * max(min(ends[s], high) - max(starts[s], low), 0.0)
+            for s in range(STRIPS):
+                above[c, s + 1] = above[c, s] + height * (EDGES[s + 1] - EDGES[s]) * column[s]
         i = j = 0
         for r in range(max(0, math.ceil(v - height - half_v)), min(h - 1, math.floor(v + height + half_v)) + 1):
             top, bottom = max(r - half_v - v, -height), min(r + half_v - v, height)
@@ -248,11 +237,11 @@ def _descent(  # type: ignore[no-untyped-def]
 ):
     """Return the best hole (5,), its offset, rows (8, n) and whether the descent from ``start`` (6,) has converged. The
     first rows are derivatives of the used pixels, at flat ``places`` (n,), by (u, v, radius, depth, offset, wall); the
-    seventh is what the hole leaves of their ``data`` (n,). They are multiplied by ``whitening`` (n, n)
-    where it is not empty. ``weight``: of the prior."""
+    seventh is what the hole leaves of their ``data`` (n,). They are multiplied by ``whitening`` (n, n) where
+    it is not empty. ``weight``: of the prior."""
     n, q, step, damping, converged = len(data), start, np.zeros(6), 10.0 * DAMPING, False
     square = promised = np.inf
-    rows, products, best, holes, sizes = np.zeros((8, n)), np.zeros((7, 7)), np.zeros(5), np.zeros((6, 5)), np.zeros(6)
+    rows, products, best, holes, sizes = np.zeros((8, n)), np.zeros((7, 7)), np.zeros(5), np.zeros((6, 5)), np.zeros(5)
     left, slope = rows[7:], np.zeros(7)
     # keeps a wild trial step finite: no disc is larger than ten patches
     widest = math.log(10.0 * (h + w) * math.sqrt(max(metric[0, 0], metric[1, 1])))
@@ -280,21 +269,19 @@ def _descent(  # type: ignore[no-untyped-def]
             depth, bend = best[3], 0.5 * math.pi * math.sin(math.pi * at[5])
             sizes[0] = sizes[1] = STEP
             sizes[2], sizes[3] = STEP * radius, STEP * (depth if depth != 0.0 else STEP)
-            sizes[5] = -STEP if best[4] >= 0.5 else STEP
+            sizes[4] = -STEP if best[4] >= 0.5 else STEP
             for k in range(5):
-                holes[k + 1, MOVED[k]] += sizes[ROWS[k]]
-            images = _painted(holes, sights, metric, blur_u, blur_v, h, w).ravel()
+                holes[k + 1, k] += sizes[k]
+            images = _painted(holes[1:], sights, metric, blur_u, blur_v, h, w).ravel()
             for k in range(5):
-                row, per_step = ROWS[k], 1.0 / sizes[ROWS[k]]
+                row, per_step = k if k < 4 else 5, 1.0 / sizes[k]
                 for i in range(n):
-                    rows[row, i] = (images[(k + 1) * h * w + places[i]] - images[places[i]]) * per_step
+                    rows[row, i] = (images[k * h * w + places[i]] - image[places[i]]) * per_step
             for i in range(n):
                 rows[4, i], rows[6, i] = 1.0, left[0, i]
             if len(whitening):
                 rows[:6] = np.dot(rows[:6], whitening)
-            for j in range(7):
-                for k in range(7):
-                    products[j, k] = 0.0
+            products = np.zeros((7, 7))
             for i in range(n):
                 for j in range(7):
                     slope[j] = rows[j, i]

@@ -127,23 +127,11 @@ def links(points_m: np.ndarray, tilt: float, noise_m: float, central: bool) -> t
             for way in range(2):
                 row, column = v + way, u + 1 - way
                 if row < h and column < w:
-                    x, y, z = points_m[v, u, 0], points_m[v, u, 1], points_m[v, u, 2]
-                    other_x, other_y, other_z = (
-                        points_m[row, column, 0],
-                        points_m[row, column, 1],
-                        points_m[row, column, 2],
-                    )
-                    near = 1.0
+                    here, there, ours, theirs = points_m[v, u], points_m[row, column], 1.0, 1.0
                     if central:
-                        near, x, y, other_x, other_y = (
-                            min(z, other_z),
-                            x / z,
-                            y / z,
-                            other_x / other_z,
-                            other_y / other_z,
-                        )
-                    dx, dy = (other_x - x) * near, (other_y - y) * near
-                    linked[way, v, u] = abs(other_z - z) <= tilt * math.sqrt(dx * dx + dy * dy) + noise_m
+                        ours, theirs = min(there[2] / here[2], 1.0), min(here[2] / there[2], 1.0)
+                    dx, dy = there[0] * theirs - here[0] * ours, there[1] * theirs - here[1] * ours
+                    linked[way, v, u] = abs(there[2] - here[2]) <= tilt * math.sqrt(dx * dx + dy * dy) + noise_m
     return linked[0], linked[1]
 
 
@@ -188,14 +176,9 @@ class _Smooth(NamedTuple):
     def misses_m(self, pixels: np.ndarray, seeds: np.ndarray) -> np.ndarray:
         """Return the distances in depth (n,) of the points at ``pixels`` from the planes at ``seeds``."""
         points, normals = self.points_m[pixels], self.normals[seeds]
-        height = _products(self.means_m[seeds] - points, normals)
+        height = ((self.means_m[seeds] - points) * normals).sum(axis=1)
         way = points / points[:, 2:] if self.central else np.array([[0.0, 0.0, 1.0]])
-        return np.abs(height) / np.maximum(np.abs(_products(normals, way)), 1e-3)
-
-
-def _products(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the scalar products (n,) of vectors (n, 3)."""
-    return np.asarray(np.einsum("ij,ij->i", a, b))
+        return np.abs(height) / np.maximum(np.abs((normals * way).sum(axis=1)), 1e-3)
 
 
 def _keep_large(cores: np.ndarray, sizes: np.ndarray, window: int) -> int:
@@ -227,7 +210,7 @@ def _joined(own: np.ndarray, cores: np.ndarray, smooth: _Smooth, apart_m: float,
                 continue
             seeds = [nearest_pixel(cores == number + 1)[1].reshape(-1)[pixels] for number in (i, j)]
             misses = np.maximum(*(smooth.misses_m(pixels, each) for each in seeds))
-            cosines = _products(smooth.normals[seeds[0]], smooth.normals[seeds[1]])
+            cosines = (smooth.normals[seeds[0]] * smooth.normals[seeds[1]]).sum(axis=1)
             if np.median(misses) <= apart_m and np.median(cosines) >= math.cos(turn):
                 stays[stays == stays[j]] = stays[i]
     kept = np.unique(stays)

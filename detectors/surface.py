@@ -224,7 +224,8 @@ def _lar(basis: np.ndarray, z: np.ndarray, start: np.ndarray, knees: np.ndarray 
 
 @numba.njit(**PLAIN)
 def _huber(rows: np.ndarray, z: np.ndarray, c: np.ndarray, knee: float) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return the sum of Huber's function over its knee, its negative gradient (p,), and the inner normal matrix."""
+    """Return the sum of Huber's function over its knee, its negative gradient (p,), and the inner normal matrix,
+    its lower half."""
     terms = len(c)
     value, pull, inside = 0.0, np.zeros(terms), np.zeros((terms, terms))
     for i in range(len(z)):
@@ -240,7 +241,6 @@ def _huber(rows: np.ndarray, z: np.ndarray, c: np.ndarray, knee: float) -> tuple
             for j in range(terms):
                 for k in range(j + 1):
                     inside[j, k] += rows[i, j] * rows[i, k]
-                    inside[k, j] = inside[j, k]
     return value, pull, inside
 
 
