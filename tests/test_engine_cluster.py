@@ -154,6 +154,7 @@ def test_a_node_killed_from_outside_costs_nothing(cluster, tmp_path):
     assert {how.state for how in ended.values()} == {"done"} and len(ended) == 12 and killed
 
 
+@pytest.mark.slow  # a node of its own
 def test_a_node_of_several_processes_uses_them_all_each_in_one_thread_whatever_its_environment(tmp_path):
     with processes(tmp_path / "cluster") as bare:
         bare.worker("--nthreads", "2", "--no-nanny")  # a nanny would set the environment

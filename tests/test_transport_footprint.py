@@ -110,6 +110,7 @@ def test_uneven_frequencies_are_no_comb():
     assert comb_step((1e6, 2e6, 3e6, 4.1e6)) is None
 
 
+@pytest.mark.slow  # a long reference
 def test_a_whole_view_of_a_comb_agrees_with_its_lines_alone():
     """Indirect light by the recurrence in float32 against the same paths with separate sines: 1e-5 of the light."""
     target = build_target(
