@@ -255,8 +255,7 @@ def _descent(  # type: ignore[no-untyped-def]
         image = _painted(holes[:1], sights, metric, blur_u, blur_v, h, w).ravel()
         for i in range(n):
             left[0, i] = image[places[i]] + at[4] - data[i]
-        if len(whitening):
-            left[:] = np.dot(left, whitening)
+        _whiten(left, whitening)
         prior = weight * (holes[0, 4] - WALL_PRIOR[0])
         new_square, enough = prior**2, TOLERANCE * square + SMALLEST
         for i in range(n):
@@ -279,8 +278,7 @@ def _descent(  # type: ignore[no-untyped-def]
                     rows[row, i] = (images[k * h * w + places[i]] - image[places[i]]) * per_step
             for i in range(n):
                 rows[4, i], rows[6, i] = 1.0, left[0, i]
-            if len(whitening):
-                rows[:6] = np.dot(rows[:6], whitening)
+            _whiten(rows[:6], whitening)
             products = np.zeros((7, 7))
             for i in range(n):
                 for j in range(7):
@@ -300,6 +298,16 @@ def _descent(  # type: ignore[no-untyped-def]
             break
         step, promised = _damped(products, damping)
     return best, q[4], rows, converged
+
+
+@numba.njit(**PLAIN)
+def _whiten(rows: np.ndarray, whitening: np.ndarray) -> None:
+    """Multiply rows (k, n) by a matrix (n, n) where it is not empty; assignment to a slice takes 8 s to compile."""
+    if len(whitening):
+        white = np.dot(rows, whitening)
+        for k in range(len(rows)):
+            for i in range(len(whitening)):
+                rows[k, i] = white[k, i]
 
 
 @numba.njit(**PLAIN)
