@@ -9,12 +9,12 @@ unexport PYTHONDONTWRITEBYTECODE
 sweep: .venv/.ready
 	$(BIN)/python -m harness.sweep experiments/averaging.yaml
 
-# Three processes for two cores, as some tests wait for nodes and time limits.
+# Four processes for two cores, as some tests wait for nodes and time limits.
 test: .venv/.ready
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder -m "not slow"
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder -m "not slow"
 
 test-all: .venv/.ready
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
 
 lint: .venv/.installed
 	$(BIN)/ruff check .
