@@ -20,7 +20,7 @@ from rosbags.typesys.store import Typestore
 
 @cache
 def types_of(store: Stores = Stores.ROS2_HUMBLE) -> Typestore:
-    """The message types, read once: every process that collects tests would read them at the import."""
+    """Return the message types. To read them takes over a second, which no import of this module should cost."""
     return get_typestore(store)
 
 

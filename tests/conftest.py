@@ -42,7 +42,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """What the imports and the collection leave is looked through no more for cycles: 2 % of all processor time."""
+    """Exclude what imports and collection have created from garbage collection, which saves 2 % of processor time."""
     gc.collect()
     gc.freeze()
 

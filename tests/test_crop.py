@@ -125,7 +125,7 @@ SURE = [kind for kind in SCENES if kind not in ("hand_in_front", "two_boards", "
 
 
 QUICK = "board_before_wall", "board_on_floor", "pipe", "plate_with_large_holes", "bent_sheet"
-"""The others are a campaign of the same kind."""
+"""Scenes that `make test` runs; `make test-all` runs the others too."""
 
 
 @pytest.mark.parametrize(

@@ -45,7 +45,7 @@ def analysed(cloud: Cloud) -> Evidence:
     return DETECTOR.analyse(cloud)
 
 
-SLOW = pytest.mark.slow  # a Monte Carlo campaign; of each detector its hardest noise is quick enough
+SLOW = pytest.mark.slow  # a Monte Carlo campaign; `make test` runs two of the six cases
 CASES = [
     ("thesis", "Student's t"),
     ("matched", "smooth"),

@@ -94,18 +94,19 @@ class Findable:
     @property
     def doubt(self) -> str:
         """Return why the limits are rough; empty where size, angle and distance decide well what is found."""
+        doubts = []
         if self.growth == GROWTHS[-1]:
-            return (
+            doubts.append(
                 "the signal scatters more with the angle than the law can describe: limits may be too small where the "
                 "face is tilted, and too large where it is seen frontally"
             )
-        if self.ratio <= LOOSE:
-            return ""
-        return (
-            "what is found depends on more than size, angle and distance: the size found nine times in ten is "
-            f"{self.ratio:.2g} times that found half of the time. Limits are rough and may be far too large: run a "
-            "study in these poses before you rely on them"
-        )
+        if self.ratio > LOOSE:
+            doubts.append(
+                "what is found depends on more than size, angle and distance: the size found nine times in ten is "
+                f"{self.ratio:.2g} times that found half of the time. Limits are rough and may be far too large: run a "
+                "study in these poses before you rely on them"
+            )
+        return ". Also, ".join(doubts)
 
     def limits_mm(self, seen: Seen) -> np.ndarray:
         """Return a90 (n,) of places, at least the smallest size inspected; infinite where it is above the largest; NaN
