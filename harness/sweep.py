@@ -16,6 +16,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=help)
     help = "a recording (.mkv) whose own lens replaces the camera's nominal one, so that your unit is simulated"
     add("--calibration", type=Path, metavar="FILE", help=help)
+    help = "a first look: at most 5 repeats, a third of a study's boards, no sensitivity; wider intervals"
+    add("--quick", action="store_true", help=help)
     add("--out", type=Path, default=Path("results"), metavar="DIR", help="folder of results (default: results)")
     add("--dry-run", action="store_true", help="validate and print what would be run; run nothing")
     add_engine_options(parser)
@@ -31,7 +33,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.experiment.load import load_experiment
     from harness.experiment.schema import CaptureSource
 
-    experiment = load_experiment(options.experiment, options.overrides, options.calibration)
+    experiment = load_experiment(options.experiment, options.overrides, options.calibration, quick=options.quick)
     if isinstance(experiment.config.source, CaptureSource) and not options.dry_run:
         from harness.engine.captures import judge_captures
 

@@ -50,6 +50,16 @@ def test_averaging_is_the_experiment_of_the_thesis() -> None:
     assert len({point.digest for point in main}) == len(main)
 
 
+def test_a_quick_run_has_few_repeats_or_boards_and_says_that_it_is_a_first_look() -> None:
+    first = load_experiment(FOLDER / "averaging.yaml", ["threshold.calibrate.repeats=7"], quick=True)
+    assert first.config.repeats == 5 and first.config.threshold.calibrate.repeats == 7  # type: ignore[union-attr]
+    assert first.config.sensitivity is None and {point.variant for point in first.points} == {MAIN}
+    assert first.config.title == f"{experiment('averaging').config.title} (a first look)"
+    whole, study = (load_experiment(FOLDER / "detection_limit.yaml", quick=quick).config for quick in (False, True))
+    boards = [[c.study.boards, c.study.hole_free_boards, c.threshold.calibrate.boards] for c in (whole, study)]  # type: ignore[union-attr]
+    assert boards == [[36, 36, 60], [12, 12, 20]] and study.repeats == whole.repeats == 1
+
+
 def test_every_variation_of_averaging_changes_something() -> None:
     points = points_of("averaging")
     main = {point.digest for point in points if point.variant == MAIN}

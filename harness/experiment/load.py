@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,9 +23,12 @@ EXPERIMENT_VERSION = 1  # Version of the resolved experiment in a result folder;
 STAMP_KIND = "experiment"
 
 
-def load_experiment(path: Path, overrides: Sequence[str] = (), calibration: Path | None = None) -> Experiment:
+def load_experiment(
+    path: Path, overrides: Sequence[str] = (), calibration: Path | None = None, *, quick: bool = False
+) -> Experiment:
     """Read, override (``path=value`` each), validate and unfold. Raises DeclarationError with all problems at once.
-    ``calibration``: a recording whose lens takes the place of the camera file's nominal one (`lens_numbers`)."""
+    ``calibration``: a recording whose lens takes the place of the camera file's nominal one (`lens_numbers`).
+    ``quick``: fewer repeats and boards, and no sensitivity; ``overrides`` take precedence."""
     recording_of.cache_clear()
     path = _experiment_file(Path(path))
     written = read_yaml(path)
@@ -33,6 +37,7 @@ def load_experiment(path: Path, overrides: Sequence[str] = (), calibration: Path
     if found is not None:
         again = "use the experiment that it was made from, or remove the first line and correct what is then refused"
         check_version(found, EXPERIMENT_VERSION, path, "an experiment", again=again)
+    overrides = [*_quick(written.data), *overrides] if quick else overrides
     source, problems = overridden(written, overrides, declared_of)
     source = _with_absolute_paths(source, path.resolve().parent)
     if calibration is not None:
@@ -49,6 +54,20 @@ def load_experiment(path: Path, overrides: Sequence[str] = (), calibration: Path
         # a detector may fill some settings from others (a preset): written out they would count beside a varied preset
         data["detector"]["settings"] = shape.get(source.data, DETECTOR_SETTINGS) or {}
     return Experiment(config, points, data, source)
+
+
+def _quick(data: Any) -> list[str]:
+    """Return the overrides for a first look: at most 5 repeats, a third of a study's boards, no sensitivity."""
+    title = shape.get(data, ("title",)) or shape.get(data, ("name",))
+    overrides = [f"title={json.dumps(f'{title} (a first look)')}"]
+    overrides += ["sensitivity=null"] if shape.get(data, ("sensitivity",)) else []
+    own = "threshold.calibrate"
+    for path in ("repeats", f"{own}.repeats", "study.boards", "study.hole_free_boards", f"{own}.boards"):
+        number = shape.get(data, path.split("."))
+        if isinstance(number, int):
+            fewer = min(number, 5) if path.endswith("repeats") else -(-number // 3)
+            overrides.append(f"{path}={fewer}")
+    return overrides
 
 
 def _experiment_file(path: Path) -> Path:
