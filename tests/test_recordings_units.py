@@ -68,6 +68,12 @@ def test_distances_are_no_codes() -> None:
     assert no_return_codes(np.array([], np.uint16)) == ()
 
 
+def test_the_largest_number_of_16_bits_is_a_code_in_metres_too() -> None:
+    stored = np.concatenate([noisy(0.7, 1e-3).ravel(), np.geomspace(1000, 64000, 3000), np.full(9, 65535.0)])
+    assert no_return_codes((stored / 1000).astype(np.float32)) == (float(np.float32(65.535)),)
+    assert no_return_codes((stored / 1000).astype(np.float32)[:-9]) == ()
+
+
 def test_no_return_is_said_and_left_out(tmp_path: Path) -> None:
     stored = noisy(0.7, 1e-3)
     stored[:7] = 65535

@@ -96,9 +96,9 @@ FEW_CODES = 8
 
 def no_return_codes(stored: np.ndarray) -> tuple[float, ...]:
     """Return the numbers among ``stored`` (n,), finite and not 0, that no surface explains: they mean "no return". Four
-    kinds: the largest number of the type; a full scale of fewer bits (4095, 65534 ..) that many pixels share, well
-    beyond all others; at most `FEW_CODES` different numbers that lie `ISOLATED` times farther than all others, or of
-    integers as much nearer; at most three different negative ones. Not found: a code amid the distances."""
+    kinds: the largest number of the type (in metres, 65.535); a full scale of fewer bits (4095, 65534 ..) that many
+    pixels share, well beyond all others; at most `FEW_CODES` different numbers that lie `ISOLATED` times farther than
+    all others, or of integers as much nearer; at most three negative ones. Not found: a code amid the distances."""
     codes: list[float] = []
     is_integer = stored.dtype.kind in "iu"
     negative = stored[stored < 0]
@@ -109,7 +109,8 @@ def no_return_codes(stored: np.ndarray) -> tuple[float, ...]:
     while rest.size:
         top = rest.max().item()
         below = rest[rest < top]
-        is_largest = is_integer and top == np.iinfo(stored.dtype).max
+        # 16-bit numbers are often divided by 1000 before they are stored in metres
+        is_largest = top == np.iinfo(stored.dtype).max if is_integer else bool(np.isclose(top, 65.535, 1e-6))
         bits = math.log2(top + 3) if top < 2**32 else 0
         below_power = bits >= 11 and top == int(top) and 2 ** int(bits) - top in (0, 1, 2)
         shared = rest.size - below.size >= SHARED_CODE and below.size > 0 and top > 1.25 * below.max()

@@ -114,6 +114,7 @@ FOUND_BESIDE = (
 )  # stems of the files that are taken for the lens of the frames beside or below them
 BARE_MATRICES = (
     *("intrinsics.txt", "intrinsic.txt", "camera-intrinsics.txt", "intrinsic_depth.txt", "K.txt", "cam_K.txt"),
+    *("camera_intrinsics.txt", "camera_intrinsic.txt", "depth_intrinsics.txt"),
 )
 """The same for text files: other text beside frames is mostly something different."""
 SPELLINGS = {
