@@ -6,6 +6,8 @@ import fcntl
 import gc
 import os
 from collections.abc import Callable, Generator
+from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -15,9 +17,21 @@ from detectors.open3d_library import MissingLibrary
 from scenes.render.scene import load_mitsuba
 
 
-def pytest_configure() -> None:
+def pytest_configure(config: pytest.Config) -> None:
     """Mitsuba starts before any test imports Open3D, whose C++ library LLVM cannot use (`scenes.render.scene`)."""
     load_mitsuba()
+    worker = getattr(config, "workerinput", None)
+    if worker and [Path(path).resolve() for path in config.args] == [Path(__file__).parent]:
+        _share_compilation(int(worker["workerid"].removeprefix("gw")), worker["workercount"])
+
+
+def _share_compilation(number: int, count: int) -> None:
+    """Import all test files, each process from another one on: it finds compiled what the others had before it."""
+    files = sorted(Path(__file__).parent.glob("test_*.py"))
+    first = len(files) * number // count
+    for file in (*files[first:], *files[:first]):
+        with suppress(Exception, pytest.skip.Exception):  # the collection reports it
+            import_module(file.stem)
 
 
 LONGEST = (
