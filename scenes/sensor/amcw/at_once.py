@@ -25,7 +25,7 @@ from scenes.sensor.amcw import kernels, ranging
 from scenes.sensor.amcw.certainty import Certainty, certainty, even_pixels, fill_even
 from scenes.sensor.amcw.kernels import LANES, FilterSettings
 from scenes.sensor.amcw.linear import DEVIATIONS, Light, light_of_samples, linearised, unknown_filtered
-from scenes.sensor.normals import EXACT_SUMS, FAST, standard_normals
+from scenes.sensor.normals import EXACT_SUMS, FAST, random_words, standard_normals
 from scenes.sensor.unit import N_REASONS, FrameTotals
 
 if TYPE_CHECKING:
@@ -40,8 +40,9 @@ class Linear(NamedTuple):
     """Pixels of a view, (n,) float32 except ``kind`` (uint8) and ``row`` (int32); z in steps of the output. ``noise``:
     one deviation of a pixel's noise, in any unit. ``z``: the mean minus ``base``, a whole number. ``by_path``: change
     of z per step of half path. EVEN pixels have ``each``, the change of z by a neighbour's noise at weight 1, and
-    ``more``, that by the centre's own noise beyond its weight's part. UNEVEN pixels have ``row`` in ``moved`` (m, k):
-    the same by each neighbour. ``taps`` (side,): symmetric weights by distance along a row."""
+    ``more``, that by the centre's own noise beyond its weight's part. UNEVEN pixels have ``row`` in ``moved`` (m,
+    side^2): the same by each neighbour. ``taps`` (side,): symmetric weights by distance along a row. The sides are
+    an odd multiple of 5, with zeros around a smaller window."""
 
     kind: np.ndarray
     noise: np.ndarray
@@ -77,25 +78,16 @@ def _noise_row(y, words, given, given_at, noise, w, half, row):  # type: ignore[
 
 
 @numba.njit(**FAST)
-def _pair_sum(above, below, tap, shift, other_shift, length, total):  # type: ignore[no-untyped-def]
-    for k in range(np.uint64(length)):
-        total[k] += tap * (above[np.uint64(shift) + k] + below[np.uint64(other_shift) + k])
-
-
-@numba.njit(**FAST)
-def _window_sums(rows, blank, y, h, taps, w, down, across):  # type: ignore[no-untyped-def]
-    """Write weighted sums over the window of each pixel of picture row y, (w lanes,), into ``across``."""
-    side = taps.size
-    half = side // 2
-    length = w * LANES
-    down[:] = taps[half] * rows[y % side]
-    for d in range(1, half + 1):
-        above = rows[(y - d) % side] if y - d >= 0 else blank
-        below = rows[(y + d) % side] if y + d < h else blank
-        _pair_sum(above, below, taps[half - d], 0, 0, down.size, down)
-    across[:] = taps[half] * down[half * LANES : half * LANES + length]
-    for d in range(1, half + 1):
-        _pair_sum(down, down, taps[half - d], (half - d) * LANES, (half + d) * LANES, length, across)
+def _sum_over(values, starts, taps, total):  # type: ignore[no-untyped-def]
+    """Write into ``total`` (n,) the sum of n values from each of ``starts`` (5 k,) on, times its tap."""
+    for q in range(0, taps.size, 5):
+        s1, s2, s3 = np.uint64(starts[q]), np.uint64(starts[q + 1]), np.uint64(starts[q + 2])
+        s4, s5 = np.uint64(starts[q + 3]), np.uint64(starts[q + 4])
+        a, b, c, d, e = taps[q], taps[q + 1], taps[q + 2], taps[q + 3], taps[q + 4]
+        for k in range(np.uint64(total.size)):
+            before = total[k] if q else f4(0)
+            some = a * values[s1 + k] + b * values[s2 + k] + c * values[s3 + k]
+            total[k] = before + some + d * values[s4 + k] + e * values[s5 + k]
 
 
 @numba.njit(**FAST)
@@ -128,47 +120,35 @@ def add_linear_frames(  # type: ignore[no-untyped-def]
     side = linear.taps.size
     half = side // 2
     width = (w + 2 * half) * LANES
-    rows = np.zeros((side, width), np.float32)
-    blank, down, across = np.zeros(width, np.float32), np.empty(width, np.float32), np.empty(w * LANES, np.float32)
-    sums, rounded = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
+    # noise of the picture rows of a window, and of one beyond the picture; its sums along columns, and over windows
+    rows, down, across = np.zeros((side + 1, width), f4), np.empty(width, f4), np.empty(w * LANES, f4)
+    noise, starts, places = rows.reshape(rows.size), np.empty(side, np.int64), np.empty(side * side, np.int64)
+    beside = np.arange(side) * LANES
+    sums, rounded = np.empty(LANES, f4), np.empty(LANES, f4)
     for y in range(-half, h):
         if y + half < h:
             _noise_row(y + half, words, given, given_at, linear.noise, w, half, rows[(y + half) % side])
         if y < 0:
             continue
-        _window_sums(rows, blank, y, h, linear.taps, w, down, across)
-        own = rows[y % side]
+        for q in range(side):
+            starts[q] = ((y + q - half) % side if 0 <= y + q - half < h else side) * width
+        _sum_over(noise, starts, linear.taps, down)
+        _sum_over(down, beside, linear.taps, across)
         for x in range(w):
-            i = y * w + x
+            i, own = y * w + x, starts[half] + (x + half) * LANES
             z, by_path = linear.z[i], linear.by_path[i]
             if linear.kind[i] == EVEN:
-                start, mine = x * LANES, (x + half) * LANES
-                _round(z, by_path, errors, linear.each[i], across, start, linear.more[i], own, mine, rounded)
+                _round(z, by_path, errors, linear.each[i], across, x * LANES, linear.more[i], noise, own, rounded)
             elif linear.kind[i] == UNEVEN:
-                sums[:] = f4(0)
                 for q in range(side * side):
-                    pull = linear.moved[linear.row[i], q]
-                    if pull != f4(0):
-                        source, first = rows[(y + q // side - half) % side], np.uint64((x + q % side) * LANES)
-                        for t in range(np.uint64(LANES)):
-                            sums[t] += pull * source[first + t]
+                    places[q] = starts[q // side] + (x + q % side) * LANES
+                _sum_over(noise, places, linear.moved[linear.row[i]], sums)
                 _round(z, by_path, errors, f4(1), sums, 0, f4(0), sums, 0, rounded)
             else:
                 continue
             a, b = _sums_of(rounded, counted)
             total[i] += a
             squares[i] += b
-
-
-@numba.njit(**EXACT_SUMS)
-def add_bytes(words: np.ndarray, counted: np.ndarray, total: np.ndarray) -> None:
-    """Add to ``total`` (n,) the bytes ``words`` (n lanes,) int8 of the counted frames, as numbers of variance 1."""
-    scale = f4(1 / np.sqrt((256.0**2 - 1) / 12))
-    for i in range(total.size):
-        sum_of_all = f4(0)
-        for t in range(np.uint64(LANES)):
-            sum_of_all += counted[t] * (f4(words[np.uint64(i * LANES) + t]) + f4(0.5))
-        total[i] += scale * sum_of_all
 
 
 MOST_LISTED = 0.25  # if more of the pixels had to be simulated one by one, whole frames would cost less
@@ -278,6 +258,9 @@ def _linear(
     by_each = np.copysign(np.sqrt((pulls**2).sum(axis=0)), pulls.sum(axis=0)) * by_path[at, None] / step_m
     by_each /= windows_of(noise.reshape(imager.region.shape), side, 1.0, at)
     taps = space[side // 2] / np.sqrt(space[side // 2, side // 2])
+    rim = (10 * ((side + 4) // 10) + 5 - side) // 2
+    taps, by_each = np.pad(taps, rim), np.pad(by_each.reshape(-1, side, side), ((0, 0), (rim, rim), (rim, rim)))
+    by_each = by_each.reshape(-1, taps.size**2)
     base = np.round(z)
     own, off, steps, others, rest_of = (values.astype(f4) for values in (noise, z - base, by_path, each, more))
     return Linear(kind, own, base.astype(f4), off, steps, others, rest_of, row, by_each.astype(f4), taps.astype(f4))
@@ -335,14 +318,15 @@ class AtOnce:
         sums = np.zeros(p, np.int32), np.zeros(p), np.zeros(p), np.zeros(p), np.zeros((N_REASONS, p), np.uint16)
         for block in np.unique(frames // LANES):
             chosen = frames // LANES == block
-            errors, counted = np.zeros(LANES), np.zeros(LANES, f4)
+            errors, counted = np.zeros(LANES, f4), np.zeros(LANES, f4)
             errors[frames[chosen] % LANES], counted[frames[chosen] % LANES] = errors_m[chosen], 1
             rng = stream(int(block))
             given = self._add_one_by_one(errors, counted, rng, sums)
-            words = rng.bit_generator.random_raw(2 * n * LANES // 8).view(np.int8)
-            steps = (errors / f4(step_m)).astype(f4)
-            add_linear_frames(shape, self.linear, words[: n * LANES], given, given_at, steps, counted, total, squares)
-            add_bytes(words[n * LANES :], counted, sway)
+            words, signs = random_words(rng, n * LANES // 8).view(np.int8), random_words(rng, n)
+            add_linear_frames(shape, self.linear, words, given, given_at, errors / f4(step_m), counted, total, squares)
+            # the amplitude's noise in each frame is one deviation up or down
+            bits = np.uint64(sum(1 << lane for lane in np.flatnonzero(counted).tolist()))
+            sway += f4(2) * np.bitwise_count(signs & bits) - f4(chosen.sum())
 
         certain, taps, noise = self.certain, self.linear.taps, sway.reshape(shape)
         for axis in (0, 1):
@@ -363,14 +347,12 @@ class AtOnce:
     def _add_one_by_one(
         self, errors_m: np.ndarray, counted: np.ndarray, rng: np.random.Generator, sums: tuple[np.ndarray, ...]
     ) -> np.ndarray:
-        """Add the listed pixels of a block to ``sums``."""
+        """Add the listed pixels of a block to ``sums``. Return the noise of z (g, lanes) on their halo."""
         light, flying_gate, wanted = self.light, self.imager.engine.flying, self.list.wanted
         g, m, n_frequencies = len(self.list.halo), len(self.list.range), len(light.turn)
-        normals = standard_normals(rng, (g, n_frequencies, 2, LANES))
-        if m == 0:
-            return normals[:, 0, 0]
-        planes = np.empty((g, n_frequencies, kernels.BLOCK), f4)
-        kernels.noisy_phasors(light.phasor, light.amplitude, light.turn, light.swell, normals, planes)
+        normals, noise = standard_normals(rng, (g, n_frequencies, 2, LANES)), np.zeros((g, LANES), f4)
+        planes = np.empty((g // kernels.BESIDE + 2, n_frequencies, 3, kernels.STRIDE), f4)
+        kernels.noisy_phasors(*light[:2], *light[3:], self.shares, normals, planes, noise)
         filtered, edge = np.empty((n_frequencies, 3, m, LANES), f4), np.empty((n_frequencies, m, LANES), f4)
         kernels.filter_listed(planes, self.list.window, self.imager.filter_settings, filtered, edge)
         flat, unsaturated = filtered.reshape(n_frequencies, 3, -1), np.zeros(m * LANES, np.uint8)
@@ -382,7 +364,7 @@ class AtOnce:
             ranging.find_flying(z_m, total, reason, wanted, self.list.near, flying_gate, flying)
         base, step_m = self.linear.base[self.listed], f4(self.imager.camera.z_step_m)
         _add_listed(z_m, reason, total, flying, wanted, counted, 1.0 / n_frequencies, step_m, base, *sums)
-        return np.asarray((self.shares[:, :, None] * normals[:, :, 1]).sum(axis=1))
+        return noise
 
 
 @numba.njit(**FAST)
