@@ -35,7 +35,7 @@ from scenes.sensor.camera import CameraConfig, camera_of
 from scenes.sensor.source import SimulatedCapture, SimulatedUnit
 from scenes.sensor.unit import FrameTotals
 
-FEWEST_FRAMES = 20
+FEWEST_FRAMES = 10
 """Drawing fewer frames costs less than sorting a view's pixels. Results depend on the number only, not on the cost."""
 FLAT_ALBEDO = 0.6  # albedo of a flat field's plane: painted wood or paper, like the boards of the experiments
 MOST_DISTURBED = 0.5
@@ -80,15 +80,11 @@ def _at_once(capture: SimulatedCapture, counts: list[int], config: AverageConfig
     # noise of one frame, with rounding, as `detectors.average` estimates it
     noise_m = float(np.hypot(summer.noise_m, capture.z_step_m / np.sqrt(12)))
     left_out = _left_out(capture, summer, config, noise_m) if config.judge_frames else {}
-    sums: FrameTotals | None = None
+    steps = pairwise([0, *counts])
+    parts = [np.array([number for number in range(*step) if number not in left_out], int) for step in steps]
     clouds: dict[int, Cloud] = {}
-    for start, n in pairwise([0, *counts]):
-        frames = np.array([number for number in range(start, n) if number not in left_out])
-        totals = capture.totals(frames) if len(frames) else None
-        if totals is None and len(frames):
-            return {}
-        sums = sums + totals if sums and totals else sums or totals
-        cloud = _cloud(capture, sums, tuple(left for number, left in left_out.items() if number < n)) if sums else None
+    for n, totals in zip(counts, capture.totals(parts) or (), strict=False):
+        cloud = _cloud(capture, totals, tuple(left for number, left in left_out.items() if number < n))
         if cloud is not None and not (config.judge_frames and _disturbed(cloud, noise_m, config)):
             clouds[n] = cloud
     return clouds

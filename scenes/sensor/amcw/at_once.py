@@ -11,7 +11,7 @@ less than that of single frames' means (standard error 3 %); the cause is not kn
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
@@ -113,7 +113,8 @@ def _sums_of(rounded, counted):  # type: ignore[no-untyped-def]
 def add_linear_frames(  # type: ignore[no-untyped-def]
     shape, linear, words, given, given_at, errors, counted, total, squares
 ):
-    """Add `LANES` frames at the EVEN and UNEVEN pixels of ``linear`` to (n,): z minus base, and its square, in steps.
+    """Add `LANES` frames at the EVEN and UNEVEN pixels of ``linear`` to (k, n): z minus base, and its square, in steps,
+    over the frames that each row of ``counted`` (k, lanes) counts.
     ``words`` (n lanes,) int8: random bytes; the normals ``given`` (g, lanes) replace them where ``given_at`` (n,) is
     not -1, so that pixels simulated in another way share their noise. ``errors`` (lanes,): displacements in steps."""
     h, w = shape
@@ -146,9 +147,10 @@ def add_linear_frames(  # type: ignore[no-untyped-def]
                 _round(z, by_path, errors, f4(1), sums, 0, f4(0), sums, 0, rounded)
             else:
                 continue
-            a, b = _sums_of(rounded, counted)
-            total[i] += a
-            squares[i] += b
+            for part in range(len(counted)):
+                a, b = _sums_of(rounded, counted[part])
+                total[part, i] += a
+                squares[part, i] += b
 
 
 MOST_LISTED = 0.25  # if more of the pixels had to be simulated one by one, whole frames would cost less
@@ -308,46 +310,68 @@ class AtOnce:
         return engine._replace(geometry=engine.geometry.take(at, axis=1), outside_mask=engine.outside_mask[at])
 
     def totals(
-        self, frames: np.ndarray, errors_m: np.ndarray, stream: Callable[[int], np.random.Generator]
-    ) -> FrameTotals:
-        """Sum the frames with numbers ``frames`` (t,), displaced by ``errors_m`` (t,). The noise of frames `LANES` k to
-        `LANES` (k + 1) - 1 comes from ``stream`` (k), whichever of them are requested."""
-        n, p, shape, step_m = self.linear.z.size, len(self.listed), self.shape, self.imager.camera.z_step_m
-        total, squares, sway, given_at = np.zeros(n), np.zeros(n), np.zeros(n, f4), np.full(n, -1, np.int32)
+        self, parts: Sequence[np.ndarray], errors_m: np.ndarray, stream: Callable[[int], np.random.Generator]
+    ) -> list[FrameTotals]:
+        """Return the sums over the first of ``parts``, over the first two, and so on: each has numbers of frames (t,),
+        no number twice. ``errors_m``: displacements by number. The noise of frames `LANES` k to `LANES` (k + 1) - 1
+        comes from ``stream`` (k), whichever of them are requested."""
+        n, p, k, shape, step_m = (
+            self.linear.z.size,
+            len(self.listed),
+            len(parts),
+            self.shape,
+            self.imager.camera.z_step_m,
+        )
+        total, squares, sway = np.zeros((k, n)), np.zeros((k, n)), np.zeros((k, n), f4)
+        sums = (np.zeros((k, p), np.int32), *np.zeros((3, k, p)), np.zeros((k, N_REASONS, p), np.uint16))
+        given_at = np.full(n, -1, np.int32)
         given_at[self.list.halo] = np.arange(len(self.list.halo))
-        sums = np.zeros(p, np.int32), np.zeros(p), np.zeros(p), np.zeros(p), np.zeros((N_REASONS, p), np.uint16)
-        for block in np.unique(frames // LANES):
-            chosen = frames // LANES == block
-            errors, counted = np.zeros(LANES, f4), np.zeros(LANES, f4)
-            errors[frames[chosen] % LANES], counted[frames[chosen] % LANES] = errors_m[chosen], 1
-            rng = stream(int(block))
-            given = self._add_one_by_one(errors, counted, rng, sums)
+        blocks = 1 + max(int(frames.max(initial=0)) for frames in parts) // LANES
+        part_of, errors = np.full(blocks * LANES, -1), np.zeros(blocks * LANES, f4)
+        for number, frames in enumerate(parts):
+            part_of[frames], errors[frames] = number, errors_m[frames]
+        for block in np.unique(np.flatnonzero(part_of >= 0) // LANES).tolist():
+            lanes = slice(block * LANES, (block + 1) * LANES)
+            rng, counted = stream(block), (part_of[lanes] == np.arange(k)[:, None]).astype(f4)
+            given = self._add_one_by_one(errors[lanes], part_of[lanes], rng, sums)
             words, signs = random_words(rng, n * LANES // 8).view(np.int8), random_words(rng, n)
-            add_linear_frames(shape, self.linear, words, given, given_at, errors / f4(step_m), counted, total, squares)
-            # the amplitude's noise in each frame is one deviation up or down
-            bits = np.uint64(sum(1 << lane for lane in np.flatnonzero(counted).tolist()))
-            sway += f4(2) * np.bitwise_count(signs & bits) - f4(chosen.sum())
+            steps = errors[lanes] / f4(step_m)
+            add_linear_frames(shape, self.linear, words, given, given_at, steps, counted, total, squares)
+            for part, there in zip(sway, counted, strict=True):
+                # the amplitude's noise in each frame is one deviation up or down
+                bits = np.uint64(sum(1 << lane for lane in np.flatnonzero(there).tolist()))
+                part += f4(2) * np.bitwise_count(signs & bits) - f4(there.sum())
+        running = (np.cumsum(values, axis=0, dtype=values.dtype) for values in (total, squares, sway, *sums))
+        frames_in = np.cumsum([len(frames) for frames in parts]).tolist()
+        return [self._finished(*each) for each in zip(frames_in, *running, strict=True)]
 
-        certain, taps, noise = self.certain, self.linear.taps, sway.reshape(shape)
+    def _finished(
+        self, frames: int, total: np.ndarray, squares: np.ndarray, sway: np.ndarray, *sums: np.ndarray
+    ) -> FrameTotals:
+        """Return the sums over ``frames`` frames from those of the linear and of the listed pixels."""
+        certain, taps, shape = self.certain, self.linear.taps, self.shape
+        noise = sway.reshape(shape)
         for axis in (0, 1):
             noise = ndimage.correlate1d(noise, taps / np.sqrt((taps**2).sum()), axis=axis, mode="constant")
-        swaying = len(frames) * certain.amplitude + certain.amplitude_deviation * noise.ravel()
-        amplitude = np.where(certain.always, swaying, 0.0)
-        count = np.where(certain.always, len(frames), 0).astype(np.int32)
-        reasons = np.zeros((N_REASONS, n), np.uint16)
+        amplitude = np.where(
+            certain.always, frames * certain.amplitude + certain.amplitude_deviation * noise.ravel(), 0.0
+        )
+        count = np.where(certain.always, frames, 0).astype(np.int32)
+        reasons = np.zeros((N_REASONS, len(count)), np.uint16)
         never, at = np.flatnonzero(certain.never), self.listed
-        reasons[certain.reason[never], never] = len(frames)
-        reasons[Reason.VALID, certain.always] = len(frames)
+        reasons[certain.reason[never], never] = frames
+        reasons[Reason.VALID, certain.always] = frames
         count[at], total[at], squares[at], amplitude[at], reasons[:, at] = sums
         return FrameTotals(
-            len(frames), step_m, self.linear.base.astype(float).reshape(shape), count.reshape(shape),
+            frames, self.imager.camera.z_step_m, self.linear.base.astype(float).reshape(shape), count.reshape(shape),
             total.reshape(shape), squares.reshape(shape), amplitude.reshape(shape), reasons.reshape(-1, *shape),
         )  # fmt: skip
 
     def _add_one_by_one(
-        self, errors_m: np.ndarray, counted: np.ndarray, rng: np.random.Generator, sums: tuple[np.ndarray, ...]
+        self, errors_m: np.ndarray, part_of: np.ndarray, rng: np.random.Generator, sums: Arrays
     ) -> np.ndarray:
-        """Add the listed pixels of a block to ``sums``. Return the noise of z (g, lanes) on their halo."""
+        """Add the listed pixels' frames to ``sums``, each to its ``part_of`` (lanes,). Return their halo's noise of z
+        (g, lanes)."""
         light, flying_gate, wanted = self.light, self.imager.engine.flying, self.list.wanted
         g, m, n_frequencies = len(self.list.halo), len(self.list.range), len(light.turn)
         normals, noise = standard_normals(rng, (g, n_frequencies, 2, LANES)), np.zeros((g, LANES), f4)
@@ -363,24 +387,25 @@ class AtOnce:
         if flying_gate is not None:
             ranging.find_flying(z_m, total, reason, wanted, self.list.near, flying_gate, flying)
         base, step_m = self.linear.base[self.listed], f4(self.imager.camera.z_step_m)
-        _add_listed(z_m, reason, total, flying, wanted, counted, 1.0 / n_frequencies, step_m, base, *sums)
+        _add_listed(z_m, reason, total, flying, wanted, part_of, 1.0 / n_frequencies, step_m, base, *sums)
         return noise
 
 
 @numba.njit(**FAST)
 def _add_listed(  # type: ignore[no-untyped-def]
-    z_m, reason, strength, flying, wanted, counted, share, step_m, base, count, total, squares, amplitude, reasons
+    z_m, reason, strength, flying, wanted, part_of, share, step_m, base, count, total, squares, amplitude, reasons
 ):
-    """Add the frames that are ``counted`` (t,) of listed pixels to sums (p,), and to ``reasons`` (r, p)."""
+    """Add the frames of listed pixels to sums (k, p) and ``reasons`` (k, r, p), each to its part; -1: not counted."""
     for p in range(wanted.size):
-        for t in range(counted.size):
-            if counted[t] == f4(0):
+        for t in range(part_of.size):
+            k = part_of[t]
+            if k < 0:
                 continue
             code = np.uint8(ranging.EDGE) if flying[p, t] else reason[wanted[p], t]
-            reasons[code, p] += 1
+            reasons[k, code, p] += 1
             if code == ranging.VALID:
                 steps = np.floor(z_m[wanted[p], t] / step_m + f4(0.5)) - base[p]
-                count[p] += 1
-                total[p] += steps
-                squares[p] += steps * steps
-                amplitude[p] += strength[wanted[p], t] * share
+                count[k, p] += 1
+                total[k, p] += steps
+                squares[k, p] += steps * steps
+                amplitude[k, p] += strength[wanted[p], t] * share
