@@ -63,7 +63,7 @@ class FilterConfig(Config):
 
 
 class LocalConfig(FilterConfig):
-    """``surface``: ``shape: auto`` unless shape or degree is given. ``hole_model``: measures sizes."""
+    """``surface``: ``shape: auto`` unless a shape or degree is given. ``hole_model``: measures sizes."""
 
     @model_validator(mode="before")
     @classmethod

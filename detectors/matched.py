@@ -55,9 +55,9 @@ LEAST_SEEN = 0.6
 SHORT_PX = 13
 """Width over which noise is compared between places: wider filters count there as much as elsewhere."""
 QUIET_SIGMAS = 4.0
-"""Residuals beyond it, and their neighbours, do not count for the covariance."""
+"""Larger residuals and their neighbours do not count for the covariance."""
 CLIP_SIGMAS = 5.0
-"""Deviations to which a pixel is clipped if its neighbours are smaller: a flying pixel alone is no finding."""
+"""Limit to which a pixel is clipped if its neighbours are smaller: a single flying pixel is not a finding."""
 STRONG, LOUD_SIGMAS, MARGIN_PX = 6.0, 3.0, 2
 """A peak with this score, the loud pixels connected to it, and those around are removed; the rest is judged again."""
 LOUD_SHARE = 0.5
@@ -67,7 +67,7 @@ ALONE_PX = 7
 RIM_PX = 6
 """Depth of the target's rim, to which the camera's window and lens reach over its edge."""
 RIM_ENDS_PX = (1, 2, 3, 5, 8, 12)
-"""Distances from the outline up to which scores have their own scatter; beyond, all are alike."""
+"""Distances from the outline up to which scores have their own scatter; farther inside, all scores share one."""
 N_ZONES = len(RIM_ENDS_PX) + 1
 ZONES = np.searchsorted(RIM_ENDS_PX, np.arange(RIM_ENDS_PX[-1] + 2)).astype(np.uint8)
 WINDOW_RADII, PART_PX, UNEVEN = 6, 8, 1.25
@@ -81,11 +81,11 @@ CAPPED = DEVIATIONS * np.sqrt(2.0 / np.pi) * (1.0 - np.exp(-0.5 * (CAP / DEVIATI
 CAPPED_UNEVEN = float(np.interp(UNEVEN, DEVIATIONS, CAPPED))
 """Deviations of a Gaussian, and the mean of its size if more than `CAP` counts as `CAP`."""
 FAINT = 3.5
-"""Scores below are all raised by the same factor, because Worth counts maxima."""
+"""Scores below this are all raised by the same factor, because `Worth` counts maxima."""
 LOBE_SHARE = 0.5
-"""A score that is so much smaller than one of the other sign within `RIM_PX` is a lobe left by whitening."""
+"""A score below this share of a score of the other sign within `RIM_PX` is a side lobe of the whitening."""
 WIDE_PX = 5.0
-"""Radius from which on noise may split a template's finding into several peaks."""
+"""Radius from which noise may split a template's finding into several peaks."""
 TAIL_PX, TAIL_SHARE, TAIL_SIGMAS = 1.5, 0.0005, 3.29
 """Largest radius at which a template's own scores show their tail; the share of pixels beyond it on either side; and
 where a Gaussian has it. Wider means are near Gaussian, and too few of them are independent."""
@@ -119,7 +119,7 @@ class MatchedDetector(LocalDetector):
         return replace(evidence, score=score, signed=signed)
 
     def picture(self, cloud: Cloud, pixels: int = 1) -> LocalPicture:
-        """Return the residuals on a grid in which noise reaches no farther than through a camera's own window."""
+        """Return the residuals on a grid in which noise reaches no farther than a camera's own window."""
         return super().picture(cloud, max(pixels, round(cloud.noise_reach_px / max(whitening.WINDOWS_PX))))
 
     def scored(
