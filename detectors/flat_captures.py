@@ -43,7 +43,7 @@ BELIEF_STEPS = 5
 class FlatCapture:
     """One capture of a flat surface. ``residual_m`` (h, w): range along the ray less the smooth fit, NaN where it does
     not count; ``variance_m2`` (h, w): of it, by the frames' noise. ``normal`` (3,): of the plane, towards the camera.
-    ``places_m`` (h, w, 2): where each pixel sees the surface, in its co-ordinates; None where poses are unknown."""
+    ``places_m`` (h, w, 2): where each pixel sees the surface, in its co-ordinates; None if poses are unknown."""
 
     name: str
     frames: int
@@ -88,7 +88,7 @@ class PatternChange:
 class Separated:
     """A flat field with its diagnostics. ``surface_m``: standard deviation of the part that captures do not share,
     beyond their noise, or NaN; ``separated``: whether the shape was solved for. ``in_time``: first captures beside last
-    ones, at equal distances; ``in_range``: near beside far ones; None where there are not enough."""
+    ones, at equal distances; ``in_range``: near beside far ones; None if there are not enough."""
 
     field: FlatField
     captures: tuple[FlatCapture, ...]

@@ -44,7 +44,7 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
         return 1.0 if self.settings.scale == "highest_before" else None
 
     def analyse(self, cloud: Cloud) -> Evidence:
-        """Score |residual| / scale in the crop. Raises UserError where it determines no surface."""
+        """Score |residual| / scale in the crop. Raises UserError if it determines no surface."""
         mask = crop(cloud, self.settings.crop)
         if self.settings.surface.shape != "polynomial":
             return self._before_background(cloud, mask)

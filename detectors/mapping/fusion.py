@@ -181,8 +181,8 @@ def fuse(
 ) -> tuple[Cloud, np.ndarray, SurfaceMap, tuple[str, ...]]:
     """Return the map as an organised cloud, its frame in the first view's (4, 4), what else is known, and notes. The
     cloud's ``variance_m2`` over ``count`` is the temporal part of the variance, ``mean_variance_m2`` all of it, which
-    one view does not know of itself (then None). Rounding is in it. Raises UserError where the points do not determine
-    a surface or the map would have too many cells."""
+    one view does not know of itself (then None). Rounding is in it. Raises UserError if the points do not determine a
+    surface or the map would have too many cells."""
     T_reference_map = placing.T_reference_map_of(views[0])
     surface = placing.common_surface(views, T_reference_map)
     placed = [placing.place(view, T_reference_map, surface) for view in views]

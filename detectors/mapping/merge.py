@@ -43,7 +43,7 @@ BLOCK, BLOCKS_AT_FIRST = 8, 4096
 def integrate(views: Sequence[ChosenView], voxel_m: float | None) -> tuple[Cloud, tuple[str, ...]]:
     """Return an unorganised cloud in the first view's frame, the field's zero crossings, sorted by x, y, z; and notes.
     ``count`` is 1, ``variance_m2`` of all points the median variance of one frame's z over the views' targets, for the
-    floor that rounding sets. Raises UserError where the field or the targets hold no smooth surface."""
+    floor that rounding sets. Raises UserError if the field or the targets hold no smooth surface."""
     clouds = [view.cloud for view in views]
     z = clouds[0].points_m[views[0].inside][:, 2]
     pitch = float(np.median(z)) * views[0].slope_step
@@ -71,7 +71,8 @@ def integrate(views: Sequence[ChosenView], voxel_m: float | None) -> tuple[Cloud
 
 
 def _undistorted(view: ChosenView) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-    """Return depth (h, w, 1) float32, 0 for none, on a pinhole's grid; colour (h, w, 3) 0..1 if any; camera matrix."""
+    """Return depth (h, w, 1) float32, 0 if there is none, on a pinhole's grid; colour (h, w, 3) 0..1 if any; camera
+    matrix."""
     cloud, inside = view.cloud, view.inside
     with np.errstate(invalid="ignore"):
         slopes = cloud.points_m[..., :2] / cloud.points_m[..., 2:]
@@ -175,13 +176,13 @@ class Mapped:
 
 
 def prepare(view: View, config: MappingConfig) -> PreparedView:
-    """Cut the target out of a view and find its marks. Raises UserError where the crop leaves nothing."""
+    """Cut the target out of a view and find its marks. Raises UserError if the crop leaves nothing."""
     inside = crop(view.cloud, config.crop)
     return PreparedView(view, inside, find_marks(view.cloud, inside, config.marks))
 
 
 def merge(views: Sequence[PreparedView], registrations: Sequence[Registration], config: AnyMerge) -> Merged:
-    """Merge the views whose registration did not fail to one cloud; works for a single view too. Raises UserError where
+    """Merge the views whose registration did not fail to one cloud; works for a single view too. Raises UserError if
     nothing is left to merge, or the settings ask for too many cells."""
     began = time.perf_counter()
     chosen, left_out = list[ChosenView](), tuple[str, ...]()
@@ -212,7 +213,7 @@ def merge(views: Sequence[PreparedView], registrations: Sequence[Registration], 
 
 def _on_grid(views: Sequence[ChosenView], step_m: float) -> Cloud:
     """The thesis' merge (MATLAB's pcmerge) as an unorganised cloud in the first view's frame: boxes in the order of x,
-    then y, then z; then the rest. Raises UserError where there are more boxes along an axis than can be numbered. The
+    then y, then z; then the rest. Raises UserError if there are more boxes along an axis than can be numbered. The
     overlap of the clouds' axis-parallel bounding boxes is divided into boxes from its lowest corner; each box with
     points becomes their plain mean, in place and in colour; points beyond the overlap stay. Of more than two clouds all
     go into one grid, over the union of the pairwise overlaps, where pcmerge called in turn would weight a late cloud

@@ -45,7 +45,7 @@ class CellGrid:
 @dataclass(frozen=True)
 class Raster:
     """The samples around each cell of a grid. ``weights``: sparse (h * w, n), the part of each of n samples in the mean
-    over a cell; a row sums to 1, and is empty where less than half of the cell is covered."""
+    over a cell; a row sums to 1, and is empty if less than half of the cell is covered."""
 
     weights: Any
     shape: tuple[int, int]
@@ -204,7 +204,7 @@ def _some(points: np.ndarray, number: int) -> np.ndarray:
 
 
 def common_surface(views: Sequence[ChosenView], T_reference_map: np.ndarray) -> Surface:
-    """Fit a robust cubic z(x, y) in the map's frame through all targets. Raises UserError where they give none."""
+    """Fit a robust cubic z(x, y) in the map's frame through all targets. Raises UserError if they give none."""
     points = np.concatenate([_some(view.points_reference_m, FIT_POINTS // len(views)) for view in views])
     x, y, z = transform_points(invert(T_reference_map), points).T
     return fit_surface(x, y, z, SurfaceConfig())

@@ -91,7 +91,7 @@ class Spot:
 
 
 def fit_patch(points_m: np.ndarray) -> Patch | None:
-    """Fit the plane of at least two thirds of points (n, 3); return None where they are too few or lie on a line."""
+    """Fit the plane of at least two thirds of points (n, 3); return None if they are too few or lie on a line."""
     x, y, z = points_m[:: max(1, len(points_m) // PATCH_POINTS)].T
     try:
         plane = fit_surface(x, y, z, SurfaceConfig(degree=1))
@@ -159,7 +159,7 @@ def coded_marks(cloud: Cloud, inside: np.ndarray, dictionary: str) -> MarkSet:
 
 
 def _coded_mark(cloud: Cloud, inside: np.ndarray, code: int, corners: np.ndarray, twice: bool) -> Mark | None:
-    """Return the tag as a mark; None where it lies off the target or has no range."""
+    """Return the tag as a mark; None if it lies off the target or has no range."""
     area = np.zeros(inside.shape, dtype=np.uint8)
     cv2.fillConvexPoly(area, np.rint(corners).astype(np.int32), 1)
     pixels = np.flatnonzero((area > 0) & inside)

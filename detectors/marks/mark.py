@@ -84,7 +84,7 @@ class MarkSet:
 
 
 def problem_of(marks: Sequence[Mark], missing: str = "") -> str:
-    """Return why no registration can rest on these marks; empty where one can. ``missing``: why there are not more."""
+    """Return why no registration can rest on these marks; empty if one can. ``missing``: why there are not more."""
     trusted = [mark for mark in marks if not mark.doubt]
     if len(trusted) >= LEAST_MARKS:
         return off_line_problem(trusted)

@@ -101,7 +101,7 @@ NO_PAIRS = np.zeros((0, 2), dtype=np.int64)
 @dataclass(frozen=True)
 class Pairing:
     """``pairs`` (n, 2): indices into the reference's marks and into the view's, in the reference's order. ``problem``:
-    why they must not be used, empty where they may. ``notes``: further remarks."""
+    why they must not be used, empty if they may. ``notes``: further remarks."""
 
     pairs: np.ndarray
     problem: str = ""

@@ -43,13 +43,13 @@ ArraysLoader = Callable[[Path], Arrays]
 
 
 def load_npy(path: Path) -> dict[str, np.ndarray]:
-    """Map an ``.npy`` file. Raises UserError where it is broken or holds objects."""
+    """Map an ``.npy`` file. Raises UserError if it is broken or holds objects."""
     with read_errors(f"{path}: cannot be read as arrays", LEGAL_ARRAYS):
         return {"": np.lib.format.open_memmap(path, mode="r")}
 
 
 def load_npz(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of an ``.npz`` file by name. Raises UserError where it is broken, too large, or has objects."""
+    """Return the arrays of an ``.npz`` file by name. Raises UserError if it is broken, too large, or has objects."""
     with read_errors(f"{path}: cannot be read as arrays", LEGAL_ARRAYS):
         with zipfile.ZipFile(path) as archive:
             stated = sum(entry.file_size for entry in archive.infolist())
@@ -136,7 +136,7 @@ class RawLoader:
         return cls(int(width), int(height), kind if kind[0] in "<>" else f"<{kind}", int(step or own), int(offset or 0))
 
     def __call__(self, path: Path) -> dict[str, np.ndarray]:
-        """Map the frames (n, h, w). Raises UserError where there is none."""
+        """Map the frames (n, h, w). Raises UserError if there is none."""
         kind, size = np.dtype(self.kind), path.stat().st_size - self.offset
         frame = self.width * self.height * self.step
         if size < frame:
@@ -147,7 +147,7 @@ class RawLoader:
         return {"": np.ndarray((size // frame, self.height, self.width), kind, content, strides=strides)}
 
     def refuse_doubtful(self, path: Path, frames: np.ndarray) -> int:
-        """Return the bytes left over after the frames. Raises UserError where neighbours differ too much."""
+        """Return the bytes left over after the frames. Raises UserError if neighbours differ too much."""
         rough = _apart(frames[0][:, 1:], frames[0][:, :-1])
         if not rough < NEIGHBOURS:
             what = f"in this layout the median pixel differs from its neighbour by {100 * rough:.3g} %"
@@ -182,7 +182,7 @@ Stack = tuple[np.ndarray, np.ndarray | None, np.ndarray | None, bool, str]
 
 
 def open_arrays(path: Path, given: Given) -> Recording:
-    """Open a file of arrays: frames, or with a pitch a height map. Raises UserError where none or several fit."""
+    """Open a file of arrays: frames, or with a pitch a height map. Raises UserError if none or several fit."""
     load = RawLoader.stated(given.raw) if given.raw is not None else LOADERS[path.suffix.lower()]
     if given.pitch is not None:
         return _open_height_map(path, load, given)
@@ -222,7 +222,7 @@ def open_array_list(paths: Sequence[Path], given: Given, name: str) -> Recording
 
 
 def _refuse_other_planes(name: str, key: str, frames: np.ndarray, left_over: int) -> None:
-    """Raise UserError where the first planes (n, h, w) are no frames of one scene, but x and y, colour or amplitude."""
+    """Raise UserError if the first planes (n, h, w) are no frames of one scene, but x and y, colour or amplitude."""
     changed = [each for each in map(_apart, frames[:SEVERAL], frames[1:SEVERAL]) if math.isfinite(each)]
     worst = max(changed, default=0.0)
     if len(frames) > 1 and (left_over or not worst < SAME_SCENE):
@@ -330,7 +330,7 @@ RELIEF = (5e-4, 0.5)
 
 
 def _open_height_map(path: Path, load: ArraysLoader, given: Given) -> Recording:
-    """Open a height map. Raises UserError where the array is no single map, or its unit cannot be determined."""
+    """Open a height map. Raises UserError if the array is no single map, or its unit cannot be determined."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?(?:e-?\d+)?)\s*(um|mm|cm|m)", (given.pitch or "").strip())
     pitch_m = float(match.group(1)) * UNITS_M[match.group(2)] if match else math.nan
     if not 1e-7 <= pitch_m <= 1:

@@ -51,12 +51,12 @@ class Bag:
             return dict(sorted((connection.topic, connection.msgtype) for connection in reader.connections))
 
     def first(self, topic: str) -> Any:
-        """Return the first message of a topic, None where it has none."""
+        """Return the first message of a topic, None if it has none."""
         return next(self.messages(topic), ("", None))[1]
 
     def messages(self, topic: str) -> Iterator[tuple[str, Any]]:
         """Yield (name, message) of a topic in the order of their times within each file, one held at a time. Raises
-        UserError where a file is damaged or a message is larger than `MAX_MESSAGE_BYTES`."""
+        UserError if a file is damaged or a message is larger than `MAX_MESSAGE_BYTES`."""
         types = _types(self._is_ros1)
         decode = types.deserialize_ros1 if self._is_ros1 else types.deserialize_cdr
         with self._opened() as reader:
@@ -117,7 +117,7 @@ def is_bag(path: Path) -> bool:
 
 
 def find_bag(path: Path) -> Bag:
-    """Return a folder or file as a bag. Raises UserError where its description or one of its files is missing."""
+    """Return a folder or file as a bag. Raises UserError if its description or one of its files is missing."""
     if path.is_file():
         return Bag(path, (path,))
     metadata = path / METADATA
@@ -154,7 +154,7 @@ RAY_TOLERANCE_PX = 0.01
 
 
 def open_bag(path: Path, given: Given) -> Recording:
-    """Open a bag's depth images or clouds. Raises UserError where it is broken or empty, or a lens does not fit."""
+    """Open a bag's depth images or clouds. Raises UserError if it is broken or empty, or a lens does not fit."""
     bag = find_bag(path)
     chosen, note = _chosen_topic(bag, given)
     if bag.first(chosen) is None:
@@ -277,7 +277,7 @@ def _infos_of(bag: Bag, topic: str) -> list[str]:
 
 
 def _lens_of_images(bag: Bag, topic: str, shape: tuple[int, ...]) -> Lens:
-    """Return the lens of depth images. Raises UserError where the bag has none for them, or one of another model."""
+    """Return the lens of depth images. Raises UserError if the bag has none for them, or one of another model."""
     every = [name for name, kind in bag.topics.items() if kind == INFO_TYPE]
     why: list[str] = []
     is_rectified = "rect" in _of_pictures(topic).rpartition("/")[2]

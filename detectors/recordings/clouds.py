@@ -90,7 +90,7 @@ LZF_STRONGEST = 100  # largest compression factor of LZF: three bytes represent 
 
 
 def _read_cloud(path: Path, _: Lens | None) -> tuple[np.ndarray, tuple[int, int], np.ndarray | None, np.ndarray | None]:
-    """Read one PLY or PCD. Raises UserError where it has no header, holds no points, or is cut off."""
+    """Read one PLY or PCD. Raises UserError if it has no header, holds no points, or is cut off."""
     o3d = load_open3d()
     with read_errors(f"{path}: cannot be read", LEGAL_CLOUD), path.open("rb") as file:
         content = file.read(HEADER_BYTES)
@@ -189,7 +189,7 @@ COLUMNS = {
 
 
 def _read_list(path: Path, lens: Lens | None) -> tuple[np.ndarray, tuple[int, int], np.ndarray | None, Any]:
-    """Read one list of points. Raises UserError where it cannot be read as numbers."""
+    """Read one list of points. Raises UserError if it cannot be read as numbers."""
     with read_errors(f"{path}: cannot be read", LEGAL_LIST):
         content = bounded_bytes(path, TABLE_BYTES).removeprefix(codecs.BOM_UTF8)
     lines = content[:65536].decode("latin1").splitlines()[:HEAD_LINES]

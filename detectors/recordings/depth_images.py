@@ -31,8 +31,8 @@ LEGAL_PICTURE = "PNG or JPEG"
 
 
 def read_picture(path: Path, flags: int) -> np.ndarray:
-    """Return a PNG or JPEG decoded by OpenCV with its ``flags``: (h, w) or (h, w, 3), blue first. Raises UserError
-    where it is another kind of file, cannot be decoded, or is too large."""
+    """Return a PNG or JPEG decoded by OpenCV with its ``flags``: (h, w) or (h, w, 3), blue first. Raises UserError if
+    it is another kind of file, cannot be decoded, or is too large."""
     with read_errors(f"{path}: cannot be read", LEGAL_PICTURE):
         content = bounded_bytes(path, PICTURE_BYTES)
     return decoded(str(path), content, flags)
@@ -49,7 +49,7 @@ def decoded(name: str, content: bytes, flags: int) -> np.ndarray:
 
 
 def refuse_broken_png(name: str, content: bytes) -> None:
-    """Raise UserError where a PNG is cut off or a checksum fails: the decoder may fill a cut picture up with zeros."""
+    """Raise UserError if a PNG is cut off or a checksum fails: the decoder may fill a cut picture up with zeros."""
     try:
         _header(name, content).verify()
     except (SyntaxError, OSError, ValueError) as error:
@@ -79,7 +79,7 @@ NOT_DEPTH = re.compile(
 
 
 def open_depth_folder(folder: Path, given: Given) -> Recording:
-    """Open a folder of depth PNGs. Raises UserError where it has none, or their lens is unknown."""
+    """Open a folder of depth PNGs. Raises UserError if it has none, or their lens is unknown."""
     inner = folder / "depth"
     depths = depth_files(inner if inner.is_dir() else folder)
     root = folder if inner.is_dir() or folder.name != "depth" else folder.parent
@@ -113,7 +113,7 @@ def open_depth_list(
     note: str = "",
 ) -> Recording:
     """Open depth PNGs in the order given. ``root``: folder of the capture, beside or in which their lens is looked for;
-    ``colours``: the colour picture of each, if any. Raises UserError where their lens is not known."""
+    ``colours``: the colour picture of each, if any. Raises UserError if their lens is not known."""
     root = root or depths[0].parent
     width, height = _depth_size(depths[0])
     lens, lens_files = lens_for(str(root), given, width, height, beside=(root, depths[0].parent, root.parent))
@@ -133,7 +133,7 @@ def open_depth_list(
 
 
 def _frames(depths: Sequence[Path], colours: Sequence[Path | None], scale_m: float) -> Iterator[Frame]:
-    """Yield a frame a file. Raises UserError where a file is missing, truncated or not 16-bit grey."""
+    """Yield a frame a file. Raises UserError if a file is missing, truncated or not 16-bit grey."""
     for depth, colour in zip_longest(depths, colours):
         rgb = _colour(colour) if colour else None
         yield frame_of(f"{depth.parent.name}/{depth.name}", read_depth_png(depth), scale_m, rgb)
@@ -145,7 +145,7 @@ def shown(folder: Path) -> list[Path]:
 
 
 def depth_files(folder: Path) -> tuple[Path, ...]:
-    """Return a folder's depth pictures by their numbers, without masks. Raises UserError where there is none."""
+    """Return a folder's depth pictures by their numbers, without masks. Raises UserError if there is none."""
     pictures = [path for path in shown(folder) if path.suffix.lower() == ".png"]
     numbered = [path for path in pictures if NUMBER.fullmatch(path.stem)]
     # a 16-bit infrared picture looks like depth
@@ -168,7 +168,7 @@ def depth_named(paths: Sequence[Path], others: Sequence[Path]) -> tuple[Path, ..
 
 
 def png_kind(path: Path) -> tuple[int, int, int, int]:
-    """Return (width, height, bits, colour type) of a PNG. Raises UserError where it is no PNG, or too large."""
+    """Return (width, height, bits, colour type) of a PNG. Raises UserError if it is no PNG, or too large."""
     with read_errors(f"{path}: cannot be read", LEGAL_PNG), path.open("rb") as file:
         head = file.read(26)
     if len(head) < 26 or head[:8] != PNG_SIGNATURE or head[12:16] != b"IHDR":
@@ -179,7 +179,7 @@ def png_kind(path: Path) -> tuple[int, int, int, int]:
 
 
 def read_depth_png(path: Path) -> np.ndarray:
-    """Return the stored numbers (h, w) uint16. Raises UserError where the file is broken or not 16-bit grey."""
+    """Return the stored numbers (h, w) uint16. Raises UserError if the file is broken or not 16-bit grey."""
     _depth_size(path)
     content = bounded_bytes(path, PICTURE_BYTES)
     refuse_broken_png(str(path), content)

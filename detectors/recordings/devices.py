@@ -40,7 +40,7 @@ WAITING = 4
 
 
 def open_mkv(path: Path, given: Given) -> Recording:
-    """Open a recording with its own calibration, or the lens given. Raises UserError where it has no depth."""
+    """Open a recording with its own calibration, or the lens given. Raises UserError if it has no depth."""
     _refuse_truncated(path)
     with _opened(path) as container:
         tracks = _tracks(container)
@@ -71,7 +71,7 @@ def open_mkv(path: Path, given: Given) -> Recording:
 
 
 def _frames(path: Path, scale_m: float, lens: Lens, colour: ColourCamera | None) -> Iterator[Frame]:
-    """Yield a frame a depth picture. Raises UserError where the file is truncated or cannot be decoded."""
+    """Yield a frame a depth picture. Raises UserError if the file is truncated or cannot be decoded."""
     slopes = lens.region_slopes(lens.whole)
     for number, pictures in enumerate(_captures(path, with_colour=colour is not None)):
         infrared = pictures.get("IR")
@@ -126,7 +126,7 @@ def _captures(path: Path, with_colour: bool) -> Iterator[dict[str, np.ndarray]]:
 
 
 def _pictures(path: Path, with_colour: bool) -> Iterator[tuple[str, float, float, np.ndarray]]:
-    """Yield (title, time in s, frame period in s, picture) in the file's order. Raises UserError where it breaks."""
+    """Yield (title, time in s, frame period in s, picture) in the file's order. Raises UserError if it breaks."""
     with _opened(path) as container:
         tracks = {title: s for title, s in _tracks(container).items() if with_colour or title != "COLOR"}
         title_of = {s.index: title for title, s in tracks.items()}
@@ -280,7 +280,7 @@ def _table(path: Path) -> np.ndarray:
 
 
 def open_r3d(path: Path, given: Given) -> Recording:
-    """Open Record3D's .r3d. Raises UserError where it is broken or pyliblzfse, which unpacks its depth, is missing."""
+    """Open Record3D's .r3d. Raises UserError if it is broken or pyliblzfse, which unpacks its depth, is missing."""
     with _archive(path) as archive:
         if "metadata" not in archive.namelist() or not _depth_names(archive):
             held = ", ".join(archive.namelist()[:6]) or "nothing"
@@ -326,7 +326,7 @@ def _content(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
 
 
 def _plane(path: Path, archive: zipfile.ZipFile, name: str, kind: str, size: tuple[int, int]) -> np.ndarray:
-    """Unpack an entry by Apple's LZFSE as (h, w) numbers. Raises UserError where it does not unpack to as many."""
+    """Unpack an entry by Apple's LZFSE as (h, w) numbers. Raises UserError if it does not unpack to as many."""
     packed = _content(path, archive, name)
     try:
         import liblzfse  # type: ignore[import-not-found]

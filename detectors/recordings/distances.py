@@ -42,7 +42,7 @@ def default_metres(dtype: np.dtype) -> float:
 
 
 def refuse_narrow(name: str, dtype: np.dtype) -> None:
-    """Raise UserError where the numbers cannot be distances: 8 bit, boolean, complex, text or objects."""
+    """Raise UserError if the numbers cannot be distances: 8 bit, boolean, complex, text or objects."""
     is_narrow = dtype.kind in "iu" and dtype.itemsize == 1
     if is_narrow or dtype.kind not in "iuf":
         what = "8-bit numbers, which is a picture or a mask" if is_narrow else f"{dtype}, not numbers"
@@ -55,7 +55,7 @@ def frame_of(
     name: str, stored: np.ndarray, scale_m: float, rgb: np.ndarray | None = None, amplitude: np.ndarray | None = None
 ) -> Frame:
     """Make a frame of stored depth (h, w) or points (h, w, 3) in units of ``scale_m`` metres. 0 and `no_return_codes`
-    mean no return. Depth that is negative throughout is turned. Raises UserError where most, not all, is negative."""
+    mean no return. Depth that is negative throughout is turned. Raises UserError if most, not all, is negative."""
     stored_z = stored[..., 2] if stored.ndim == 3 else stored
     reason = np.zeros(stored_z.shape, np.uint8)
     reason[stored_z == 0] = Reason.NO_RETURN
@@ -160,7 +160,7 @@ class Unit(NamedTuple):
 
 
 def scale_in(statements: dict[str, Any], median: float) -> float | None:
-    """Return metres in one stored number as names with values state it, None where they do not. Values are metres
+    """Return metres in one stored number as names with values state it, None if they do not. Values are metres
     (RealSense: 0.001), millimetres (BOP: 0.1), numbers to the metre (Open3D: 1000) or a unit's name; they are three
     powers of ten apart, and the ``median`` stored number tells which it is."""
     for key, value in statements.items():
@@ -253,7 +253,7 @@ def refuse_implausible(frame: Frame, scale_m: float) -> None:
 
 
 def refuse_far_aside(frame: Frame) -> None:
-    """Raise UserError where half of the points lie farther off the axis than in any camera's picture."""
+    """Raise UserError if half of the points lie farther off the axis than in any camera's picture."""
     across_m = np.zeros(1) if frame.xy_m is None else np.hypot(*np.moveaxis(frame.xy_m, -1, 0))
     if (aside := float(np.nanmedian(across_m / frame.z_m))) > FARTHEST_ASIDE:
         what = f"{frame.name}: half of the points lie more than {math.degrees(math.atan(aside)):.0f} degrees"
@@ -262,7 +262,7 @@ def refuse_far_aside(frame: Frame) -> None:
 
 
 def ray_lengths_doubt(z_m: np.ndarray, slopes: np.ndarray) -> str:
-    """Return a sentence where ``z_m`` (h, w) looks like lengths along the rays of ``slopes`` (h, w, 2), else "".
+    """Return a sentence if ``z_m`` (h, w) looks like lengths along the rays of ``slopes`` (h, w, 2), else "".
 
     Of a plane, 1/z is a plane over the slopes, whose bends over an eighth of the picture are noise; if z is a length
     along the ray, that holds for 1/z times the ray's length at z = 1."""

@@ -56,7 +56,7 @@ def depth_lens(name: str, cameras: dict[str, Any], mode: str) -> Lens:
 
 
 def depth_mode_of_size(width: int, height: int) -> str | None:
-    """Return the depth mode whose image has this size, None where there is none."""
+    """Return the depth mode whose image has this size, None if there is none."""
     return next((name for name, (_, _, image) in DEPTH_MODES.items() if image == (width, height)), None)
 
 
@@ -145,7 +145,7 @@ def lens_for(
     hint: str = "",
 ) -> tuple[Lens, tuple[Path, ...]]:
     """Return the lens of depth images and the files that state it: --intrinsics, the named camera's, the capture's
-    ``own``, or the first file named like a lens in the folders ``beside``. Raises UserError where nobody states a lens
+    ``own``, or the first file named like a lens in the folders ``beside``. Raises UserError if nobody states a lens
     (``hint`` ends its advice), or that of other images."""
     lens, file = given.lens, given.intrinsics
     if lens is None and file is None:
@@ -170,8 +170,8 @@ def lens_for(
 
 
 def read_lens(path: Path, width: int, height: int) -> Lens:
-    """Return the lens in a file, for images of ``width`` x ``height``. Raises UserError where it is missing,
-    unreadable, of another image size, or of a lens model that is not known."""
+    """Return the lens in a file, for images of ``width`` x ``height``. Raises UserError if it is missing, unreadable,
+    of another image size, or of a lens model that is not known."""
     data = parsed_lens(path)
     if "CalibrationInformation" in data:
         mode = depth_mode_of_size(width, height)
@@ -210,7 +210,7 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
 
 
 def parsed_lens(path: Path) -> dict[str, Any]:
-    """Return the file's mapping; of bare numbers, these by name. Raises UserError where it is neither JSON nor YAML."""
+    """Return the file's mapping; of bare numbers, these by name. Raises UserError if it is neither JSON nor YAML."""
     if not path.exists():
         raise UserError(f"{path}: no such file", legal=LEGAL_LENS)
     with read_errors(f"{path}: cannot be read", LEGAL_LENS, "give another file"):
@@ -251,7 +251,7 @@ def mappings(data: dict[str, Any], name: str = "", level: int = 0) -> Iterator[t
 
 def _the_lens(path: Path, data: dict[str, Any], size: tuple[int, int]) -> dict[str, Any]:
     """Return the mapping in a file that holds the lens: of several different ones those of this image size count, then
-    those under a name with "depth". Raises UserError where there is none, or where several are left."""
+    those under a name with "depth". Raises UserError if there is none, or where several are left."""
     found = [pair for pair in mappings(data) if _matrix_key(pair[1]) or all(_named(pair[1], key) for key in SPELLINGS)]
     for fits in (lambda _, each: _size(each) == size, lambda name, _: "depth" in name.lower()):
         if len(found) > 1:
@@ -276,7 +276,7 @@ def _matrix_key(data: dict[str, Any]) -> str | None:
 
 
 def _size(data: dict[str, Any]) -> tuple[Any, Any] | None:
-    """Return width and height that a mapping states, None where it does not."""
+    """Return width and height that a mapping states, None if it does not."""
     return next(((data[across], data[down]) for across, down in SIZES if across in data and down in data), None)
 
 

@@ -34,7 +34,7 @@ def encoding_of(message: Any) -> str:
 
 
 def stored_depth(name: str, message: Any) -> np.ndarray:
-    """Return the stored numbers (h, w), uint16 or float32. Raises UserError where depth is missing or cut off."""
+    """Return the stored numbers (h, w), uint16 or float32. Raises UserError if depth is missing or cut off."""
     encoding = encoding_of(message)
     if encoding not in DEPTH_NUMBERS:
         what = encoding or getattr(message, "format", "")
@@ -47,7 +47,7 @@ def stored_depth(name: str, message: Any) -> np.ndarray:
 
 
 def _rows(name: str, message: Any, kind: np.dtype, row_bytes: int) -> np.ndarray:
-    """Return a (height, width) view of a message's data. Raises UserError where it is shorter than that needs."""
+    """Return a (height, width) view of a message's data. Raises UserError if it is shorter than that needs."""
     height, width = int(message.height), int(message.width)
     refuse_pixels(name, width, height)
     data = np.asarray(message.data, np.uint8)
@@ -108,7 +108,7 @@ def _rvl(name: str, content: bytes) -> np.ndarray:
 
 def frame_of_message(name: str, message: Any, scale_m: float) -> Frame:
     """Make a frame of a depth image, or of a PointCloud2, (1, n) without a grid; NaN means no return. Raises UserError
-    where x, y or z is missing, a field lies outside its point, or the data are shorter than the layout needs."""
+    if x, y or z is missing, a field lies outside its point, or the data are shorter than the layout needs."""
     if not hasattr(message, "point_step"):
         frame = frame_of(name, stored_depth(name, message), scale_m)
     else:

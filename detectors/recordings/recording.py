@@ -57,9 +57,9 @@ class Recording:
     """A real capture as a `harness.vocabulary.geometry.FrameSource`.
 
     ``read`` yields the frames in order; each call starts again. ``shape``: (height, width). ``files``: all whose
-    content can change a number. ``scale_m``: metres in one stored unit, and ``unit_from`` its origin: "" where the
-    data shall decide. ``notes``: how the files were understood. ``warnings``: full sentences on what makes the
-    distances doubtful; every program shows them first. ``selection`` picks frames."""
+    content can change a number. ``scale_m``: metres in one stored unit, and ``unit_from`` its origin: "" if the data
+    shall decide. ``notes``: how the files were understood. ``warnings``: full sentences on what makes the distances
+    doubtful; every program shows them first. ``selection`` picks frames."""
 
     name: str
     read: Callable[[], Iterator[Frame]]

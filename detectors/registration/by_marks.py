@@ -66,7 +66,7 @@ def register_by_marks(reference: PreparedView, view: PreparedView) -> registered
 
 def held_out_error_m(reference: PreparedView, view: PreparedView) -> float | None:
     """Return the root mean square distance (m) of each matched mark from its place by a registration with the others;
-    None where fewer than four marks match, or where leaving one out leaves the rest on a line."""
+    None if fewer than four marks match, or where leaving one out leaves the rest on a line."""
     ours, theirs, problem, _ = _matched(reference, view)
     if problem or len(ours) < 4:
         return None

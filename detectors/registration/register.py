@@ -124,7 +124,7 @@ def judge(
 
 
 def _jump(registration: registered.Registration, reference: PreparedView, view: PreparedView) -> str:
-    """Return the reason why a pose is too far from its guess to be credible; empty where it is credible."""
+    """Return the reason why a pose is too far from its guess to be credible; empty if it is credible."""
     guess = registered.guess_of(reference, view)
     if guess is None:
         return ""
@@ -140,7 +140,7 @@ def _jump(registration: registered.Registration, reference: PreparedView, view: 
 
 
 def _apart(agreement: Agreement) -> str:
-    """Return the reason why surfaces or marks are too far apart to be merged; empty where they are not."""
+    """Return the reason why surfaces or marks are too far apart to be merged; empty if they are not."""
     # views may differ by their noise and BLUR_M, or by a pixel where that is larger
     blur = float(np.hypot(agreement.noise_m, max(BLUR_M, agreement.pitch_m)))
     limit = blur * (1 + agreement.scatter)
@@ -184,7 +184,7 @@ def _widened(
 
 def register(views: Sequence[PreparedView], config: AnyRegistration) -> tuple[registered.Registration, ...]:
     """Return one registration for each view; the first is that of the reference. A registration that cannot be trusted
-    has a ``failure``. Raises UserError where a view lacks an input of the method (colour, a pixel grid, a guess)."""
+    has a ``failure``. Raises UserError if a view lacks an input of the method (colour, a pixel grid, a guess)."""
     if not views:
         raise UserError("no views to register", legal="one or more views, the first being the reference")
     _check_views(views, config)

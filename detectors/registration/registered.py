@@ -27,8 +27,8 @@ class Registration:
     metres; NaN where the method has no estimate. It holds the noise of the method's points, not an error that a whole
     view shares. ``residual_m``: root mean square of the minimised distances. ``overlap``: share of the view's target
     points that lie within a pixel's pitch of the reference's target. ``failure``: why the view must not be merged;
-    empty where it may. ``pairs``: marks or points that were matched. ``seconds``: time taken (an equal share where
-    views are registered together)."""
+    empty if it may. ``pairs``: marks or points that were matched. ``seconds``: time taken (an equal share where views
+    are registered together)."""
 
     view: str
     method: str
@@ -171,7 +171,7 @@ def clouds_of(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, tuple[str, ...], str]:
     """Return the points that registrations start from: those of the fiducials or of the whole target, of the reference
     and of the view, each (n, 3) with at most `MAX_POINTS`; the guess (4, 4), a note where there is none, and the reason
-    why they cannot be registered, empty where they can."""
+    why they cannot be registered, empty if they can."""
     fixed, moving = (
         thinned(each.mark_points_m if points == "marks" else each.points_m, MAX_POINTS) for each in (reference, view)
     )

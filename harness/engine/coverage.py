@@ -54,7 +54,7 @@ class Survey:
 
 def survey(experiment: Experiment, poses: Sequence[Pose], cache: Path, folder: Path, engine: JobEngine) -> list[Survey]:
     """Return a survey for each set-up. Views and trials that are in ``cache`` and ``folder`` are not made again. Raises
-    UserError where a point has no threshold, and as `declared` and `findable` do."""
+    UserError if a point has no threshold, and as `declared` and `findable` do."""
     plan = SweepPlan(tuple(_widened(group, poses) for group in plan_of(experiment, cache, folder).groups))
     journal, scores = Journal(folder / "journal"), dict[tuple[str, int, int, str], list[float]]()
     with progress_display() as report:
@@ -103,7 +103,7 @@ def patches_of(board: BoardConfig) -> Patches:
 
 
 def declared(config: ExperimentConfig) -> tuple[SimulatedSource, DrawnTargetConfig]:
-    """Return the source and the family of boards. Raises UserError where there is no study of these in single views."""
+    """Return the source and the family of boards. Raises UserError if there is no study of these in single views."""
     source = config.simulated
     if isinstance(source.target, DrawnTargetConfig) and config.study is not None and source.views is None:
         return source, source.target
@@ -149,7 +149,7 @@ def _bare(batch: Batch) -> Batch:
 def _each(
     act: Callable[..., Any], asked: Iterable[tuple[Batch, ...]], further: tuple[Any, ...], engine: JobEngine
 ) -> list[Any]:
-    """The values of a function of batches, None where its detector can judge nothing; a bug is raised."""
+    """The values of a function of batches, None if its detector can judge nothing; a bug is raised."""
     jobs = [Job(str(n), "trials", act, (*some, *further)) for n, some in enumerate(asked)]
     ends = {job.name: ended for job, ended in carried_out(jobs, engine)}
     if bug := next((end.why for end in ends.values() if end.is_bug), None):

@@ -97,7 +97,7 @@ class LocalEngine:
         self.put(job, self._limits, self._answers)
 
     def ended(self) -> list[tuple[Job, Ended]]:
-        """Wait for jobs to end. Raises UserError where processes run other code or cannot start."""
+        """Wait for jobs to end. Raises UserError if processes run other code or cannot start."""
         found: list[tuple[Job, Ended]] = []
         while not found or not self._answers.ended.empty():
             answer = self._answers.ended.get()

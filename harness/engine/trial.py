@@ -64,7 +64,7 @@ def averages_of(
 
 @lru_cache(maxsize=4)
 def flat_field_of(camera: CameraConfig, config: FlatFieldConfig, seed: int) -> FlatField:
-    """Return a unit's flat field, measured on a plane across its axis. Raises UserError where no pixel has a range."""
+    """Return a unit's flat field, measured on a plane across its axis. Raises UserError if no pixel has a range."""
     facts = camera_of(camera)
     view = plane_view(facts, facts.nominal_lens.whole, config.distance_m, FLAT_ALBEDO)
     capture = SimulatedUnit(facts, camera, view).capture(config.frames, seed, "flat field")
@@ -121,7 +121,7 @@ def _disturbed(cloud: Cloud, noise_m: float, config: AverageConfig) -> bool:
 
 
 def _cloud(capture: SimulatedCapture, totals: FrameTotals, left_out: tuple[LeftOut, ...]) -> Cloud | None:
-    """Return the average from sums over frames, as `detectors.average` computes it; None where no pixel has a range."""
+    """Return the average from sums over frames, as `detectors.average` computes it; None if no pixel has a range."""
     count = totals.count
     if not count.any():
         return None

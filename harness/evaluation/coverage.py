@@ -93,7 +93,7 @@ class Findable:
 
     @property
     def doubt(self) -> str:
-        """Return why the limits are rough; empty where size, angle and distance decide well what is found."""
+        """Return why the limits are rough; empty if size, angle and distance decide well what is found."""
         doubts = []
         if self.growth == GROWTHS[-1]:
             doubts.append(
@@ -126,7 +126,7 @@ def _design(size_mm: np.ndarray, cosine: np.ndarray, range_m: np.ndarray) -> np.
 
 
 def findable(some: ScoredDamage, threshold: float) -> Findable:
-    """Learn from the inspections of damage where the detector judges. Raises UserError where these do not suffice."""
+    """Learn from the inspections of damage where the detector judges. Raises UserError if these do not suffice."""
     judged = np.isfinite(some.seen.deviation_m) & (some.seen.cosine > 0)
     damages, of = len(np.unique(some.damage[judged])), len(np.unique(some.damage))
     if damages < FEWEST:

@@ -42,7 +42,7 @@ class Interval:
         return bool(self.high < value)
 
     def over(self, value: float) -> bool | None:
-        """Return whether the estimated quantity certainly exceeds ``value``; None where the interval includes both."""
+        """Return whether the estimated quantity certainly exceeds ``value``; None if the interval includes both."""
         return True if self.low > value else False if self.high <= value else None
 
     def within(self, low: float, high: float) -> bool:
@@ -177,7 +177,7 @@ def threshold_for_rate(
     """Choose the lowest observed score whose false-call rate is at most the one wanted, from hole-free runs of
     ``area_m2`` each. ``highest_scores_per_run`` (runs,), -inf without finding. Calls are a Poisson process; a new run's
     score lies above the (k + 1)-th highest of n with probability (k + 1) / (n + 1), the true one is Beta(k + 1, n - k)
-    distributed (Wilks 1941). Judge on other runs. UserError where the runs are too few."""
+    distributed (Wilks 1941). Judge on other runs. UserError if the runs are too few."""
     scores = np.asarray(highest_scores_per_run, float).ravel()
     if not (area_m2 > 0 and rate_per_m2 > 0):
         raise UserError(f"area {area_m2:g} m2, wanted rate {rate_per_m2:g} per m2", legal="both above 0")

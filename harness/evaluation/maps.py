@@ -34,8 +34,8 @@ FEWEST_BOTH = 2
 
 @dataclass(frozen=True)
 class MapSetUp:
-    """One set-up or variation. ``views``: 0 for "all" without a finished run; ``registration``, ``merge``: empty where
-    no axis tells; ``place``: the other axes' values as text; ``reference``: the set-up of a variation, or ""."""
+    """One set-up or variation. ``views``: 0 for "all" without a finished run; ``registration``, ``merge``: empty if no
+    axis tells; ``place``: the other axes' values as text; ``reference``: the set-up of a variation, or ""."""
 
     variant: str
     views: int
@@ -184,7 +184,7 @@ class MapCase:
         return sorted(int(n) for n in self.summary["frames"][self.summary["variant"] == variant].unique())
 
     def common_frames(self, *variants: str | None) -> int | None:
-        """Choose `MANY` where all of them have it, else the most that all have; None where one is missing."""
+        """Choose `MANY` where all of them have it, else the most that all have; None if one is missing."""
         if any(variant is None for variant in variants):
             return None
         shared = set.intersection(*(set(self.frames(variant)) for variant in variants if variant is not None))
@@ -253,7 +253,7 @@ class AgainstOne:
 
 
 def against_one(case: MapCase, registration: str, merge: str) -> AgainstOne | None:
-    """Compare two views with the most frames that both have (`MapCase.common_frames`); None where a map is missing."""
+    """Compare two views with the most frames that both have (`MapCase.common_frames`); None if a map is missing."""
     frames = case.common_frames(*(case.variant(views, registration, merge) for views in (1, 2)))
     if frames is None:
         return None

@@ -88,7 +88,7 @@ def true_residual_mm(cloud: ExampleCloud, hole: HoleInView) -> np.ndarray:
 
 
 def hole_shape(cloud: ExampleCloud, hole: HoleInView) -> HoleShape | None:
-    """Fit both shapes to the measured residual inside the outline; None where too few of its pixels are valid."""
+    """Fit both shapes to the measured residual inside the outline; None if too few of its pixels are valid."""
     radius = relative_radius(cloud, hole)
     outline = radius < 1
     valid = outline & np.isfinite(cloud.residual_mm)

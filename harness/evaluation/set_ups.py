@@ -190,7 +190,7 @@ def effect_costs(tables: ResultTables) -> pd.DataFrame:
 
 def _cost(ladders: Mapping[frozenset[str], Ladder], off: frozenset[str], on: frozenset[str]) -> dict[str, Any]:
     """The paired difference of two set-ups with its interval, and whether both sizes lie on the ladder, so that it is
-    no mere bound; empty where either was not finished, or not with the same repeats."""
+    no mere bound; empty if either was not finished, or not with the same repeats."""
     if off not in ladders or on not in ladders or ladders[off].detected.shape != ladders[on].detected.shape:
         return {}
     before, after = ladders[off], ladders[on]

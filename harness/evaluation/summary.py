@@ -70,7 +70,7 @@ def found_rule(trials: int) -> str:
 
 
 def found_holes(summary: pd.DataFrame, variant: str, frames: int) -> dict[str, HoleState]:
-    """Each hole's status by `FOUND_RULE`, in the holes' order; empty where the variant lacks these frames."""
+    """Each hole's status by `FOUND_RULE`, in the holes' order; empty if the variant lacks these frames."""
     rows = summary[(summary["variant"] == variant) & (summary["frames"] == frames)]
     return dict(zip(rows["hole"], rows["status"], strict=True))
 

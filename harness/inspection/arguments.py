@@ -76,7 +76,7 @@ def refuse_misfits(arguments: argparse.Namespace, paths: list[Path]) -> None:
 
 
 def refuse_repeats(paths: Sequence[Path]) -> None:
-    """Raise UserError where a capture is named twice."""
+    """Raise UserError if a capture is named twice."""
     places = [path.resolve() for path in paths]
     for path, place in zip(paths, places, strict=True):
         if places.count(place) > 1:
@@ -195,7 +195,7 @@ FARTHEST_M = 100.0  # Largest distance of two views of one target: poses in mill
 
 def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
     """Return ``T_first_view`` (4, 4) of each view, the first the identity, from poses to any common frame. Raises
-    UserError where the file cannot be read, has another number of poses, or one that is not rigid or too far."""
+    UserError if the file cannot be read, has another number of poses, or one that is not rigid or too far."""
     import numpy as np
 
     from harness.vocabulary.geometry import invert

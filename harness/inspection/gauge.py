@@ -41,7 +41,7 @@ class GaugeMark(Config):
 
 
 class GaugeHole(Config):
-    """A hole to drill: its centre on the board, and its depth, None where it goes through."""
+    """A hole to drill: its centre on the board, and its depth, None if it goes through."""
 
     id: Annotated[int, Field(ge=1)]
     diameter_mm: Length
@@ -69,7 +69,7 @@ class Gauge(Config):
 
 
 def read_gauge(path: Path) -> Gauge:
-    """Read the truth file of `harness.gauge`. Raises UserError where it cannot be read or is another file."""
+    """Read the truth file of `harness.gauge`. Raises UserError if it cannot be read or is another file."""
     legal = "the gauge.json that python -m harness.gauge wrote"
     try:
         data = strict_json(bounded_bytes(path, RECORD_BYTES))

@@ -76,7 +76,7 @@ OPEN_MM, FILTER_PX = 75.0, 3.0
 
 
 def refuse_thresholds(arguments: argparse.Namespace) -> None:
-    """Raise UserError where several arguments set the threshold, or its value is not legal."""
+    """Raise UserError if several arguments set the threshold, or its value is not legal."""
     given = [f"--{name.replace('_', '-')}" for name in THRESHOLDS if getattr(arguments, name) is not None]
     if len(given) > 1:
         raise UserError(f"{' and '.join(given)} set the threshold", fix="give one of them")
@@ -187,7 +187,7 @@ class Inspection:
 
     @property
     def cell_m(self) -> float | None:
-        """The side of a map's cells, None where the cloud is no map."""
+        """The side of a map's cells, None if the cloud is no map."""
         surface_map = self.mapped.merged.surface_map if self.mapped else None
         return surface_map.cell_m if surface_map else None
 

@@ -103,7 +103,7 @@ def print_choice(choice: Choice | None) -> None:
 
 
 def choice_facts(choice: Choice | None) -> dict[str, Any] | None:
-    """Return the choice's facts for the JSON; None where there was none."""
+    """Return the choice's facts for the JSON; None if there was none."""
     if choice is None:
         return None
     candidates = [

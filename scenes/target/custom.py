@@ -368,7 +368,7 @@ class TargetConfig(SetUpConfig):
 
     def at_wavelength(self, wavelength_nm: float) -> TargetConfig:
         """Return the declaration with the nearest albedos to that wavelength as its ``albedo_850``, and no others.
-        Raises UserError where the declaration has none for it, or lacks the albedo of one of its surfaces."""
+        Raises UserError if the declaration has none for it, or lacks the albedo of one of its surfaces."""
         near = [albedos for albedos in self.other_wavelengths if abs(albedos.wavelength_nm - wavelength_nm) <= NEAR_NM]
         from_850 = abs(wavelength_nm - 850.0)
         if from_850 <= NEAR_NM and all(from_850 <= abs(albedos.wavelength_nm - wavelength_nm) for albedos in near):

@@ -235,7 +235,7 @@ class DrawnTargetConfig(Config):
 
     def drawn(self, purpose: Purpose, number: int) -> custom.TargetConfig:
         """Return a board of the family with its damage, ids from 1 in the order of size; of a hole-free one call
-        ``hole_free()``: the damages left out are unflawed sites. Raises UserError where the board is too full."""
+        ``hole_free()``: the damages left out are unflawed sites. Raises UserError if the board is too full."""
 
         def stream(quantity: str) -> np.random.Generator:
             return random_stream(self.seed, "drawn board", purpose, number, quantity)

@@ -109,7 +109,7 @@ MAX_CELLS = 1_000_000  # of a bent sheet: some 300 MB
 class TargetPart:
     """A surface. ``mesh``: camera frame, metres, normals outwards; sharp edges share vertices, so use face normals.
     ``albedo_850`` and ``rgb`` (3,) are the means of ``texture_850`` (h, w) and ``texture_rgb`` (h, w, 3), float32
-    linear reflectances, placed by ``uv`` (n_vertices, 2) in 0..1 (see the module); all None where the part is plain.
+    linear reflectances, placed by ``uv`` (n_vertices, 2) in 0..1 (see the module); all None if the part is plain.
     ``gloss``: share and exponent of its Phong lobe (`scenes.target.custom.GlossConfig`)."""
 
     name: str
@@ -208,7 +208,7 @@ def sheet(
 ) -> trimesh.Trimesh:
     """Return a watertight sheet over a rectangle in plan, between two parallels of the face (offsets along normals).
     Its facets stay within ``sagitta_m`` of the face; a flat sheet has 12 triangles. ``flat_back``: its lower side is a
-    plane. Board frame. Raises UserError where the face needs more than MAX_CELLS."""
+    plane. Board frame. Raises UserError if the face needs more than MAX_CELLS."""
     turn = turned(angle_rad)
 
     def plan(columns: int, rows: int) -> np.ndarray:

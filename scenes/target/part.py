@@ -37,7 +37,7 @@ class MeshTargetConfig(custom.SetUpConfig):
     material: custom.MaterialConfig = custom.MaterialConfig(grain_contrast=0.0)
 
     def declare(self) -> custom.TargetConfig:
-        """Return the full declaration. Raises UserError where the file cannot be used."""
+        """Return the full declaration. Raises UserError if the file cannot be used."""
         shape = custom.MeshConfig(kind="mesh", file=self.file, unit=self.unit, front=self.front)
         sizes = np.round(np.ptp(part_of(shape)[0], axis=0), 9) / MM
         board = dict(zip(("width_mm", "height_mm", "thickness_mm"), sizes.tolist(), strict=True))

@@ -34,7 +34,7 @@ class StudyPlan:
 
 def curve_through(a50: float, a90: float, link: str = "logit", *, log_size: bool = False) -> PodCurve:
     """Return the curve of ``link`` with POD 0.5 at ``a50`` and 0.9 at ``a90`` (any one unit); its covariance is zero.
-    Raises UserError where it would not rise, and for sizes that are not above 0."""
+    Raises UserError if it would not rise, and for sizes that are not above 0."""
     if not (np.isfinite([a50, a90]).all() and 0 < a50 < a90):
         what = f"a50 {a50:g} and a90 {a90:g}: the probability of detection must grow with size"
         raise UserError(what, legal="0 < a50 < a90", fix="a50 is found 50 % of the time and a90 90 %, so a90 is larger")

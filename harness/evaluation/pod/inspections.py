@@ -37,7 +37,7 @@ Rows = list[tuple[int, list[str]]]
 @dataclass(frozen=True)
 class Inspections:
     """One inspection a row: ``size`` (n,) in the file's unit, ``response`` (n,) hits as 0/1 or signals, ``target`` (n,)
-    the name of what was inspected, None where every row is a target of its own; ``line`` (n,) of the file, from 1.
+    the name of what was inspected, None if every row is a target of its own; ``line`` (n,) of the file, from 1.
     ``unflawed`` (m,): responses at sites without a flaw, whose size is 0 or missing. ``notes``: sentences on what was
     left out, and how cells were understood where that was not plain."""
 
@@ -103,7 +103,7 @@ def read_inspections(
 
 
 def texts_of(read: Inspections, column: str) -> np.ndarray:
-    """Return (n,) the text of another column in the rows that were read. Raises UserError where there is none."""
+    """Return (n,) the text of another column in the rows that were read. Raises UserError if there is none."""
     (_, header), *rows = _rows(read.path, read.size_column)
     header = [name.strip() for name in header]
     at, row_of = _column(read.path, header, column, (column,)), dict(rows)
@@ -132,7 +132,7 @@ def require_positive(read: Inspections, response: bool, why: str) -> None:
 
 
 def _column(path: Path, header: list[str], name: str, chosen: tuple[str | None, ...]) -> int:
-    """Return the number of a column. Raises UserError where it is not there, or is not the only one of this name."""
+    """Return the number of a column. Raises UserError if it is not there, or is not the only one of this name."""
     if chosen.count(name) > 1:
         raise UserError(f"column {name!r} is chosen twice", fix="name a different column for each option")
     if header.count(name) > 1:
@@ -182,7 +182,7 @@ def _numbers(path: Path, name: str, lines: np.ndarray, texts: list[str], notes: 
 
 
 def _thousands(path: Path, name: str, texts: list[str]) -> tuple[set[str], str]:
-    """Return the marks that part thousands in a column, and a number that leaves it open ("" where none does). Of two
+    """Return the marks that part thousands in a column, and a number that leaves it open ("" if none does). Of two
     marks in a number the last is the decimal one; a mark that stands twice in a number parts thousands, and so does one
     that only stands before three digits, where the other is decimal."""
     parts, decimals, grouped = set[str](), set[str](), dict[str, str]()
@@ -245,7 +245,7 @@ def _text_rows(path: Path, content: bytes, column: str) -> Rows:
 
 
 def _sheet_rows(path: Path, content: bytes) -> Rows:
-    """Return the rows of an Excel file's only sheet that holds anything. Raises UserError where openpyxl is missing."""
+    """Return the rows of an Excel file's only sheet that holds anything. Raises UserError if openpyxl is missing."""
     try:
         import openpyxl
     except ImportError as error:

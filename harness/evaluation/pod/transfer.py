@@ -182,10 +182,10 @@ DISAGREES = 0.05
 @dataclass(frozen=True, eq=False)
 class Mapod:
     """A study's curve beside real hits and misses and the combination of both. ``set_up``: the study's, by name;
-    ``measured``: the real ones alone, None where no curve fits them, ``why``. ``transfers``: of all simulated models
-    that fit about equally well. ``steps``: estimates before any board and after each, limits the largest over
-    ``transfers``. ``agrees``: probability of data as far from the simulated curve as these, were it right. ``unlike``:
-    how the real hits were counted otherwise than the study's, or that it is not known; "" where they agree."""
+    ``measured``: the real ones alone, None if no curve fits them, ``why``. ``transfers``: of all simulated models that
+    fit about equally well. ``steps``: estimates before any board and after each, limits the largest over ``transfers``.
+    ``agrees``: probability of data as far from the simulated curve as these, were it right. ``unlike``: how the real
+    hits were counted otherwise than the study's, or that it is not known; "" if they agree."""
 
     set_up: str
     simulated: PodStatement
@@ -202,7 +202,7 @@ class Mapod:
         cls, set_up: str, simulated: PodStatement | None, why: str, read: Inspections, boards: np.ndarray | None = None,
         unlike: str = "",
     ) -> Mapod:  # fmt: skip
-        """Correct a study's curve. Raises UserError where the study has no curve, and says ``why``."""
+        """Correct a study's curve. Raises UserError if the study has no curve, and says ``why``."""
         if simulated is None:
             raise UserError(f"set-up {set_up} has no curve to correct: {why}", fix="name another set-up with --set-up")
         measured, none = None, ""

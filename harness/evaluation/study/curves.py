@@ -128,7 +128,7 @@ def roc_curve(holes: pd.DataFrame, sites: pd.DataFrame, threshold: float) -> Roc
 def free_response(
     operating: pd.DataFrame, runs: pd.DataFrame, holes: pd.DataFrame, draws: int = DRAWS
 ) -> FreeResponse | None:
-    """Draw the free-response curve of one set-up; None where no damage or no hole-free board was inspected, or no other
+    """Draw the free-response curve of one set-up; None if no damage or no hole-free board was inspected, or no other
     threshold was counted. Thresholds with fewer false calls than a higher one has are left out: that far down findings
     run into one another, to one that covers the board, and the curve would fold back."""
     import pandas as pd

@@ -47,9 +47,9 @@ class Level:
 
 @dataclass(frozen=True, eq=False)
 class Efficiency:
-    """A set-up's detector beside the ideal observer, at shares of 50 % and 90 %. ``size_mm``, ``index``, ``pod``
-    (ideal observer's), ``hits``, ``inspections`` (n,) of each damage; ``curve``: the detector's POD against d', None
-    where there is none, and ``why``."""
+    """A set-up's detector beside the ideal observer, at shares of 50 % and 90 %. ``size_mm``, ``index``, ``pod`` (ideal
+    observer's), ``hits``, ``inspections`` (n,) of each damage; ``curve``: the detector's POD against d', None if there
+    is none, and ``why``."""
 
     limit: SetUpLimit
     ideal: IdealDamages

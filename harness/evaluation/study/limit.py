@@ -260,13 +260,13 @@ WIDER = 1.1
 
 @dataclass(frozen=True, eq=False)
 class SetUpLimit:
-    """Sizes in mm, diameters or depths (`Inspected.limit_of`). ``statement``: curve, band and bounds from hits, None
-    where none can be fitted, and ``why``. ``a90_95``: the limit to quote; infinite where not demonstrated.
-    ``a90_draws_mm`` (B,): over boards (and units) drawn again, in one order for all set-ups of as many boards.
-    ``over_boards``: a90/95 were damages of one board as alike as the data say. Where everything is found the estimates
-    are the smallest size inspected, which they do not exceed; where nothing is, or POD does not grow with size, they
-    are NaN and their draws infinite. ``beside``: findings on damaged boards that count for no damage.
-    ``size_error_mm``: median error of the size of hits ``sized`` by a model. ``seconds_detect``: median a cloud."""
+    """Sizes in mm, diameters or depths (`Inspected.limit_of`). ``statement``: curve, band and bounds from hits, None if
+    none can be fitted, and ``why``. ``a90_95``: the limit to quote; infinite where not demonstrated. ``a90_draws_mm``
+    (B,): over boards (and units) drawn again, in one order for all set-ups of as many boards. ``over_boards``: a90/95
+    were damages of one board as alike as the data say. Where everything is found the estimates are the smallest size
+    inspected, which they do not exceed; where nothing is, or POD does not grow with size, they are NaN and their draws
+    infinite. ``beside``: findings on damaged boards that count for no damage. ``size_error_mm``: median error of the
+    size of hits ``sized`` by a model. ``seconds_detect``: median a cloud."""
 
     record: SetUpRecord
     statement: PodStatement | None

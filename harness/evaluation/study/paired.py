@@ -32,7 +32,7 @@ class HitsChange:
 
 
 def hits_change(first: Inspected, second: Inspected) -> HitsChange | None:
-    """Compare hits on the inspections (board, hole, repeat) that both have; None where there are none."""
+    """Compare hits on the inspections (board, hole, repeat) that both have; None if there are none."""
     one, two = shared_rows(first, second)
     if not len(one):
         return None
@@ -124,7 +124,7 @@ class SignalChange:
 def signal_change(first: SetUpRecord, second: SetUpRecord) -> SignalChange | None:
     """Compare signals on the inspections that both have. It is more sensitive than hits: signals change with all of the
     noise and the threshold, hits only near the limit. Damages count whose two signals, each over what is needed, exceed
-    1 in the geometric mean: smaller ones are noise. None where fewer than two boards have any, or for two detectors."""
+    1 in the geometric mean: smaller ones are noise. None if fewer than two boards have any, or for two detectors."""
     one, two = shared_rows(first.inspected, second.inspected)
     if first.detector != second.detector or not len(one):
         return None
@@ -206,8 +206,8 @@ def calls_change(first: SetUpRecord, second: SetUpRecord, wanted_per_m2: float |
     honest calibrations for one rate give two different true rates (Beta distributed, Wilks 1941): a test of two Poisson
     counts is called at 5 % in 20 % of honest pairs with 240 boards each. So each gets its own draw of that
     distribution. On identical frames with the same threshold the signs of each board's difference are tossed, which
-    shows smaller changes; where anything moved the threshold on identical frames, both tests must agree. None where
-    either has no hole-free board. ``wanted_per_m2``: None without a wanted rate."""
+    shows smaller changes; where anything moved the threshold on identical frames, both tests must agree. None if either
+    has no hole-free board. ``wanted_per_m2``: None without a wanted rate."""
     one, two = first.unflawed, second.unflawed
     areas = (float(one.area_m2.sum()), float(two.area_m2.sum()))
     if not min(areas) > 0:
@@ -250,7 +250,7 @@ def _calling(table: Unflawed) -> tuple[int, int]:
 
 
 def _rank(record: SetUpRecord, wanted_per_m2: float | None) -> tuple[int, int] | None:
-    """Return (r, n + 1 - r): the threshold is the r-th highest of n calibration scores; None where it was given."""
+    """Return (r, n + 1 - r): the threshold is the r-th highest of n calibration scores; None if it was given."""
     n = record.calibration_runs
     if not n:
         return None

@@ -98,7 +98,7 @@ class Inspected:
     """Inspections of damage, one a row: each damage of each board for every repeat of the noise. True: ``diameter_mm``
     (of long damage the width or length that ``size_of`` names), ``depth_mm`` removed, ``x_mm``, ``y_mm`` on the board.
     ``signal`` (n,): the highest score within the hit radius, NaN where no pixel there was judged. ``by_depth``,
-    ``by_no_return`` (n,) bool: hits by each kind of finding; None where hits were counted by depth alone."""
+    ``by_no_return`` (n,) bool: hits by each kind of finding; None if hits were counted by depth alone."""
 
     __pydantic_config__ = FORM
     board: Counts
@@ -192,7 +192,7 @@ class SetUpRecord:
 @dataclass(frozen=True, eq=False)
 class StudyRecord:
     """A whole study. ``hit_radius_mm``, ``hit_overlap`` (None: not asked): what counts as a hit. The thresholds' rate
-    ``false_calls_per_m2`` is None where they were given. ``provenance``: commit, dirty, versions, seed."""
+    ``false_calls_per_m2`` is None if they were given. ``provenance``: commit, dirty, versions, seed."""
 
     __pydantic_config__ = FORM
     name: Name
@@ -229,7 +229,7 @@ def record_text(record: StudyRecord) -> str:
 
 
 def read_record(path: Path) -> StudyRecord:
-    """Read the record at ``path``: a file, or a result folder with its ``study.json``. Raises UserError where there is
+    """Read the record at ``path``: a file, or a result folder with its ``study.json``. Raises UserError if there is
     none, where it is not a record or is damaged (with set-up and field), and where it is of another version."""
     file = Path(path) / "study.json" if Path(path).is_dir() else Path(path)
     try:
@@ -249,7 +249,7 @@ def read_record(path: Path) -> StudyRecord:
 
 
 def set_up_named(study: StudyRecord, name: str | None) -> SetUpRecord:
-    """Return the set-up with this label, or the only one. Raises UserError where there is none, or none is named."""
+    """Return the set-up with this label, or the only one. Raises UserError if there is none, or none is named."""
     by_label = {record.label: record for record in study.set_ups}
     name, known = name or (next(iter(by_label)) if len(by_label) == 1 else None), "; ".join(by_label)
     if name is None:

@@ -209,7 +209,7 @@ def _sizes_miss_the_rise(limit: SetUpLimit) -> tuple[tuple[bool, str], ...]:
 
 
 def _one_kind(facts: Mapping[str, Any]) -> str:
-    """The kind of all damage drawn; empty where nothing is drawn or an axis varies the damage."""
+    """The kind of all damage drawn; empty if nothing is drawn or an axis varies the damage."""
     kind = facts.get("source", {}).get("target", {}).get("damage", {}).get("kind", "")
     varied = any("source.target.damage.kind".startswith(axis) for axis in facts.get("sweep") or {})
     return kind if kind in KINDS and not varied else ""
@@ -287,7 +287,7 @@ def conditions_of(facts: Mapping[str, Any], inspected: int | None = None) -> str
 @dataclass(frozen=True, eq=False)
 class SetUpResult:
     """One set-up: ``limit``; ``chance`` hits (None: nothing to lay them over); ``roc``, ``free_response``, ``pixels``
-    (None where not counted); ``surface`` over diameter and depth, or ``surface_why`` there is none."""
+    (None if not counted); ``surface`` over diameter and depth, or ``surface_why`` there is none."""
 
     limit: SetUpLimit
     chance: ChanceHits | None

@@ -149,7 +149,7 @@ def paired_set_ups(first: StudyRecord, second: StudyRecord) -> tuple[Pair, ...]:
 
 
 def not_comparable(first: StudyRecord, second: StudyRecord, one: SetUpRecord, other: SetUpRecord) -> str:
-    """Return why the two were not measured in the same way (hit radius, wanted false calls, damage), empty where they
+    """Return why the two were not measured in the same way (hit radius, wanted false calls, damage), empty if they
     were. Damage of other boards is compared by Kolmogorov and Smirnov's test with as many values as there are boards,
     since damages of one board may be alike: cautious where they are not."""
     if first.hit_radius_mm != second.hit_radius_mm:
@@ -234,7 +234,7 @@ def limit_margin(signal: paired.SignalChange | None) -> float:
 
 
 def _lost(before: SetUpLimit, now: SetUpLimit) -> str:
-    """Name what ``before`` had and ``now`` has not; empty where nothing."""
+    """Name what ``before`` had and ``now`` has not; empty if nothing."""
     if now.record.failed > before.record.failed:
         return f"{now.record.failed} trials failed, {before.record.failed} before"
     if np.isfinite(before.a90_mm) and not np.isfinite(now.a90_mm):
