@@ -120,8 +120,8 @@ def refuse_size(config: ExperimentConfig, size_mm: float | None) -> None:
         word, (low, high) = "depth", damage.depths_mm
     if size_mm is not None and not low <= size_mm <= high:
         fix = "change the damage's range in the experiment: nothing is said of sizes that are not inspected"
-        said = f"{size_mm:.3g} mm: {config.name} inspects no damage of that size"
-        raise UserError(said, legal=f"{low:.3g} to {high:.3g} mm ({word})", fix=fix)
+        what = f"{size_mm:.3g} mm: {config.name} inspects no damage of that size"
+        raise UserError(what, legal=f"{low:.3g} to {high:.3g} mm ({word})", fix=fix)
 
 
 def _widened(group: Group, poses: Sequence[Pose]) -> Group:

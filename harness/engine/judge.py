@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from detectors import DETECTORS, load_detector
-from detectors.interface import Calibratable, Detection, Detector, Evidence, Measurement, ToldTheTruth, TrueDamage
+from detectors.interface import Calibratable, Detection, Detector, Evidence, Measurement, NeedsTruth, TrueDamage
 from detectors.masks import grown
 from detectors.missing import missing_returns, one_damage_once
 from detectors.noise import median_of, sigma_of
@@ -169,13 +169,13 @@ def detector_for(
     """Return the detector for a cloud. A built-in detector that asks for the truth receives it; a plug-in never
     does."""
     detector = detector_of(name, settings_json, learned)
-    if not (isinstance(detector, ToldTheTruth) and DETECTORS.offer(name).built_in):
+    if not (isinstance(detector, NeedsTruth) and DETECTORS.offer(name).built_in):
         return detector
     truth = (
         TrueDamage(known.centre_in_cloud_m(damage), damage.diameter_m, known.outlines[damage.id])
         for damage in known.truth
     )
-    return detector.told(() if hole_free else tuple(truth))
+    return detector.with_truth(() if hole_free else tuple(truth))
 
 
 def _place(damage: Damage) -> dict[str, Any]:

@@ -82,7 +82,7 @@ class Findable:
     damages: int
 
     @property
-    def said(self) -> str:
+    def statement(self) -> str:
         """Return what was learnt, in a sentence."""
         return (
             f"Learnt from {self.damages} damages: the detector's signal is proportional to the {self.size_of} to the "
@@ -149,8 +149,8 @@ def findable(some: ScoredDamage, threshold: float) -> Findable:
     best = int(np.nanargmax([value for value, _ in fits]))
     growth, (coefficients, scatter, _, _) = float(GROWTHS[best]), fits[best][1]
     if coefficients[1] <= 0:
-        said = f"what is found does not follow the {some.size_of} of the damage: no limit can be learnt"
-        raise UserError(said, fix="ask for fewer or less tilted poses, or run a study in the pose wanted")
+        what = f"what is found does not follow the {some.size_of} of the damage: no limit can be learnt"
+        raise UserError(what, fix="ask for fewer or less tilted poses, or run a study in the pose wanted")
     ratio = np.exp(special.ndtri(POD) * scatter / np.median(cosine) ** growth / coefficients[1])
     sizes_mm = (float(size_mm.min()), float(size_mm.max()))
     law = (coefficients, scatter, growth, float(ratio), threshold)

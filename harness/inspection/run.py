@@ -28,7 +28,7 @@ from detectors.noise import REACH_FRAMES, noise_reach_px
 from detectors.null import each_object_once, own_threshold
 from detectors.views import PreparedView, View
 from harness.inspection import arguments as asked
-from harness.inspection import told
+from harness.inspection import output
 from harness.inspection.gauge import HITS_AND_MISSES, GaugeSeen, read_gauge, seen_on
 from harness.report.findings import Judged, write_findings
 from harness.tables.outputs import GAUGE_ROWS
@@ -215,7 +215,7 @@ def inspect(arguments: argparse.Namespace) -> int:
         views.append(View(name, _averaged(arguments, recording, field), guess))
     for view in views:
         with _mistakes_named(view if config else None):
-            choices.append(told.choice_by(config or getattr(detector, "settings", None), view.cloud))
+            choices.append(output.choice_by(config or getattr(detector, "settings", None), view.cloud))
     mapped, registrations = None, dict[str, Any]()
     if config:
         mapped, registrations = _merged(arguments, config, recordings, views, choices)
@@ -282,14 +282,14 @@ def _merged(
     from detectors.registration.register import register
 
     for view, choice in zip(views, choices, strict=True):
-        told.print_warnings(f"view {view.name}: {why}" for why in (choice.warnings if choice else ()))
+        output.print_warnings(f"view {view.name}: {why}" for why in (choice.warnings if choice else ()))
     prepared: list[PreparedView] = []
     for recording, view, choice in zip(recordings, views, choices, strict=True):
         with _mistakes_named(view):
             ready = prepare(view, config)
-        told.print_choice(choice)
-        told.print_capture(recording, view.cloud, view.name, ready.inside, arguments.crop)
-        told.print_marks(ready)
+        output.print_choice(choice)
+        output.print_capture(recording, view.cloud, view.name, ready.inside, arguments.crop)
+        output.print_marks(ready)
         prepared.append(ready)
     reference, has_poses = prepared[0], arguments.poses is not None
     if config.registration.method in START_FROM_MARKS and not has_poses:
@@ -363,28 +363,28 @@ def _print(run: Inspection) -> None:
     # with several views, doubts about their targets were printed before the registration
     doubts = choice.warnings if run.mapped is None and choice else ()
     of_gauge = run.seen.warnings if run.seen else ()
-    told.print_warnings((*recorded, *doubts, *evidence.warnings, *of_gauge))
+    output.print_warnings((*recorded, *doubts, *evidence.warnings, *of_gauge))
     kept = np.isfinite(evidence.residual_m)
     if run.mapped is None:
-        told.print_choice(choice)
-        told.print_capture(run.recordings[0], cloud, run.recordings[0].name, kept, crop)
+        output.print_choice(choice)
+        output.print_capture(run.recordings[0], cloud, run.recordings[0].name, kept, crop)
         if not cloud.organised and crop == "auto" and (off := cloud.valid.sum() - kept.sum()) > 0:
             print(f"note: {off} points lie off the target or on its rim: not judged; --crop none judges all of them")
     else:
-        told.print_registrations(run.registrations)
+        output.print_registrations(run.registrations)
         merged = run.mapped.merged
-        told.print_notes(merged.notes)
+        output.print_notes(merged.notes)
         height, width = cloud.valid.shape
-        grid = f", a map of {width} x {height} cells of {told.mm(run.cell_m)}" if run.cell_m is not None else ""
+        grid = f", a map of {width} x {height} cells of {output.mm(run.cell_m)}" if run.cell_m is not None else ""
         print(f"merged: {len(merged.views_used)} views, {cloud.valid.sum()} points, {kept.sum()} judged{grid}")
-    unit = evidence.unit or f"{told.mm(evidence.scale_m)} at the median point"
+    unit = evidence.unit or f"{output.mm(evidence.scale_m)} at the median point"
     print(f"surface: {evidence.notes.get('surface', '')}; one unit of score is {unit}")
     if run.result.missing is not None:
         print(run.result.missing.blind_text)
-    print(f"threshold: {told.threshold_text(run.threshold, evidence)} ({run.origin})")
-    told.print_findings(run.result.findings, grid="px" if run.cell_m is None else "cell")
+    print(f"threshold: {output.threshold_text(run.threshold, evidence)} ({run.origin})")
+    output.print_findings(run.result.findings, grid="px" if run.cell_m is None else "cell")
     if run.seen is not None:
-        told.print_notes(run.seen.notes)
+        output.print_notes(run.seen.notes)
         show([HITS_AND_MISSES.grid(run.seen.rows, terminal=True)])
         print(run.seen.answer)
 
@@ -395,14 +395,14 @@ def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
     settings: dict[str, Any] = {"average": arguments.average, "unit": arguments.unit}
     facts: dict[str, Any] = {}
     if run.mapped is None or run.config is None:
-        facts["target"] = told.choice_facts(run.choices[0])
-        facts["capture"] = told.capture_facts(run.recordings[0], run.result.cloud)
+        facts["target"] = output.choice_facts(run.choices[0])
+        facts["capture"] = output.capture_facts(run.recordings[0], run.result.cloud)
     else:
         merged, cell_mm = run.mapped.merged, None if run.cell_m is None else run.cell_m / MM
         facts["frame"] = "of the merged cloud; registrations.json says where it stands to the first view's camera"
         facts["captures"] = [
-            {"view": ready.view.name, **told.capture_facts(each, ready.view.cloud), "target": told.choice_facts(choice)}
-            for each, ready, choice in zip(run.recordings, run.mapped.views, run.choices, strict=True)
+            {"view": view.view.name, **output.capture_facts(each, view.view.cloud), "target": output.choice_facts(own)}
+            for each, view, own in zip(run.recordings, run.mapped.views, run.choices, strict=True)
         ]
         facts["merged"] = {"views": merged.views_used, "cell_mm": cell_mm, "notes": merged.notes}
         settings["mapping"] = run.config.to_data()
@@ -428,22 +428,22 @@ def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
 def _write(run: Inspection, facts: dict[str, Any]) -> None:
 
     mapped, beside = run.mapped, dict[str, Callable[[Path], object]]()
-    count, limit = len(run.result.detections), told.threshold_text(run.threshold, run.result.evidence)
+    count, limit = len(run.result.detections), output.threshold_text(run.threshold, run.result.evidence)
     subject = f"{len(mapped.merged.views_used)} views" if mapped else run.recordings[0].name
     title = f"{subject}: {count} findings beyond {limit}"
     if run.seen is not None:
         table = HITS_AND_MISSES.frame(run.seen.rows).to_csv(index=False, float_format="%.6g", lineterminator="\n")
         beside[GAUGE_ROWS.name] = lambda path: path.write_text(table, encoding="utf-8")
     if mapped is None:
-        beside |= told.pictures(run.choices[0])
+        beside |= output.pictures(run.choices[0])
     else:
         from harness.report.view3d import write_view3d
 
-        scene = told.scene_of(mapped, run.result)
+        scene = output.scene_of(mapped, run.result)
         beside["registrations.json"] = lambda path: path.write_text(plain_json(run.registrations), encoding="utf-8")
         beside["view3d.html"] = lambda path: write_view3d(path, scene, title)
         for number, choice in enumerate(run.choices, start=1):
-            beside |= told.pictures(choice, f"targets-{number}.png")
+            beside |= output.pictures(choice, f"targets-{number}.png")
     name = "merged.ply" if mapped else "cloud.ply"
     for path in write_findings(run.arguments.out, run.result, facts, title, cloud_name=name, beside=beside):
         print(f"wrote {path}")
