@@ -168,7 +168,7 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
 
 
 def misfit(cloud: Cloud, residual_m: np.ndarray, surface: str) -> str:
-    """Return a sentence if a stated ``surface`` leaves structure in ``residual_m`` (h, w) that resembles damage, else
+    """Return a sentence if a stated ``surface`` leaves structure in ``residual_m`` (h, w) that looks like damage, else
     ""."""
     mask = np.isfinite(residual_m)
     cells = _cells(cloud.points_m[mask], cloud)
@@ -219,8 +219,7 @@ def _cells(points: np.ndarray, cloud: Cloud) -> _Cells | None:
 
 @numba.njit(cache=True, nogil=True)
 def _group_medians(values: np.ndarray, group: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the median of each group's finite values, and their median distance from it over 0.6745; NaN for no
-    value."""
+    """Return the median of each group's finite values, and their median distance from it over 0.6745; else NaN."""
     starts = np.zeros(groups + 1, np.int64)
     for i in range(len(values)):
         if group[i] >= 0 and np.isfinite(values[i]):

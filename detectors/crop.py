@@ -1,5 +1,4 @@
-"""The pixels that belong to the target: those in a box or in a polygon of the image, or the nearest large smooth
-surface.
+"""The pixels that belong to the target: in a box, in a polygon of the image, or on the nearest large smooth surface.
 
 Two surfaces are compared at their outlines: one is in front of the other, lies on it or is visible through its hole, or
 they only meet. The surface with the best odds under a model of how people photograph a target is proposed; if the odds
@@ -35,8 +34,7 @@ GRAZING = 0.5
 that mix two surfaces look like a third surface at such an angle."""
 STEEPNESS = 2.0  # odds grow with this power of weights and areas
 SURROUNDED, BORDERING, STEP_PART = 0.7, 0.1, 0.3
-"""Shares of the outline that border on the surface under an object, and on a neighbour; share of a border that is a
-step."""
+"""Shares of the outline on the surface under an object, and on a neighbour; share of a border that is a step."""
 CUT_OFF = 0.15
 """Share of the outline on the picture's edge from which a surface continues outside it, as walls and floors do."""
 NOTCHES_PX = (8, 16)
@@ -100,8 +98,7 @@ class Candidate:
         return int(np.count_nonzero(outline & edge)) / max(int(np.count_nonzero(outline)), 1)
 
     def continues(self, other: Candidate, apart_m: float) -> bool:
-        """Return whether this flat surface and the other lie in one plane: nine points in ten agree within
-        ``apart_m``."""
+        """Return whether this flat surface and the other lie in one plane: 90 % of the points within ``apart_m``."""
         normal, middle = self._plane[1][:, 0], self._some.mean(axis=0)
         off_m = [np.quantile(np.abs((each._some - middle) @ normal), 0.9) for each in (self, other)]
         return bool(max(off_m) <= apart_m)
@@ -136,8 +133,7 @@ class Choice:
 
 
 class _Border(NamedTuple):
-    """Border on another surface: its share (``part``) of the outline, whether it is a step, and its height in
-    metres."""
+    """Border on another surface: its share of the outline, whether it is a step, and its height in metres."""
 
     part: float
     is_step: bool
@@ -256,8 +252,7 @@ def _borders(surfaces: Surfaces, grid: Cloud, number: int) -> dict[int, _Border]
 
 
 RIM_PX = 3
-"""Width of the rim where target and background mix: a 5 x 5 window reaches 2 pixels, and the edge itself crosses a
-third."""
+"""Width of the rim where target and background mix: a 5 x 5 window reaches 2 pixels, and the edge crosses a third."""
 
 
 class _Crop(Config):
@@ -274,8 +269,7 @@ class NoCrop(_Crop):
 
 
 class BoxCrop(_Crop):
-    """Takes points in an open box in the camera's frame, by default the thesis'. ``range_max_m``: limit of sqrt(x^2 +
-    z^2)."""
+    """Takes points in an open box (default: the thesis') in the camera's frame. ``range_max_m``: of sqrt(x^2 + z^2)."""
 
     kind: Literal["box"] = "box"
     x_mm: tuple[float, float] = (-500.0, 400.0)
@@ -304,8 +298,8 @@ class AutoCrop(_Crop):
 
     Neighbours are joined if tilt and noise explain their step in z and the surface bends by at most ``crease_deg`` over
     ``smooth_px``; then holes are filled, and ``inset_px`` is removed at the rim. A background so near that blur leaves
-    no crease counts as target (13 mm behind the face, at 0.7 m with a 5 x 5 window). Without a pixel grid, a raster of
-    the nearest points is used."""
+    no crease counts as target (13 mm behind the face, at 0.7 m with a 5 x 5 window). Without a pixel grid, a raster is
+    used."""
 
     kind: Literal["auto"] = "auto"
     inset_px: int = Field(default=RIM_PX, ge=0, le=200)
@@ -356,8 +350,8 @@ def crop(cloud: Cloud, config: AnyCrop) -> np.ndarray:
 
 
 def choice_of(cloud: Cloud, config: AutoCrop) -> Choice:
-    """Return the automatic crop of a cloud that has a valid point, and all candidates. Raises UserError if there is no
-    candidate ``target``."""
+    """Return the automatic crop of a cloud with a valid point, and all candidates. Raises UserError without
+    ``target``."""
     grid, smooth_px, inset_px, wanted = cloud, config.smooth_px, config.inset_px, config.target
     if not cloud.organised:
         grid, rows, columns, spacings = raster(cloud.points_m[cloud.valid], cloud)

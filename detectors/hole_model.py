@@ -29,14 +29,11 @@ MOST_STEPS, TOLERANCE = 40, 1e-5  # limits of a descent: the number of steps, an
 DAMPING, LEAST_M, SMALLEST = 1e-3, 1e-9, 1e-18
 """Damping of the first step; size of a deviation that is only rounding error, and its square."""
 MODEL_ERROR, RADIUS_ERROR_PX, DEPTH_ERROR = 0.02, 0.05, 0.05
-"""Errors that light between wall and floor causes on simulated clouds: shares of a pixel's depth and of the fitted
-sizes."""
+"""Errors by light between wall and floor on simulated clouds: shares of a pixel's depth and of the fitted sizes."""
 MOST_MISFIT = 1.5
-"""Largest misfit of a valid fit: simulations with the model's own optics give 0.3 to 1.05, with other optics 1.1 to
-3."""
+"""Largest misfit of a valid fit: simulations with the model's optics give 0.3 to 1.05, with others 1.1 to 3."""
 WALL_PRIOR = (0.5, 12.0**-0.5)
-"""Prior mean and standard deviation of the tube's length over the depth: those of a uniform distribution from 0 to
-1."""
+"""Prior mean and standard deviation of the tube's length over the depth, which is uniform from 0 to 1."""
 
 _THETA = np.linspace(-np.pi / 2, np.pi / 2, STRIPS + 1)
 EDGES = np.sin(_THETA)  # edges (s + 1,) of strips across a unit disc: narrow where the chord changes fast
@@ -56,8 +53,7 @@ def sight(centre_m: np.ndarray, per_px_m: np.ndarray, emitter_m: np.ndarray, sha
     share of the image that this viewpoint contributes. ``centre_m`` (3,): camera frame. ``per_px_m``: (2, 3).
 
     A circle at depth h along the normal has the image of the same circle on the surface, moved by h * drift / (1 + h *
-    shrinking) and divided by that divisor. Light from depth h entered at a distance of beam * h / (h + height) from
-    it."""
+    shrinking) and divided by that divisor. Light from depth h entered at beam * h / (h + height) from it."""
     normal = normal_of(per_px_m)
     normal = normal / np.copysign(np.linalg.norm(normal), normal @ centre_m)
     ray, z = centre_m / centre_m[2], centre_m[2]
@@ -70,8 +66,7 @@ def sight(centre_m: np.ndarray, per_px_m: np.ndarray, emitter_m: np.ndarray, sha
 
 
 def straight_sight(per_px_m: np.ndarray) -> np.ndarray:
-    """Return the viewpoint (8,) of a parallel projection of unknown origin: it looks along z, and light comes from
-    there."""
+    """Return the viewpoint (8,) of a parallel projection of unknown origin: view and light are along z."""
     normal = normal_of(per_px_m)
     normal = normal / np.copysign(np.linalg.norm(normal), normal[2])
     drift = np.linalg.solve(per_px_m[:, :2].T, normal[:2])
@@ -82,7 +77,7 @@ def straight_sight(per_px_m: np.ndarray) -> np.ndarray:
 class HolePatch:
     """Residuals around one detection. ``metric_m2`` (2, 2): its quadratic form is the squared length of a pixel offset
     (du, dv). ``blur_px`` (along u, along v): sides of the rectangle over which the image is averaged. ``noise_m``:
-    standard deviation beside the hole. ``sights``: (s, 8). ``whitener`` (n, n): of the errors of the used pixels, if
+    standard deviation beside the hole. ``sights``: (s, 8). ``whitener`` (n, n): of the used pixels' errors, if
     known."""
 
     residual_m: np.ndarray
@@ -187,8 +182,8 @@ def _cut(  # type: ignore[no-untyped-def]
 @dataclass(frozen=True)
 class HoleFit:
     """A fitted hole: ``u_px`` and ``v_px`` in the patch. ``covariance`` (6, 6): of u, v, radius, depth, offset and
-    wall, in px and metres. ``misfit``: standard deviation of the fit's residuals over that of noise and model error; 0
-    if unknown."""
+    wall, in px and metres. ``misfit``: standard deviation of the residuals over that of noise and model error; 0 if
+    unknown."""
 
     u_px: float
     v_px: float
@@ -240,8 +235,8 @@ def _descent(  # type: ignore[no-untyped-def]
 ):
     """Return the best hole (5,), its offset, rows (8, n) and whether the descent from ``start`` (6,) has converged. The
     first rows are derivatives of the used pixels, at flat ``places`` (n,), by (u, v, radius, depth, offset, wall); the
-    seventh is ``data`` (n,) minus the hole. A ``whitening`` (n, n), unless empty, multiplies them. ``weight``: of the
-    prior."""
+    seventh is ``data`` (n,) minus the hole. A ``whitening`` (n, n) not empty multiplies them. ``weight``: the
+    prior's."""
     n, q, step, damping, converged = len(data), start, np.zeros(6), 10.0 * DAMPING, False
     square = promised = np.inf
     rows, products, best, holes, sizes = np.zeros((8, n)), np.zeros((7, 7)), np.zeros(5), np.zeros((6, 5)), np.zeros(5)

@@ -291,8 +291,7 @@ def local_sigma(
     window's middle to its edge, interpolated between nodes ``half`` apart."""
 
     def nodes_of(length: int) -> np.ndarray:
-        """Return the centres of equal parts, where `cv2.resize` assumes its samples, moved to pixels so that they are
-        symmetric about both ends."""
+        """Return the centres of equal parts, as `cv2.resize` assumes, moved to pixels symmetrically about both ends."""
         count = max(1, round(length / half))
         count += (length - count) % 2 if length % 2 == 0 else 0
         half_pixel = 0.5 if length % 2 == 0 else 0.0

@@ -50,8 +50,7 @@ def grown(mask: np.ndarray, pixels: int, shape: int = cv2.MORPH_RECT) -> np.ndar
 
 
 def shrunk(mask: np.ndarray, side: int) -> np.ndarray:
-    """Return the pixels whose square of ``side`` pixels lies inside the mask; pixels beyond the picture count as
-    inside."""
+    """Return the pixels whose square of ``side`` pixels lies inside the mask; beyond the picture counts as inside."""
     return np.asarray(cv2.erode(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 
 
@@ -76,8 +75,7 @@ def parts_with(mask: np.ndarray, seeds: np.ndarray, connectivity: int = 8, least
 
 
 def nearest_pixel(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return each pixel's distance (h, w) to the mask, in pixels, and the flat index of the nearest pixel of the
-    mask."""
+    """Return each pixel's distance (h, w) to the mask, in pixels, and the flat index of the mask's nearest pixel."""
     beyond = (~mask).astype(np.uint8)
     apart, labels = cv2.distanceTransformWithLabels(beyond, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
     inside = np.flatnonzero(mask)

@@ -17,8 +17,8 @@ Upsampled depth is judged on squares of pixels in which its noise reaches no far
 Not modelled: slots that no template fits; slots within `RIM_PX` of outlines and of removed findings; distortion of
 templates on steep surfaces; missing returns, except the few that are no findings by themselves (`detectors.missing`).
 The denominator takes the share of a template's whitened energy on known pixels for t' C^-1 t, by a rectangle that
-spreads as widely; a template does not judge places where less than `LEAST_SEEN` of it is visible. Scores of slots are
-taken on every second pixel."""
+spreads as widely; a template does not judge places where less than `LEAST_SEEN` of it is visible. Slots are scored on
+every second pixel."""
 
 from __future__ import annotations
 
@@ -357,8 +357,8 @@ def _keep_stronger(  # type: ignore[no-untyped-def]
 ):
     """Keep the larger of each pixel's scores (r, c) by size, and that template's ``number``. Scores are scaled to
     deviations of their ``zone`` (r, c) by the factors ``per_deviation`` (z,), and raised: their squares grow by
-    ``raised``, in proportion below `FAINT`. Scores of a template between pixels, ``down`` or to the ``right``, belong
-    to all pixels around."""
+    ``raised``, in proportion below `FAINT`. Scores of a template between pixels, ``down`` or ``right``, belong to all
+    around."""
     faint = per_deviation * np.float32(np.sqrt(1.0 + raised / FAINT**2))
     height, width = score.shape
     for y in range(down + 1):

@@ -33,14 +33,12 @@ from harness.vocabulary.geometry import MM, Cloud, Region, rotate_vectors
 OTHER_DAMAGE_SIGMAS = 5.0
 """Pixels of the patch with a larger residual that do not touch the detection belong to other damage."""
 OPEN_M = 20.0 * MM
-"""The contour clips deeper residuals to this value, so that it follows an oblique hole's mouth, not what shows
-through."""
+"""The contour clips deeper residuals to this depth, to follow an oblique hole's mouth, not what shows through."""
 CONTOUR_ZOOM = 4  # sub-pixels of the half-depth contour along each axis
 EXPLAINED = 0.5
 """Least share of a detection's mean residual that its fit must explain: correlated noise may absorb a smooth dent."""
 SHARPER_PX, SHARPER_GAIN = (1.0, 2.0, 3.0, 5.0), 9.0
-"""Blurs, smaller than that of the noise, that are tried for a recording, and the gain in chi square that accepts a
-blur."""
+"""Blurs, smaller than the noise's, that are tried for a recording, and the gain in chi square that accepts them."""
 
 
 class HoleModelConfig(Config):
@@ -48,8 +46,7 @@ class HoleModelConfig(Config):
     the Azure Kinect's depth engine (OpenK4A), 3 for the Kinect v2 (libfreenect2), 1 for none. ``emitter_mm``: position
     of the light source in the camera's frame. ``linear_depth_mm``: at greater depths, the filter weights a deep
     neighbour by less than half, and the contour at half depth is more reliable. ``largest_invalid``: share of the disc
-    that may lack a range. ``largest_relative_error``: of the diameter; if it is exceeded, diameter and depth cannot be
-    told apart."""
+    that may lack a range. ``largest_relative_error``: of the diameter; beyond it, diameter and depth are ambiguous."""
 
     blur_px: int = Field(default=5, ge=1, le=31)
     emitter_mm: tuple[float, float, float] = (-14.0, 0.0, 1.0)
@@ -83,8 +80,8 @@ def blur_in_cells(cloud: Cloud, config: HoleModelConfig) -> tuple[float, float]:
 
 def extents(points_m: np.ndarray) -> tuple[float, np.ndarray]:
     """Return the thesis' size and centre (3,) of a cluster (n, 3), metres. The size is the mean of the distances
-    between the two extreme points in x and between those in y; the centre is the mean of these four. Of equal extremes
-    the first counts."""
+    between the two extreme points in x and between those in y; the centre is the mean of these four. The first of
+    equals counts."""
     west, east, north, south = points_m[_extremes(points_m, np.zeros(len(points_m), np.int64), 1)[0]]
     diameter = 0.5 * float(np.linalg.norm(east - west) + np.linalg.norm(south - north))
     return diameter, (west + east + north + south) / 4.0
@@ -121,8 +118,7 @@ def measure_extents(cloud: Cloud, detection: Detection, note: str) -> Measuremen
 def measure_detection(
     cloud: Cloud, evidence: Evidence, detection: Detection, config: HoleModelConfig, by_lag: np.ndarray | None = None
 ) -> Measurement:
-    """Measure a detection both ways; a measurement that fails is NaN, with a note. ``by_lag``: the noise's
-    correlation."""
+    """Measure a detection both ways; failed measurements are NaN, with a note. ``by_lag``: the noise's correlation."""
     if not cloud.organised:
         return measure_extents(cloud, detection, "no pixel grid: extents only")
     placed = measure_extents(cloud, detection, "too few valid pixels around it for a model")
@@ -204,8 +200,7 @@ class _Surroundings:
 def _surroundings(
     cloud: Cloud, evidence: Evidence, rows: np.ndarray, columns: np.ndarray, config: HoleModelConfig
 ) -> _Surroundings | None:
-    """Cut out the detection with a margin of twice the blur on each side; None if too few valid pixels are around
-    it."""
+    """Cut out the detection with a margin of twice the blur on each side; None with too few valid pixels around."""
     h, w = cloud.points_m.shape[:2]
     sides = blur_in_cells(cloud, config)
     blur = max(sides)
@@ -253,9 +248,8 @@ def _surroundings(
 def local_plane(
     points: np.ndarray, surface_z: np.ndarray, finite: np.ndarray, own: np.ndarray, projection: str
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the surface's point at the detection's centroid (3,) and its derivatives by u and v (2, 3), from a linear
-    regression of the directions (of x and y in a parallel projection) and of the surface's z. None if it is
-    singular."""
+    """Return the surface's point at the detection's centroid (3,) and its derivatives by u and v (2, 3), by linear
+    regression of directions (in a parallel projection of x and y) and of the surface's z; None if singular."""
     v0, u0 = (float(axis.mean()) for axis in np.nonzero(own))
     v, u = np.nonzero(finite)
     design, (x, y, z) = np.stack([np.ones(len(u)), u - u0, v - v0]), points[finite].T

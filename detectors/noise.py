@@ -17,8 +17,7 @@ LONE_LEVEL_PX, LONE_SIGMAS, LONE_MOST_PX = 21, 5.0, 7
 """Side of the square of the local mean in a single frame; deviations that mark an edge; longest lag that is attributed
 to noise and not to a pattern or the surface."""
 LEAST_FRAMES, SCATTER_PX = 4, 7
-"""Fewest frames whose scatter shows noise; side of the square over which it is averaged: to 12 % from 49 x 3
-differences."""
+"""Fewest frames whose scatter shows noise; side of the square of its average: to 12 % from 49 x 3 differences."""
 SHARED = 0.1  # correlation below which pixels share no noise: a box of b pixels, up to 9, falls below it at lag b
 
 
@@ -46,8 +45,7 @@ def sigma_of(values: np.ndarray) -> float:
 
 def rounding_left_m2(step_m: float, dither_m2: float) -> float:
     """Return the variance of the fixed pattern that rounding to a step q leaves in an average of infinitely many
-    frames. With noise of variance s^2 before rounding, it is (q / pi)^2 / 2 * sum_k exp(-4 pi^2 k^2 s^2 / q^2) /
-    k^2."""
+    frames. With noise of variance s^2 before it is (q / pi)^2 / 2 * sum_k exp(-4 pi^2 k^2 s^2 / q^2) / k^2."""
     k = np.arange(1, 200)
     left = (step_m / np.pi) ** 2 / 2.0 * float((np.exp(-((2.0 * np.pi * k) ** 2) * dither_m2 / step_m**2) / k**2).sum())
     return min(left, step_m**2 / 12.0)
@@ -59,8 +57,7 @@ def rounding_variances(cloud: Cloud, mask: np.ndarray) -> tuple[float, float]:
 
     Rounding to a step q errs by q / sqrt(12). Noise before the rounding turns part of that into noise, which averages
     out, and leaves a fixed pattern b^2 (`rounding_left_m2`): b^2 + (q^2 / 12 - b^2) / n after n frames. The whole error
-    remains if the averaged z still lies on the steps, as a median does. Without a step, z is assumed to be stored as
-    float32."""
+    remains if the averaged z still lies on the steps, as a median does. Without a step, z counts as float32."""
     z = cloud.points_m[..., 2][mask]
     step = cloud.z_step_m if cloud.z_step_m > 0 else float(np.finfo(np.float32).eps) * float(np.abs(z).max())
     whole = step**2 / 12.0

@@ -216,8 +216,7 @@ def _excess(ratios: np.ndarray, exponent: float, floor: float) -> np.ndarray:
 
 
 def _crowd(floor: float) -> float:
-    """Return the logarithmic part of the excess; for low floors, where that law does not hold, at most half of the
-    excess."""
+    """Return the logarithmic part of the excess; at most half of it for low floors, where that law does not hold."""
     return min(floor**-2.0, 0.5)
 
 

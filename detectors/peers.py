@@ -205,8 +205,7 @@ def _py4dgeo() -> Any:
 class FpfhMemoryConfig(ScoreMapConfig):
     """``normal_neighbours``, ``feature_neighbours``: typical number of points in the sphere of a normal and of a
     feature. ``pool_px``: side of the square over which features are averaged. The paper's program has 30, 100 and 8.
-    ``memory``: number of features of undamaged targets that are kept. ``surface``: the surface from which sizes are
-    measured."""
+    ``memory``: number of features of undamaged targets that are kept. ``surface``: the reference of sizes."""
 
     crop: CropConfig = Field(default_factory=AutoCrop)
     surface: SurfaceConfig = Field(default_factory=SurfaceConfig)
@@ -291,8 +290,7 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
 
 
 def coreset(features: np.ndarray, size: int) -> np.ndarray:
-    """Return at most ``size`` of the features (n, k): the most central one, then repeatedly the one farthest from all
-    chosen."""
+    """Return at most ``size`` of the features (n, k): the most central one, then always the one farthest from these."""
     apart = ((features - features.mean(axis=0)) ** 2).sum(axis=1)
     taken, apart = [int(apart.argmin())], np.full(len(features), np.inf)
     while len(taken) < size:

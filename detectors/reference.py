@@ -1,5 +1,4 @@
-"""The part's own mesh as the undamaged surface: it is fitted to the cloud, and gives the point where each ray should
-end.
+"""The part's own mesh as the undamaged surface: fitted to the cloud, it gives the point where each ray should end.
 
 The part's front axis is turned to the camera, upright or rolled by multiples of 90 degrees. Closest points, then
 closest planes, move it onto the cloud (Besl and McKay 1992; Chen and Medioni 1992); points off the part count less
@@ -23,8 +22,7 @@ from harness.vocabulary.geometry import MM, rotate_vectors, transform_points
 from harness.vocabulary.meshes import front_first, read_mesh
 
 SAMPLE, STEPS = 4000, 20
-"""Number of points used; number of steps by closest points (twice as many by distances follow, then as many by
-planes)."""
+"""Number of points used; steps by closest points (twice as many by distances follow, then as many by planes)."""
 LEAST_SCALE_M, FAR_M = 0.1 * MM, 10.0
 EDGE_PX, BENT = 1.5, 0.5
 """Pixels within this distance of a step or edge of the part are not judged; bend, in pixels, that makes an edge."""
@@ -83,8 +81,7 @@ def laid_on(points: np.ndarray, reference: ReferenceConfig, central: bool) -> tu
 
 
 def _scene(corners: np.ndarray) -> Any:
-    """Return triangles (m, 3, 3) as a scene for rays and closest points, which identifies triangles by their
-    numbers."""
+    """Return triangles (m, 3, 3) as a scene for rays and closest points, identified by their numbers."""
     scene = load_open3d().t.geometry.RaycastingScene(nthreads=1)
     faces = np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3)
     scene.add_triangles(corners.reshape(-1, 3).astype(np.float32), faces)

@@ -1,5 +1,4 @@
-"""Finds the large connected smooth surfaces of a cloud. A pipe up to its limb is one surface; two faces of a box are
-two."""
+"""Finds the large connected smooth surfaces of a cloud. A pipe up to its limb is one; two faces of a box are two."""
 
 from __future__ import annotations
 
@@ -22,28 +21,24 @@ BRIDGED_PX = 2  # largest distance from which a pixel without a return takes its
 SMOOTH_MM, MIXED_PX = 16.0, 3
 """Width of the window on a coarse grid, and half of the least number of pixels over which a bend is judged."""
 NORMAL_NOISE, WIDEST_SMOOTH_PX = 0.06, 41
-"""Largest noise of the smoothed surface's slope, radians; if a cloud is noisier, a wider window is used, up to this
-one."""
+"""Largest noise of the smoothed surface's slope, radians; noisier clouds use a wider window, up to this one."""
 LEAST_SHARE, LEAST_PX = 0.004, 100  # a surface with a smaller share of all pixels or fewer pixels is not a candidate
 LEAST_SHARED_PX = 10  # pixels that the rims of two surfaces must share to be merged
 CONTACT_MM, CONTACT_SIGMAS = 5.0, 3.0
 """Two surfaces touch at a common border if their step there is smaller; the noise of a difference raises this limit."""
 RIM_TURN_DEG = 10.0  # largest turn of a rim from the surface inside it, beyond the bend of that surface
 MOST_SURFACES, WIDE_PART = 8, 0.1
-"""Largest number of surfaces; least share of pixels at the middle of a full window: a smoothed step has no such
-pixel."""
+"""Most surfaces; least share of pixels at the middle of a full window: a smoothed step has no such pixel."""
 WIDEST_SLOPE = 5.7
 """tan(80 degrees): no camera sees so far off its axis; a cloud with a larger slope was not recorded from its origin."""
 CELL_SPACINGS, CELL_GROWTH, CELLS_FILLED, MAX_RASTER = 1.5, 1.25, 0.99, 4096
-"""Least side of a raster's cell in spacings; its growth until this share of the cells hold a point; most cells a
-side."""
+"""Least side of a raster's cell in spacings; its growth until this share of cells hold a point; most cells a side."""
 
 
 @dataclass(frozen=True)
 class Surfaces:
     """``own`` (n, h, w) bool: each surface's pixels, largest core first. ``filled`` (n, h, w) bool: the same with all
-    that they enclose. ``contact_m``: smaller steps do not count. ``reach_px``: distance from an edge that smoothing
-    affects."""
+    that they enclose. ``contact_m``: smaller steps do not count. ``reach_px``: smoothing's reach from an edge."""
 
     own: np.ndarray
     filled: np.ndarray
@@ -52,8 +47,7 @@ class Surfaces:
 
 
 def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces:
-    """Find the smooth surfaces of an organised cloud with windows of about ``smooth_px``, wider if the cloud is
-    noisy."""
+    """Find the smooth surfaces of an organised cloud with windows of about ``smooth_px``, wider in noisy clouds."""
     points, seen = np.array(cloud.points_m, np.float64), cloud.valid
     valid = seen
     if seen.any() and not seen.all():
@@ -245,8 +239,7 @@ def _share_contested(own: np.ndarray, cores: np.ndarray, smooth: _Smooth) -> Non
 def _trim_rims(
     own: np.ndarray, cores: np.ndarray, valid: np.ndarray, smooth: _Smooth, window: int, reach: int, apart_m: float
 ) -> None:
-    """Remove parts of each surface's rim that depart from the surface inside, and pixels that only these connect to
-    it."""
+    """Remove the parts of each surface's rim that depart from the surface inside, and pixels connected only by them."""
     points, means, normals, _ = smooth
     for number in range(len(own)):
         # the picture's edge is a rim too: a strip of background may lie there

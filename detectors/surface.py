@@ -2,8 +2,8 @@
 and quadrics (sphere, cylinder, cone, ...).
 
 Large clouds are solved on an even sample first and finished on all points. Not modelled: errors in x and y, correlated
-noise, overhangs, creases, several sheets. Damage of one to three sigma shifts every point-wise robust fit by a third of
-a sigma."""
+noise, overhangs, creases, several sheets. Damage of one to three sigma shifts point-wise robust fits by a third of a
+sigma."""
 
 from __future__ import annotations
 
@@ -26,8 +26,7 @@ from harness.vocabulary.meshes import FILES, FileUnit, FrontAxis
 SAMPLE_POINTS = 2048
 BISQUARE_TUNING = 4.685  # 95 % efficiency for Gaussian noise; MATLAB's default
 LTS_SAMPLE, LTS_SMALL, LTS_STARTS, LTS_KEPT, LTS_STEPS = 8192, 600, 500, 10, 10
-"""FAST-LTS: points in the large and in the first sample, number of elemental starts, of continued starts and their
-steps."""
+"""FAST-LTS: points in the large and in the first sample, elemental starts, continued starts and their steps."""
 LTS_COVERAGE = 0.55  # fraction of points that the fit must explain: it tolerates up to 45 % damage
 LTS_SEED = 20201102
 LAR_THINNING, LAR_STEPS, HALVINGS = 12, 60, 12
@@ -40,8 +39,7 @@ Solution = tuple[np.ndarray, str]  # coefficients (p,) and a description of the 
 
 
 class ReferenceConfig(Config):
-    """The part's own mesh, which may be open: its ``file``, its ``unit``, and the axis that points to the camera
-    (``front``)."""
+    """The part's own mesh, which may be open. ``front``: the axis of the file that points to the camera."""
 
     file: Annotated[str, Field(min_length=1, max_length=1000, description=FILES)]
     unit: FileUnit = "mm"
@@ -182,8 +180,7 @@ def _factor(gram: np.ndarray) -> np.ndarray | None:
 
 
 def _thinned(basis: np.ndarray, z: np.ndarray, points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return about ``points`` of the points, evenly strided; all if there are few or the sample would not determine the
-    fit."""
+    """Return about ``points`` of the points, evenly strided; all if these are too few for the fit."""
     stride = len(z) // points
     if stride < 2:
         return basis, z
@@ -226,8 +223,8 @@ def _lar(basis: np.ndarray, z: np.ndarray, start: np.ndarray, knees: np.ndarray 
 
 @numba.njit(**PLAIN)
 def _huber(rows: np.ndarray, z: np.ndarray, c: np.ndarray, knee: float) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return the sum of Huber's function over its knee, its negative gradient (p,), and the lower half of the inner
-    normal matrix."""
+    """Return the sum of Huber's function over its knee, its negative gradient (p,), and the inner normal matrix's lower
+    half."""
     terms = len(c)
     value, pull, inside = 0.0, np.zeros(terms), np.zeros((terms, terms))
     for i in range(len(z)):
@@ -249,8 +246,8 @@ def _huber(rows: np.ndarray, z: np.ndarray, c: np.ndarray, knee: float) -> tuple
 def _smoothed_descent(
     rows: np.ndarray, z: np.ndarray, far_pull: np.ndarray, start: np.ndarray, knee: float, enough: float
 ) -> np.ndarray:
-    """Minimise sum huber(r, knee) - c' far_pull by Newton steps or, where one fails, a majorising step, which always
-    descends."""
+    """Minimise sum huber(r, knee) - c' far_pull by Newton steps or, if they fail, majorising steps, which always
+    descend."""
 
     def state(c: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
         value, pull, inside = _huber(rows, z, c, knee)

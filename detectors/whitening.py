@@ -23,8 +23,7 @@ DENT_RADII_PX = (5.0, 6.5, 8.0, 10.0, 12.0, 14.5, 17.5)
 SLOT_PX, SLOTS_DEG = (20.0, 2.0), tuple(22.5 * k for k in range(8))
 """Length and width of slots, and their angles to the rows."""
 WINDOWS_PX = (1, 3, 5)
-"""Sides of the square over which cameras average: 3 for a Kinect v2, 5 for an Azure Kinect, 1 if only the lens
-blurs."""
+"""Sides of the square over which cameras average: 3 for a Kinect v2, 5 for an Azure Kinect, 1: only the lens blurs."""
 LENS_BLUR_PX = 0.6
 LONGEST_LAG_PX = 28
 """Lag at which Parzen's window fades the covariance to 0."""
@@ -42,7 +41,7 @@ CONVERGED, MOST_ITERATIONS, FADED = 0.01, 40, 0.1
 
 
 def grid_of(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the grid on which a picture of this shape is transformed. It holds every template, and half of it is
+    """Return the grid on which a picture of this shape is transformed; it holds every template, and its half is
     even."""
     quarters = (math.ceil((max(side, GRID) + LONGEST_LAG_PX) / 4) for side in shape)
     return tuple(4 * scipy.fft.next_fast_len(quarter, real=True) for quarter in quarters)
@@ -242,8 +241,7 @@ def _drawn(shape: tuple[int, ...], window_px: int) -> list[np.ndarray]:
 
 @lru_cache(maxsize=3)
 def _sizes(window_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the magnitudes (t, r, c) of the spectra on `GRID`; those of coarse templates, which come last,
-    separately."""
+    """Return the magnitudes (t, r, c) of the spectra on `GRID`; coarse templates, the last ones, separately."""
     sizes = list(map(np.abs, _drawn((GRID, GRID), window_px)))
     fine = sum(not template.coarse for template in bank(window_px))
     return np.stack(sizes[:fine]), np.stack(sizes[fine:])
@@ -251,8 +249,7 @@ def _sizes(window_px: int) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=3)
 def bank(window_px: int) -> tuple[Template, ...]:
-    """Return the templates as seen through a window of `WINDOWS_PX`: discs, paraboloids and slots; coarse templates are
-    last."""
+    """Return the templates as seen through a window of `WINDOWS_PX`: discs, paraboloids and slots; coarse ones last."""
 
     def disc(radius_px: float, off: tuple[float, float] = (0.0, 0.0)) -> Template:
         def inside(x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -11,8 +11,8 @@ p_j| / length)^exponent)), a variogram with nugget and sill (Matheron 1963; Cres
 because at damage views see different parts of it. Views that look through the same pixels share f.
 
 Not modelled: errors that all views share in all pixels, or registrations to one reference; a pattern that is not the
-same all over the sensor; changes of the blur. Where views are no farther apart than the pattern is long, its sill is an
-extrapolation."""
+same all over the sensor; changes of the blur. If views are no farther apart than the pattern's length, its sill is
+extrapolated."""
 
 from __future__ import annotations
 

@@ -71,8 +71,7 @@ def integrate(views: Sequence[ChosenView], voxel_m: float | None) -> tuple[Cloud
 
 
 def _undistorted(view: ChosenView) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-    """Return depth (h, w, 1) float32, 0 if there is none, on a pinhole's grid; colour (h, w, 3) 0..1 if any; camera
-    matrix."""
+    """Return depth (h, w, 1) float32, 0 if none, on a pinhole's grid; colour (h, w, 3) 0..1 if any; camera matrix."""
     cloud, inside = view.cloud, view.inside
     with np.errstate(invalid="ignore"):
         slopes = cloud.points_m[..., :2] / cloud.points_m[..., 2:]

@@ -1,5 +1,4 @@
-"""Captures in files of arrays: which array holds the distances, and the meaning of its axes; also height maps and bare
-numbers.
+"""Reads captures from files of arrays, finding the distances and the meaning of their axes; height maps; bare numbers.
 
 The libraries that read them run within `files.limited_memory`. Arrays of objects, which would need pickle, are refused.
 A height map's pixels lie a stated pitch apart, and it is a cloud in parallel projection: x and y count from its middle,

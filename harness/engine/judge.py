@@ -34,8 +34,7 @@ PIXEL_OCTAVES = (-6, 4)  # further thresholds for pixels: a third of the undamag
 class JudgedCloud:
     """The result of one detector on one cloud. ``run``: its row. ``holes``: a row per damage. ``places_m`` (m, 2): of
     the detections on the face. ``pairs``: index into ``known.truth`` -> index into ``detections``; on a hole-free
-    board, at the places of left-out damage. ``overlap``: the rule by which detections were matched beside the hit
-    radius."""
+    board, at the places of left-out damage. ``overlap``: the rule of matching beside the hit radius."""
 
     run: dict[str, Any]
     holes: list[dict[str, Any]]
@@ -166,8 +165,7 @@ def detector_of(name: str, settings_json: str, learned: str | None = None) -> De
 def detector_for(
     known: KnownCloud, name: str, settings_json: str, *, hole_free: bool, learned: str | None = None
 ) -> Detector:
-    """Return the detector for a cloud. A built-in detector that asks for the truth receives it; a plug-in never
-    does."""
+    """Return the detector for a cloud. A built-in detector that needs the truth gets it; no plug-in does."""
     detector = detector_of(name, settings_json, learned)
     if not (isinstance(detector, NeedsTruth) and DETECTORS.offer(name).built_in):
         return detector

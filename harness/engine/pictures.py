@@ -97,8 +97,7 @@ def _outline_px(set_up: SetUp, damage: Damage) -> np.ndarray:
 
 
 def _map_examples(group: Group, thresholds: Mapping[str, float]) -> list[MappedExample]:
-    """Return maps of the fewest views and of all, one for each merge, with the most frames and the last
-    registration."""
+    """Return maps of the fewest and of all views, one per merge, with the most frames and the last registration."""
     batch = group.damaged
     points = [point for point in group.points if point.digest in thresholds and point.config.mapping is not None]
     several = [point for point in points if (_mapping(point).views or len(batch.renders)) > 1]

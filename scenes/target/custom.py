@@ -97,8 +97,8 @@ class PanelConfig(Config):
 class RoughConfig(Config):
     """A face with random roughness, such as concrete, and a flat back. Heights are Gaussian. Their power spectrum in
     two dimensions is (k^2 + k_outer^2)^-(1 + H) with k_outer = 2 pi / ``outer_mm``, and ends at 2 pi / ``inner_mm``;
-    between both, the surface is self-affine (Persson et al., J. Phys.: Condens. Matter 17 (2005) R1). Pores and gravel
-    are not modelled."""
+    between both, the surface is self-affine (Persson et al., J. Phys.: Condens. Matter 17 (2005) R1). Not modelled:
+    pores, gravel."""
 
     kind: Literal["rough"]
     deviation_mm: Annotated[float, Field(gt=0.0, le=20.0)] = Field(0.3, description="standard deviation of the heights")
@@ -143,8 +143,7 @@ ShapeConfig = Annotated[
 
 
 class BoardConfig(Config):
-    """A board. Its outline, seen along z, is a rectangle; its thickness, along the face's normal, is the same
-    everywhere."""
+    """A board. Its outline, seen along z, is a rectangle; its thickness along the face's normal is constant."""
 
     width_mm: Annotated[float, Field(ge=5.0, le=5e3)]
     height_mm: Annotated[float, Field(ge=5.0, le=5e3)]

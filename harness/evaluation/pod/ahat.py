@@ -179,8 +179,7 @@ def _axis(name: str, values: np.ndarray, log: bool) -> np.ndarray:
 
 class CensoredFit(NamedTuple):
     """``coefficients`` (p,). ``tau``: scatter, by maximum likelihood without a correction for degrees of freedom.
-    ``covariance`` (p + 1, p + 1): inverse observed information of (coefficients, tau). ``log_likelihood``: of the
-    rows."""
+    ``covariance`` (p + 1, p + 1): inverse observed information of (coefficients, tau). ``log_likelihood``."""
 
     coefficients: np.ndarray
     tau: float
@@ -191,8 +190,8 @@ class CensoredFit(NamedTuple):
 def fit_censored(design: np.ndarray, y: np.ndarray, below: np.ndarray, above: np.ndarray) -> CensoredFit:
     """Fit y = design @ coefficients + tau * normal by maximum likelihood (Tobin 1958). ``design`` (n, p). ``y`` (n,):
     the value, or the limit if ``below`` or ``above`` (n,) says that the value lies beyond it. Solved in Olsen's 1978
-    parameters (coefficients / tau, 1 / tau), for which the log-likelihood is concave. Raises UserError without a line
-    or scatter."""
+    parameters (coefficients / tau, 1 / tau), which make the log-likelihood concave. Raises UserError without a line or
+    scatter."""
     exact = ~(below | above)
     p = design.shape[1]
     if exact.sum() <= p or np.linalg.matrix_rank(design[exact]) < p:

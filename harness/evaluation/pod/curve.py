@@ -67,8 +67,7 @@ def slopes_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.nda
 
 @dataclass(frozen=True)
 class PodCurve:
-    """``mu`` and ``sigma``: in the unit of x (size, or ln size if ``log_size``). ``covariance`` (2, 2): of these
-    two."""
+    """``mu`` and ``sigma``: in the unit of x (size, or ln size if ``log_size``). ``covariance``: (2, 2)."""
 
     link: str
     log_size: bool
@@ -89,8 +88,7 @@ class PodCurve:
 
 @dataclass(frozen=True)
 class Bound:
-    """An upper confidence bound on a size, such as a90/95. Without a bound, it is infinite and ``why`` gives the
-    reason."""
+    """An upper confidence bound on a size, such as a90/95; infinite if there is none, and ``why`` gives the reason."""
 
     pod: float
     confidence: float
@@ -211,8 +209,7 @@ def maxima(data: HitsAndMisses, start: np.ndarray, tolerance: float = TOLERANCE)
     """Return the coefficients (d, p) with the largest likelihood of several studies, from ``start`` (p,); without a
     penalty. If hits and misses of a study do not overlap, its coefficients are those of the last step. Plain Newton
     steps need no values and nearly always reach the maximum. The other studies are searched again, and so are those
-    that end lower than they began: far out, where probabilities are rounded to 0 or 1, steps can be small without a
-    maximum."""
+    that end lower than they began: where probabilities are rounded to 0 or 1, steps can be small without a maximum."""
     place = np.tile(np.asarray(start, float), (len(data.hits), 1))
     moving = np.arange(len(place))
     for _ in range(PLAIN_STEPS):
@@ -233,7 +230,7 @@ def penalised_maxima(data: HitsAndMisses, tolerance: float = TOLERANCE) -> np.nd
     """Return the intercepts and slopes (d, 2) with the largest penalised likelihood of several studies; they are finite
     for separated data too. Logit and probit have one maximum. For cloglog and loglog, the highest of those is returned
     that are reached from a flat start, from the gap between largest miss and smallest hit, and from the best `CLIMBED`
-    other starts."""
+    others."""
     z, hits = data.z, data.hits
     below = np.where(data.misses > 0, z, -np.inf).max(axis=1)
     gap = np.where(hits > 0, z, np.inf).min(axis=1) - below
@@ -256,8 +253,7 @@ def penalised_maxima(data: HitsAndMisses, tolerance: float = TOLERANCE) -> np.nd
 
 def profile(data: HitsAndMisses, z0: float, level: float, slope: float = 1.0) -> tuple[float, float]:
     """Return the largest (penalised) log-likelihood of one study's rising curves (slope >= 0) whose predictor is
-    ``level`` at ``z0``, and the slope there. ``slope``: start of the search, such as the slope at a neighbouring
-    ``z0``."""
+    ``level`` at ``z0``, and the slope there. ``slope``: start of the search, such as that of a neighbour."""
     if data.penalty is not None:  # concavity is not proved, so the search begins with a grid
 
         def rising(s: np.ndarray) -> np.ndarray:

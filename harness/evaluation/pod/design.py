@@ -1,5 +1,4 @@
-"""Plans hit/miss studies: it simulates studies from a guess of the POD curve and analyses them as real ones would
-be."""
+"""Plans hit/miss studies: it simulates them from a guess of the POD curve and analyses them like real ones."""
 
 from __future__ import annotations
 
@@ -75,8 +74,7 @@ def design(
 
 def recommend(plans: Sequence[StudyPlan], goal: float | None = None) -> tuple[StudyPlan, bool | None]:
     """Return the plan with the fewest targets, at least `LEAST_TARGETS` if any plan has them, in which 90 % of the
-    studies demonstrate ``goal`` (None: no goal), and whether there is one; otherwise return the plan with the most
-    targets."""
+    studies demonstrate ``goal`` (None: no goal), and True; else the plan with the most targets, and False."""
     most = max(plan.targets for plan in plans)
     # below the handbook's minimum, the largest number of targets is nearest to it
     allowed = sorted((plan for plan in plans if plan.targets >= min(LEAST_TARGETS, most)), key=lambda one: one.targets)

@@ -49,8 +49,8 @@ STEEPEST = 1e3
 """Largest slope in standardised sizes: a curve that rises within a thousandth of the sizes' spread is a step."""
 NEAR_DEVIANCE = 2.0
 """Largest excess over the least deviance, with one inspection per target, of a model that is hardly worse than the
-best. All models have equally many parameters, so it is a difference of 2 in Akaike's criterion (Burnham and Anderson
-2002, section 2.6)."""
+best. All models have equally many parameters: it is a difference of 2 in AIC (Burnham and Anderson 2002, section
+2.6)."""
 STARTS = 10
 """Points of a coarse grid from which the search for the maximum with floor or ceiling starts."""
 
@@ -59,8 +59,7 @@ STARTS = 10
 class HitMissFit:
     """A fitted curve, POD = F(b0 + b1 x) with x = size or ln size, and its basis. ``covariance`` (2, 2): of b0 and b1,
     multiplied by ``repeats`` = n / targets. Deviances count every row, without the penalty of ``method`` "Firth".
-    ``place`` (2,): intercept and slope in z = (x - centre) / spread. ``data``: defines the likelihood that was
-    maximised."""
+    ``place`` (2,): intercept and slope in z = (x - centre) / spread. ``data``: defines the likelihood."""
 
     curve: PodCurve
     b0: float
@@ -107,8 +106,7 @@ def fit_hit_miss(
 ) -> HitMissFit:
     """Fit the POD curve of hits (0/1, (n,)) at sizes ((n,), any unit); ``inspections`` (n,): the target of each row. If
     hits and misses do not overlap, the likelihood has no maximum: Firth's penalised likelihood is used, with a note.
-    Raises `UserError` for values that cannot be fitted and for a probability of detection that does not grow with
-    size."""
+    Raises `UserError` for values that cannot be fitted and for a POD that does not grow with size."""
     x, hits = _checked(size, hit, link, log_size)
     n, rows_each = len(x), rows_of_target(x, inspections)
     targets = round(float((1 / rows_each).sum()))
@@ -171,8 +169,8 @@ def near_models(fits: Sequence[HitMissFit]) -> tuple[HitMissFit, ...]:
 def floor_ceiling_tests(fit: HitMissFit) -> tuple[FloorCeilingTest, ...]:
     """Test three or four parameters against the two of ``fit`` by the likelihood ratio. A floor of 0 and a ceiling of 1
     lie on the boundary: the distribution is 1/2 chi2(0) + 1/2 chi2(1) for either, and 1/4, 1/2, 1/4 of chi2(0),
-    chi2(1), chi2(2) for both (Self and Liang, JASA 82 (1987), 605, cases 5 and 7, without their correlation). No test
-    of separated data."""
+    chi2(1), chi2(2) for both (Self and Liang, JASA 82 (1987), 605, cases 5 and 7, without their correlation). None for
+    separated data."""
     tests, sides = [], (("floor", (0.0, 0.5), (1.0, 1.0)), ("ceiling", (0.0, 0.0), (0.5, 1.0)))
     cases: tuple[tuple[Any, ...], ...] = (*sides, ("both", (0.0, 0.5), (0.5, 1.0)))
     for beyond, floor, ceiling in cases if fit.method == "ML" else ():
@@ -197,8 +195,7 @@ def value_and_gradient(data: HitsAndMisses, place: np.ndarray) -> tuple[float, n
 
 
 def _of_shares(data: HitsAndMisses, share: np.ndarray, miss: np.ndarray, floor: float, ceiling: float) -> np.ndarray:
-    """Return the log-likelihoods (m,) of curves with a floor and a ceiling, from their shares (m, n) of hits and
-    misses."""
+    """Return the log-likelihoods (m,) of curves with floor and ceiling, from their shares (m, n) of hits and misses."""
     p_hit = np.maximum(floor + (ceiling - floor) * share, 1e-300)
     p_miss = np.maximum((1.0 - ceiling) + (ceiling - floor) * miss, 1e-300)
     return np.asarray(np.log(p_hit) @ data.hits + np.log(p_miss) @ data.misses)
@@ -207,8 +204,7 @@ def _of_shares(data: HitsAndMisses, share: np.ndarray, miss: np.ndarray, floor: 
 def _search(
     data: HitsAndMisses, plain: np.ndarray, floor: tuple[float, float], ceiling: tuple[float, float]
 ) -> tuple[np.ndarray, float]:
-    """Return the likeliest curve (4,) with floor and ceiling in these ranges, found from the best points of a coarse
-    grid."""
+    """Return the likeliest curve (4,) with floor and ceiling in these ranges, from the best points of a coarse grid."""
     floors = sorted({float(np.clip(f, *floor)) for f in (0.02, 0.1, 0.25)})
     ceilings = sorted({float(np.clip(c, *ceiling)) for c in (0.75, 0.9, 0.98)})
     middles = np.append(np.quantile(data.z, np.linspace(0.04, 0.96, 16)), -plain[0] / plain[1])
@@ -294,8 +290,7 @@ def bound(fit: HitMissFit, pod: float = 0.9, confidence: float = 0.95, *, design
 
 
 def band(fit: HitMissFit, sizes: np.ndarray, confidence: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
-    """Return lower and upper POD at ``sizes`` (n,), each one-sided as in `bound`: the lower one crosses 90 % at
-    a90/95."""
+    """Return lower and upper POD at ``sizes`` (n,), each one-sided as in `bound`: the lower crosses 90 % at a90/95."""
     x = np.log(np.maximum(sizes, np.finfo(float).tiny)) if fit.curve.log_size else np.asarray(sizes, float)
     outline = _outline(fit, criterion(confidence) * fit.repeats)
     predictors = outline[:, :1] + outline[:, 1:] * (x - fit.centre) / fit.spread
@@ -304,8 +299,7 @@ def band(fit: HitMissFit, sizes: np.ndarray, confidence: float = 0.95) -> tuple[
 
 
 def largest_bound(fits: Sequence[HitMissFit], design_effects: Sequence[float] = ()) -> Bound:
-    """Return the largest a90/95 of several models; infinite if any of them has none. ``design_effects``: one per
-    model."""
+    """Return the largest a90/95 of several models; infinite if any of them has none. ``design_effects``: by model."""
     effects = design_effects or [1.0] * len(fits)
     bounds = (bound(fit, design_effect=of) for fit, of in zip(fits, effects, strict=True))
     return max(bounds, key=lambda one: one.value)
@@ -345,8 +339,7 @@ def _likelihood_bound(fit: HitMissFit, pod: float, allowed: float) -> tuple[floa
 
 
 def _outline(fit: HitMissFit, allowed: float) -> np.ndarray:
-    """Return points (n, 2) of b0 and b1, in standardised sizes, on the outline of 2 (llmax - ll) <= ``allowed`` with b1
-    >= 0."""
+    """Return (b0, b1) (n, 2), in standardised sizes, on the outline of 2 (llmax - ll) <= ``allowed`` with b1 >= 0."""
     data, best = fit.data, fit.place
     scale = np.array([[1.0, fit.centre], [0.0, fit.spread]])
     metric = scale @ (fit.covariance / fit.repeats) @ scale.T

@@ -103,8 +103,7 @@ def read_inspections(
 
 
 def texts_of(read: Inspections, column: str) -> np.ndarray:
-    """Return the text (n,) of another column in the rows that were read. Raises UserError if there is no such
-    column."""
+    """Return the text (n,) of another column in the rows that were read. Raises UserError if there is none."""
     (_, header), *rows = _rows(read.path, read.size_column)
     header = [name.strip() for name in header]
     at, row_of = _column(read.path, header, column, (column,)), dict(rows)
@@ -204,8 +203,8 @@ def _thousands(path: Path, name: str, texts: list[str]) -> tuple[set[str], str]:
 
 
 def _rows(path: Path, column: str) -> Rows:
-    """Return (line, fields) of every row that is not blank. The header comes first: the first row with the ``column``,
-    so that titles may precede it."""
+    """Return (line, fields) of every row that is not blank. The header is the first row with ``column``: titles may
+    precede it."""
     try:
         content = bounded_bytes(path, TABLE_BYTES)
     except OSError as error:
@@ -219,8 +218,8 @@ def _rows(path: Path, column: str) -> Rows:
 
 
 def _text_rows(path: Path, content: bytes, column: str) -> Rows:
-    """Return the rows of a CSV file in UTF-8, UTF-16 or Latin-1. Its separator is stated by ``sep=`` or chosen to fit
-    the header."""
+    """Return the rows of a CSV file in UTF-8, UTF-16 or Latin-1. The separator is that of ``sep=``, or fits the
+    header."""
     try:
         text = content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
     except UnicodeDecodeError:

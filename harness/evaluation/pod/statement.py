@@ -1,5 +1,4 @@
-"""The statement on one set of inspections, from hits and misses or from signals: the curve, its bounds, and their
-basis."""
+"""The statement on one set of inspections, from hits and misses or from signals: curve, bounds, and their basis."""
 
 from __future__ import annotations
 
@@ -110,8 +109,7 @@ class PodStatement:
 
     @property
     def doubts(self) -> list[str]:
-        """Return warnings: near models whose a90/95 differ by more than `APART`; data that suggest a floor or
-        ceiling."""
+        """Return warnings: near models with a90/95 more than `APART` apart; data that suggest a floor or ceiling."""
         doubts = [note for note in self.notes if note.endswith(DOUBTED)]
         most = min(row.deviance for row in self.models) + NEAR_DEVIANCE * len(self.read.size) / self.read.targets
         limits = [row.bound.value for row in self.models if row.deviance <= most]
@@ -240,8 +238,7 @@ def _models(tried: Sequence[tuple[Any, Bound]], near: Sequence[Any]) -> tuple[Mo
 def false_positives(read: Inspections, fit: AhatFit | None = None) -> dict[str, float]:
     """Return the probability of a false positive at unflawed sites, by name; empty if there are no sites. It is the
     share of calls with its upper bound (Clopper and Pearson); for signals, also by the normal distribution that fits
-    the noise best on the fit's axis, with signals at or below the left limit censored (MIL-HDBK-1823A, 4.5.4 and
-    G.3.4)."""
+    the noise best on the fit's axis, with signals up to the left limit censored (MIL-HDBK-1823A, 4.5.4 and G.3.4)."""
     sites = read.unflawed
     if not sites.size:
         return {}
