@@ -13,7 +13,7 @@ from harness.vocabulary.config import Config
 
 
 class GridMerge(Config):
-    """The thesis' merge (MATLAB's pcmerge): the mean of all points in each cube of a grid, first view's frame."""
+    """The thesis' merge (MATLAB's pcmerge): the mean of all points in each cube of a grid in the first view's frame."""
 
     kind: Literal["grid"] = "grid"
     step_mm: float = Field(default=0.1, gt=0, le=50, description="side of a cube")
