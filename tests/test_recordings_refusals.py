@@ -120,9 +120,9 @@ def test_clouds_of_different_sizes_are_named(tmp_path: Path) -> None:
 def test_frames_without_one_valid_pixel_are_refused(tmp_path: Path) -> None:
     png(tmp_path / "1.png", STORED * 0)
     png(tmp_path / "2.png", STORED * 0)
-    assert "not one valid pixel in 2 frames" in refusal(tmp_path, lens=plane.LENS)
+    assert "no valid pixel in 2 frames" in refusal(tmp_path, lens=plane.LENS)
     np.save(tmp_path / "nan.npy", np.full((72, 96), np.nan))
-    assert "not one valid pixel in 1 frame" in refusal(tmp_path / "nan.npy", lens=plane.LENS)
+    assert "no valid pixel in 1 frame" in refusal(tmp_path / "nan.npy", lens=plane.LENS)
 
 
 def test_one_empty_frame_among_good_ones_is_no_error(tmp_path: Path) -> None:

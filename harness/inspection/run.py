@@ -1,4 +1,4 @@
-"""`harness.detect` step by step: one capture, or several views that become one cloud, judged and reported alike."""
+"""The steps of `harness.detect`: one capture, or several views merged into one cloud, judged and reported alike."""
 
 from __future__ import annotations
 
@@ -44,13 +44,15 @@ if TYPE_CHECKING:
     from detectors.recordings import Recording
     from detectors.registration.registered import Registration
 
-DEFAULT_K = 5.0  # Robust standard deviations, where the capture cannot tell; 0.6 of a million normal pixels lie beyond
-FAINT_CALLS = 0.05  # Expected false calls as strong as a finding, from which on noise explains the finding
+DEFAULT_K = (
+    5.0  # robust standard deviations, if the capture sets no threshold; 0.6 of a million normal pixels lie beyond
+)
+FAINT_CALLS = 0.05  # noise explains a finding if at least so many false calls as strong are expected
 THRESHOLDS = ("threshold", "quiet_capture", "false_calls")  # arguments of which each sets the threshold
 
 
 def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: float) -> Judged:
-    """Find damage beyond a threshold and missing returns, each damage and each object once, and measure them."""
+    """Find damage above a threshold and missing returns, each damage and each object once, and measure them."""
     missing = missing_returns(cloud, evidence)
     unseen = () if missing is None else missing.detections
     searched = detector.find(cloud, evidence, threshold)
@@ -65,14 +67,14 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
 
 
 def analysed(detector: Detector, cloud: Cloud) -> Evidence:
-    """Return the detector's evidence, with a warning where it fitted a stated surface that does not fit."""
+    """Return the detector's evidence, with a warning if it fitted a stated surface that does not fit."""
     evidence = detector.analyse(cloud)
     doubt = "" if "misfit_share" in evidence.notes else misfit(cloud, evidence.residual_m, "the stated surface")
     return replace(evidence, warnings=(*evidence.warnings, doubt)) if doubt else evidence
 
 
 OPEN_MM, FILTER_PX = 75.0, 3.0
-"""Depth beyond which a hole shows what lies far behind it, and the least width of a filter that hides its rim."""
+"""Depth beyond which a hole shows objects far behind it; least width of a filter that hides its rim."""
 
 
 def refuse_thresholds(arguments: argparse.Namespace) -> None:
@@ -92,9 +94,9 @@ def threshold_of(
     evidence: Evidence,
     quiet: Callable[[], tuple[float, str]],
 ) -> tuple[float, str, Evidence]:
-    """Return the threshold, its origin, and the evidence to search with it: given, calibrated on a quiet capture
-    (``quiet`` does it), the detector's own, or by the peaks of the capture towards the camera, which may leave out a
-    rim that cannot be judged; where these cannot be trusted, a fallback with warnings."""
+    """Return the threshold, its origin, and the evidence to search with it. The threshold is given, calibrated on a
+    quiet capture (by ``quiet``), the detector's own, or from the capture's peaks towards the camera, which may leave
+    out a rim that cannot be judged; if these cannot be trusted, it is a fallback with warnings."""
     if arguments.threshold is not None:
         return arguments.threshold, "given", evidence
     if arguments.quiet_capture is not None:
@@ -110,7 +112,7 @@ def threshold_of(
     if own.objects:
         peaks += f"; expect more beside objects, tags and edges in the picture ({own.objects} places)"
     if not cloud.organised:
-        peaks += "; objects on the target were not looked for"
+        peaks += "; objects on the target were not sought"
     if own.rim_pixels:
         peaks += f"; {own.rim_pixels} pixels along the rim are mixed with the background and are not judged"
     if own.doubts:
@@ -124,9 +126,9 @@ def threshold_of(
 
 
 def with_faint_warning(judged: Judged, threshold: float) -> Judged:
-    """Add a warning where noise explains more of the findings than false calls are expected, in a capture that set its
-    own threshold. The logarithm of their number is taken to fall with the square of the score, as normal
-    noise's does, through the peaks above the floor and the upper 95 % bound of what is expected at the threshold."""
+    """Add a warning if noise explains more of the findings than the expected false calls, in a capture that set its own
+    threshold. The logarithm of the number of false calls is assumed to fall with the square of the score, as for normal
+    noise, through the peaks above the floor and the upper 95 % bound of the number expected at the threshold."""
     null = judged.evidence.notes.get("own_null", {"threshold": None})
     if threshold != null["threshold"] or not FAINT_CALLS < null["high"] < null["peaks"]:
         return judged
@@ -143,8 +145,8 @@ def with_faint_warning(judged: Judged, threshold: float) -> Judged:
 
 
 def with_size_warnings(judged: Judged) -> Judged:
-    """Add warnings where findings reach the rim of what is judged, as the rest of them was not seen, and where the room
-    behind shows through holes whose rim the camera's filter, as wide as the noise's reach, draws over them."""
+    """Add warnings if findings reach the rim of the judged area, because the rest of them was not seen, and if distant
+    surfaces show through holes: the camera's filter, as wide as the noise's reach, then draws them over the rim."""
     cloud = judged.cloud
     if not cloud.organised:
         return judged
@@ -170,7 +172,7 @@ START_FROM_MARKS = ("icp", "cpd")  # methods that need a start; `joint` finds it
 
 @dataclass(frozen=True)
 class Inspection:
-    """Everything that a run found. ``mapped`` None: one capture; ``registrations``: data of registrations.json."""
+    """The results of a run. ``mapped``: None for one capture. ``registrations``: data of registrations.json."""
 
     arguments: argparse.Namespace
     recordings: list[Recording]
@@ -187,7 +189,7 @@ class Inspection:
 
     @property
     def cell_m(self) -> float | None:
-        """The side of a map's cells, None if the cloud is no map."""
+        """The side of a map's cells, None if the cloud is not a map."""
         surface_map = self.mapped.merged.surface_map if self.mapped else None
         return surface_map.cell_m if surface_map else None
 
@@ -206,7 +208,7 @@ def inspect(arguments: argparse.Namespace) -> int:
     recordings = [_opened(arguments, group) for group in ([[path] for path in paths] if config else [paths])]
     quiet = [] if arguments.quiet_capture is None else [_opened(arguments, [arguments.quiet_capture])]
 
-    # a view's name is its path's last part, or the whole path where these are not distinct
+    # a view's name is the last part of its path, or the whole path if these parts are not distinct
     names = [path.resolve().name for path in paths] if config else [recordings[0].name]
     names = names if len(set(names)) == len(names) else list(map(str, paths))
     views: list[View] = []
@@ -260,7 +262,7 @@ def _averaged(arguments: argparse.Namespace, recording: Recording, field: FlatFi
 
 @contextmanager
 def _mistakes_named(view: View | None) -> Iterator[None]:
-    """Name the view, if there are several, in a UserError of one of its steps."""
+    """Name the view, if there are several, in a UserError from one of its steps."""
     try:
         yield
     except UserError as mistake:
@@ -275,8 +277,8 @@ def _merged(
     views: Sequence[View],
     choices: Sequence[Choice | None],
 ) -> tuple[Mapped, dict[str, Any]]:
-    """Find targets and marks (printed at once, as they explain later failures), register and merge; return also the
-    data of registrations.json. Raises UserError if a view has no target, or for each view that cannot be placed."""
+    """Find targets and marks (printed at once, as they explain later failures), register and merge. Also return the
+    data of registrations.json. Raises UserError if a view has no target, or for all views that cannot be placed."""
     from detectors.mapping.merge import Mapped, merge, prepare
     from detectors.registration.by_marks import register_by_marks
     from detectors.registration.register import register
@@ -308,7 +310,7 @@ def _merged(
         reasons = "\n  ".join(f"{each.view}: {each.failure.removeprefix(f'{each.view}: ')}" for each in failed)
         several = f"{len(failed)} of {len(registrations)} views" if len(failed) > 1 else "one view"
         what = f"{several} cannot be registered to {registrations[0].view} by {failed[0].method}:\n  {reasons}"
-        pose = "correct --poses where it is wrong" if has_poses else "state where they stand (--poses)"
+        pose = "correct --poses" if has_poses else "state their poses (--poses)"
         raise UserError(what, fix=f"leave such views out, {pose}, or choose another --register or --marks")
     mapped = Mapped(tuple(prepared), registrations, merge(tuple(prepared), registrations, config.merge))
     return mapped, _registration_data(mapped)
@@ -390,7 +392,7 @@ def _print(run: Inspection) -> None:
 
 
 def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
-    """Return the facts that the JSON holds beside the findings, with the origin and digests of all files read."""
+    """Return the facts in the JSON file besides the findings, with the origin and digests of all files read."""
     evidence, arguments = run.result.evidence, run.arguments
     settings: dict[str, Any] = {"average": arguments.average, "unit": arguments.unit}
     facts: dict[str, Any] = {}
@@ -399,7 +401,7 @@ def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
         facts["capture"] = output.capture_facts(run.recordings[0], run.result.cloud)
     else:
         merged, cell_mm = run.mapped.merged, None if run.cell_m is None else run.cell_m / MM
-        facts["frame"] = "of the merged cloud; registrations.json says where it stands to the first view's camera"
+        facts["frame"] = "of the merged cloud; registrations.json has its pose relative to the first view's camera"
         facts["captures"] = [
             {"view": view.view.name, **output.capture_facts(each, view.view.cloud), "target": output.choice_facts(own)}
             for each, view, own in zip(run.recordings, run.mapped.views, run.choices, strict=True)
