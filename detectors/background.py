@@ -168,8 +168,7 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
 
 
 def misfit(cloud: Cloud, residual_m: np.ndarray, surface: str) -> str:
-    """Return a sentence if a stated ``surface`` leaves structure in ``residual_m`` (h, w) that looks like damage, else
-    ""."""
+    """Return a sentence if a stated ``surface`` leaves structure like damage in ``residual_m`` (h, w), else ""."""
     mask = np.isfinite(residual_m)
     cells = _cells(cloud.points_m[mask], cloud)
     if cells is None:

@@ -298,8 +298,8 @@ class AutoCrop(_Crop):
 
     Neighbours are joined if tilt and noise explain their step in z and the surface bends by at most ``crease_deg`` over
     ``smooth_px``; then holes are filled, and ``inset_px`` is removed at the rim. A background so near that blur leaves
-    no crease counts as target (13 mm behind the face, at 0.7 m with a 5 x 5 window). Without a pixel grid, a raster is
-    used."""
+    no crease counts as target (13 mm behind the face, at 0.7 m with a 5 x 5 window). A cloud without a grid is treated
+    as a raster of its nearest points."""
 
     kind: Literal["auto"] = "auto"
     inset_px: int = Field(default=RIM_PX, ge=0, le=200)
@@ -350,8 +350,7 @@ def crop(cloud: Cloud, config: AnyCrop) -> np.ndarray:
 
 
 def choice_of(cloud: Cloud, config: AutoCrop) -> Choice:
-    """Return the automatic crop of a cloud with a valid point, and all candidates. Raises UserError without
-    ``target``."""
+    """Return the automatic crop of a cloud with a valid point, and all candidates. UserError without ``target``."""
     grid, smooth_px, inset_px, wanted = cloud, config.smooth_px, config.inset_px, config.target
     if not cloud.organised:
         grid, rows, columns, spacings = raster(cloud.points_m[cloud.valid], cloud)

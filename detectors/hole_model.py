@@ -77,8 +77,7 @@ def straight_sight(per_px_m: np.ndarray) -> np.ndarray:
 class HolePatch:
     """Residuals around one detection. ``metric_m2`` (2, 2): its quadratic form is the squared length of a pixel offset
     (du, dv). ``blur_px`` (along u, along v): sides of the rectangle over which the image is averaged. ``noise_m``:
-    standard deviation beside the hole. ``sights``: (s, 8). ``whitener`` (n, n): of the used pixels' errors, if
-    known."""
+    standard deviation beside the hole. ``sights``: (s, 8). ``whitener`` (n, n): of the used pixels' errors."""
 
     residual_m: np.ndarray
     used: np.ndarray
@@ -182,8 +181,7 @@ def _cut(  # type: ignore[no-untyped-def]
 @dataclass(frozen=True)
 class HoleFit:
     """A fitted hole: ``u_px`` and ``v_px`` in the patch. ``covariance`` (6, 6): of u, v, radius, depth, offset and
-    wall, in px and metres. ``misfit``: standard deviation of the residuals over that of noise and model error; 0 if
-    unknown."""
+    wall, in px and metres. ``misfit``: deviation of the residuals over that of noise and model error; 0 if unknown."""
 
     u_px: float
     v_px: float
@@ -235,8 +233,7 @@ def _descent(  # type: ignore[no-untyped-def]
 ):
     """Return the best hole (5,), its offset, rows (8, n) and whether the descent from ``start`` (6,) has converged. The
     first rows are derivatives of the used pixels, at flat ``places`` (n,), by (u, v, radius, depth, offset, wall); the
-    seventh is ``data`` (n,) minus the hole. A ``whitening`` (n, n) not empty multiplies them. ``weight``: the
-    prior's."""
+    seventh is ``data`` (n,) minus the hole. A ``whitening`` (n, n) that is not empty multiplies them."""
     n, q, step, damping, converged = len(data), start, np.zeros(6), 10.0 * DAMPING, False
     square = promised = np.inf
     rows, products, best, holes, sizes = np.zeros((8, n)), np.zeros((7, 7)), np.zeros(5), np.zeros((6, 5)), np.zeros(5)

@@ -357,8 +357,7 @@ def _keep_stronger(  # type: ignore[no-untyped-def]
 ):
     """Keep the larger of each pixel's scores (r, c) by size, and that template's ``number``. Scores are scaled to
     deviations of their ``zone`` (r, c) by the factors ``per_deviation`` (z,), and raised: their squares grow by
-    ``raised``, in proportion below `FAINT`. Scores of a template between pixels, ``down`` or ``right``, belong to all
-    around."""
+    ``raised``, in proportion below `FAINT`. Scores between pixels, ``down`` or ``right``, belong to all around."""
     faint = per_deviation * np.float32(np.sqrt(1.0 + raised / FAINT**2))
     height, width = score.shape
     for y in range(down + 1):

@@ -80,8 +80,8 @@ def blur_in_cells(cloud: Cloud, config: HoleModelConfig) -> tuple[float, float]:
 
 def extents(points_m: np.ndarray) -> tuple[float, np.ndarray]:
     """Return the thesis' size and centre (3,) of a cluster (n, 3), metres. The size is the mean of the distances
-    between the two extreme points in x and between those in y; the centre is the mean of these four. The first of
-    equals counts."""
+    between the two extreme points in x and between those in y; the centre is the mean of these four. Of equals, the
+    first counts."""
     west, east, north, south = points_m[_extremes(points_m, np.zeros(len(points_m), np.int64), 1)[0]]
     diameter = 0.5 * float(np.linalg.norm(east - west) + np.linalg.norm(south - north))
     return diameter, (west + east + north + south) / 4.0

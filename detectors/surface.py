@@ -223,7 +223,7 @@ def _lar(basis: np.ndarray, z: np.ndarray, start: np.ndarray, knees: np.ndarray 
 
 @numba.njit(**PLAIN)
 def _huber(rows: np.ndarray, z: np.ndarray, c: np.ndarray, knee: float) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return the sum of Huber's function over its knee, its negative gradient (p,), and the inner normal matrix's lower
+    """Return the sum of Huber's function over its knee, its negative gradient (p,), the inner normal matrix's lower
     half."""
     terms = len(c)
     value, pull, inside = 0.0, np.zeros(terms), np.zeros((terms, terms))
@@ -246,8 +246,7 @@ def _huber(rows: np.ndarray, z: np.ndarray, c: np.ndarray, knee: float) -> tuple
 def _smoothed_descent(
     rows: np.ndarray, z: np.ndarray, far_pull: np.ndarray, start: np.ndarray, knee: float, enough: float
 ) -> np.ndarray:
-    """Minimise sum huber(r, knee) - c' far_pull by Newton steps or, if they fail, majorising steps, which always
-    descend."""
+    """Minimise sum huber(r, knee) - c' far_pull by Newton steps, or by majorising steps, which always descend."""
 
     def state(c: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
         value, pull, inside = _huber(rows, z, c, knee)

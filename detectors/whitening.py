@@ -41,8 +41,7 @@ CONVERGED, MOST_ITERATIONS, FADED = 0.01, 40, 0.1
 
 
 def grid_of(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the grid on which a picture of this shape is transformed; it holds every template, and its half is
-    even."""
+    """Return the grid for transforms of pictures of this shape; it holds every template, and its half is even."""
     quarters = (math.ceil((max(side, GRID) + LONGEST_LAG_PX) / 4) for side in shape)
     return tuple(4 * scipy.fft.next_fast_len(quarter, real=True) for quarter in quarters)
 

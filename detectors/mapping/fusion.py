@@ -180,8 +180,8 @@ def fuse(
 ) -> tuple[Cloud, np.ndarray, SurfaceMap, tuple[str, ...]]:
     """Return the map as an organised cloud, its frame in the first view's (4, 4), further results, and notes. The
     cloud's ``variance_m2`` over ``count`` is the temporal part of the variance, ``mean_variance_m2`` the whole with
-    rounding (None for one view, which cannot know it). Raises UserError if the points do not determine a surface or the
-    map would have too many cells."""
+    rounding (None for a single view, which cannot know it). Raises UserError if the points do not determine a surface
+    or the map would have too many cells."""
     T_reference_map = placing.T_reference_map_of(views[0])
     surface = placing.common_surface(views, T_reference_map)
     placed = [placing.place(view, T_reference_map, surface) for view in views]

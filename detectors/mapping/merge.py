@@ -88,8 +88,7 @@ def _undistorted(view: ChosenView) -> tuple[np.ndarray, np.ndarray | None, np.nd
 
 
 def _crossings(views: Sequence[ChosenView], voxel: float) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Return places and normals (n, 3) of zero crossings in the first view's frame, and colours if all views have
-    any."""
+    """Return places and normals (n, 3) of zero crossings in the first view's frame; colours if all views have any."""
     coloured = all(view.cloud.rgb is not None for view in views)
     names, channels = ["tsdf", "weight", "color"][: 2 + coloured], [[1], [1], [3]][: 2 + coloured]
     with open3d_on_one_thread() as o3d:
@@ -158,8 +157,7 @@ class Mapped:
 
     def view_of_points(self) -> np.ndarray:
         """Return (n,) for each point of the merged cloud the index of its view in ``merged.views_used``, or `SEVERAL`.
-        A map knows its views; else the view of the nearest point counts, or several if another has one within twice
-        that."""
+        A map knows its views; else it is that of the nearest point, or several if another has one within twice that."""
         merged = self.merged
         count = merged.cloud.valid.size
         if merged.surface_map is not None:

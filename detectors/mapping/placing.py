@@ -58,7 +58,7 @@ class Raster:
 
     @property
     def concentration(self) -> np.ndarray:
-        """Return the sum of squares (h, w) of the samples' weights: the factor on the variance of independent
+        """Return the sum of squares (h, w) of the samples' weights: the factor of the variance of independent
         errors."""
         return np.asarray(self.weights.multiply(self.weights).sum(axis=1), np.float64).reshape(self.shape)
 

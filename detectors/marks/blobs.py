@@ -171,8 +171,7 @@ def _window(
     rim = grown(group, 1) & ~_eroded(group) & target
 
     def settled(mixed: bool) -> Blob | None:
-        """Return the blob, pixels weighted by their share of the group's colour if rims are mixed; None for too few
-        pixels."""
+        """Return the blob, pixels weighted by their share of the group's colour if rims are mixed; None if too few."""
         weights = group.astype(float)
         if mixed:
             near = grown(group, RIM_PX) & target & ~(others & ~group)

@@ -2,8 +2,8 @@
 
 Two marks and their normals fix a placement (Grimson and Lozano-Perez 1987, without the tree). A hypothesis is an
 ordered pair of marks of the larger set with the distance of a pair of the smaller set; further marks support it if
-their distances to both fit. More than half of the smaller set must agree. The normals face the camera in both views, so
-a mirror image is not a solution.
+their distances to both fit. More than half of the smaller set must agree. Normals face the camera, so a mirror image is
+not a solution.
 
 Kabsch's closed form (1976; Umeyama 1991 for the sign) gives the start; Gauss-Newton with the full covariances gives the
 most probable rigid transform and its covariance. Not modelled: marks that are seen twice, or moved between the views;

@@ -106,8 +106,7 @@ SENSOR_SIZES = (
 SAME_SCENE, SEVERAL = 0.05, 8
 """Largest relative difference of the median pixel between successive frames, and number of frames examined."""
 NEIGHBOURS = 0.1
-"""Largest such difference between neighbouring pixels: rows of a flat floor differ by 1 %, noise by less; a wrong
-layout by 100 %."""
+"""Largest difference between neighbours: rows of a flat floor differ by 1 %, noise by less; a wrong layout by 100 %."""
 
 
 @dataclass(frozen=True)

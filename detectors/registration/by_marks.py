@@ -12,8 +12,7 @@ mark c of each view that is one of the reference's, in the surface's frame. Nois
 sampling, with one independent value in 25 pixels; Tukey's weights exclude holes. b_v is the smooth error that all
 pixels of a view share (wiggling, multipath): a cubic, whose level and tilts are indistinguishable from those of the
 pose. The scatter of its seven other terms between views gives their common deviation (by expectation maximisation),
-which also widens the level and tilts. Not modelled: errors of a view within the plane; other surfaces; gross errors of
-marks."""
+which also widens the level and tilts. Not modelled: errors within the plane; other surfaces; gross errors of marks."""
 
 from __future__ import annotations
 

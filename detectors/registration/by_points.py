@@ -77,8 +77,7 @@ def register_by_icp(reference: PreparedView, view: PreparedView, config: IcpRegi
 
 
 def stages_m(pitch_m: float, extent_m: float) -> tuple[float, ...]:
-    """Return the largest distance of a pair in each stage: twice a guess's usual error, halved down to three
-    pitches."""
+    """Return each stage's largest distance of a pair: twice a guess's usual error, halved down to three pitches."""
     finest = FINEST_PITCHES * pitch_m
     limits = [max(2 * (GUESS_ERROR_M + GUESS_ERROR_RAD * extent_m), finest)]
     while limits[-1] > finest:
@@ -207,9 +206,9 @@ def register_by_cpd(reference: PreparedView, view: PreparedView, config: CpdRegi
 def drift_covariance(fixed_m: np.ndarray, moved_m: np.ndarray, drift: Drift, pitch_m: float) -> np.ndarray:
     """Return the covariance (6, 6) of the pose, as in `Registration`, about the fixed cloud's centroid: H^-1 S H^-1. H
     is the observed information (Louis, JRSS B 44:226, 1982); S is the scatter of the scores, summed within cubes of 5
-    pixels whose errors are common (Liang & Zeger, Biometrika 73:13, 1986). The moving cloud is assumed to have equal
-    noise. The Gaussian width is at least a pitch, below which the likelihood shows the moire of two grids. NaN if H is
-    not positive."""
+    pixels whose errors are common (Liang & Zeger, Biometrika 73:13, 1986). The moving cloud's noise is assumed equal.
+    The Gaussian width is at least a pitch, below which the likelihood shows the moire of two grids. NaN if H is not
+    positive definite."""
     centre = fixed_m.mean(axis=0)
     x = fixed_m - centre
     variance = max(drift.sigma_m, pitch_m) ** 2

@@ -128,8 +128,7 @@ THINNED_POINTS = 2000
 class Sampling:
     """One view's target, camera frame, metres. ``pitch_m``: median distance between neighbouring points along the
     coarser axis of the grid. ``noise_m``: standard deviation of a point across the surface, with the fixed pattern.
-    ``centre_m``, ``normal`` (3,): of the plane through the points, towards the camera. ``extent_m``: half the box's
-    diagonal."""
+    ``centre_m``, ``normal`` (3,): of the points' plane, towards the camera. ``extent_m``: half the box's diagonal."""
 
     pitch_m: float
     noise_m: float
@@ -170,8 +169,7 @@ def clouds_of(
     reference: PreparedView, view: PreparedView, points: Literal["marks", "target"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, tuple[str, ...], str]:
     """Return the points to register, of the fiducials or of the whole target: the reference's and the view's, each (n,
-    3) with at most `MAX_POINTS`; the guess (4, 4); a note if there is none; and why they cannot be registered, else
-    ""."""
+    3) with at most `MAX_POINTS`; the guess (4, 4); a note without one; and why they cannot be registered, else ""."""
     fixed, moving = (
         thinned(each.mark_points_m if points == "marks" else each.points_m, MAX_POINTS) for each in (reference, view)
     )

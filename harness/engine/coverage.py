@@ -45,8 +45,7 @@ Pose = tuple[float, float, float]  # Distance in metres, tilts of the part about
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """A set-up in front of a part. ``task``: with the threshold. ``found``: the signal's law. ``seen``: patches by
-    pose."""
+    """A set-up in front of a part. ``task``: has the threshold. ``found``: the signal's law. ``seen``: by pose."""
 
     point: Point
     task: PointTask

@@ -75,8 +75,7 @@ def clopper_pearson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray
 
 
 def poisson_rate(count: ArrayLike, exposure: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Return Garwood's exact interval of a Poisson rate, ``count`` in ``exposure`` (runs, areas), NaN where that is
-    0."""
+    """Return Garwood's exact interval of a Poisson rate: ``count`` in ``exposure``, NaN where that is 0."""
     k, time = np.broadcast_arrays(np.asarray(count, float), np.asarray(exposure, float))
     low = np.where(k == 0, 0.0, special.gammaincinv(k, 1 - UPPER))
     high = special.gammaincinv(k + 1, UPPER)
@@ -152,8 +151,7 @@ class FalseCallRate:
 
 
 def false_call_rate(calls: int, area_m2: float) -> FalseCallRate:
-    """Return the rate of ``calls`` false calls on ``area_m2`` of unflawed surface: a Poisson count, with exact
-    limits."""
+    """Return the rate of ``calls`` false calls on ``area_m2`` of unflawed surface, a Poisson count; exact limits."""
     if calls < 0 or not area_m2 > 0:
         raise UserError(f"{calls} false calls on {area_m2:g} m2", legal="0 calls or more, an area above 0")
     low, high = poisson_rate(calls, area_m2)

@@ -239,8 +239,8 @@ def map_cases(tables: ResultTables, summary: pd.DataFrame) -> list[MapCase]:
 class AgainstOne:
     """Several merged views compared with the first view on the same repeats. ``large``, ``small``: change of |size
     error| in mm over the holes from `LARGE_MM` and below. ``threshold``: change of the calibrated threshold in mm.
-    ``noise``: of the logarithm of the surface noise. ``lost``, ``gained``: holes that only the single view finds, only
-    the others."""
+    ``noise``: of the logarithm of the surface noise. ``lost``, ``gained``: holes found only by the single view, and
+    only by the several views."""
 
     frames: int
     sizes: SizeErrors
@@ -353,8 +353,7 @@ def per_pair(registrations: pd.DataFrame, column: str) -> pd.Series:
 
 
 def paired_ratio(first: pd.DataFrame, second: pd.DataFrame, column: str) -> tuple[float, float, float, int]:
-    """Return the geometric mean over pairs of views of second / first by `per_pair`, Student's interval, number; NaN
-    below two."""
+    """Return the geometric mean of second / first over pairs of views, Student's interval, number; NaN below two."""
     both = per_pair(first, column).to_frame("first").join(per_pair(second, column).rename("second"), how="inner")
     both = both[(both > 0).all(axis=1)]
     if len(both) < 2:

@@ -6,8 +6,7 @@ import numpy as np
 
 
 def match(truth_m: np.ndarray, found_m: np.ndarray, radius_m: float) -> dict[int, int]:
-    """Return pairs {index of truth: index of finding} of centres (n, d) and (m, d) in one frame; see
-    `closest_pairs`."""
+    """Return pairs {index of truth: index of finding} of centres (n, d), (m, d) in one frame; see `closest_pairs`."""
     return closest_pairs(np.linalg.norm(truth_m[:, None] - found_m[None], axis=-1), radius_m)
 
 

@@ -72,8 +72,8 @@ def relative_radius(cloud: ExampleCloud, hole: HoleInView) -> np.ndarray:
 
 def true_residual_mm(cloud: ExampleCloud, hole: HoleInView) -> np.ndarray:
     """Return true z minus the undamaged face's (h, w). The face is continued over the hole by a quadratic through the
-    board's pixels at 1.2 to 3 radii (at least 4 pixels wide) that lie in no other hole. All NaN if these are too few
-    for six coefficients."""
+    board's pixels at 1.2 to 3 radii (at least 4 pixels wide) that lie in no other hole. NaN everywhere if these are too
+    few for six coefficients."""
     v, u = np.indices(cloud.residual_mm.shape)
     outer = max(3 * hole.radius_px, 1.2 * hole.radius_px + 4)
     face = cloud.inside & np.isfinite(cloud.z_truth_mm) & (np.hypot(u - hole.u_px, v - hole.v_px) <= outer)

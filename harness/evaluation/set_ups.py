@@ -78,8 +78,7 @@ def ladder_of(holes: pd.DataFrame) -> Ladder:
 
 
 def found_limit_mm(summary: pd.DataFrame) -> float:
-    """Return the limit by `LIMIT_RULE` from summary rows of one set-up and frames; NaN if it misses the largest
-    hole."""
+    """Return the limit by `LIMIT_RULE` from rows of one set-up and frames; NaN if it misses the largest hole."""
     missed = summary["true_diameter_mm"][summary["status"] != "found"].max()  # NaN if there is none
     return float(summary["true_diameter_mm"][~(summary["true_diameter_mm"] <= missed)].min())
 
@@ -108,8 +107,7 @@ def compare_set_ups(
     """Return one row per finished (variant, frames), variants in the given order, with the axes' columns. ``half_*``:
     only for set-ups, and with ``half_sizes``, as they need a bootstrap. ``<measure>_*``: for each measure, of all
     single diameters of found holes against the truth. ``<measure>_place_*``: of distances from the largest hole (none
-    if several are largest). Also: noise of the averaged z on probe pixels, means over hole-free runs of
-    ``tables.noise``."""
+    if several are largest). Also: noise of averaged z on probes, means over hole-free runs of ``tables.noise``."""
     summary, halved = summary[summary["variant"].isin(variants)], set_ups_of(tables) if half_sizes else []
     groups = summary.groupby(KEYS, sort=False)
     table = pd.DataFrame([_row(tables, part, variant in halved) for (variant, _), part in groups])

@@ -239,7 +239,6 @@ def _moments(part: pd.DataFrame) -> np.ndarray:
 
 
 def _pattern_variance(mean: np.ndarray, pixels: int) -> np.ndarray:
-    """Return the variance over pixels of the mean error, minus the rest of temporal variance, from means of
-    `_moments`."""
+    """Return the variance over pixels of the mean error, minus leftover temporal variance, from means of `_moments`."""
     unbiased = (mean[..., 2] - mean[..., 1] ** 2) * (pixels / max(pixels - 1, 1))
     return np.maximum(unbiased - mean[..., 3], 0.0)

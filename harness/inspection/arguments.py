@@ -151,8 +151,7 @@ def crop_from_text(text: str, target: int | None = None) -> dict[str, Any]:
 
 
 def assign(settings: dict[str, Any], assignment: str) -> None:
-    """Put one KEY=VALUE into nested settings; the value is JSON if possible, else text. Raises UserError without
-    one."""
+    """Put one KEY=VALUE into nested settings; the value is JSON if possible, else text. UserError without one."""
     path, equals, text = assignment.partition("=")
     if not (path and equals):
         raise UserError(f"--set {assignment}: has no value", legal="KEY=VALUE, for instance surface.degree=5")

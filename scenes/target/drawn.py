@@ -104,8 +104,7 @@ RANGES["angle_deg"] = Annotated[tuple[flaws.Angle, flaws.Angle], AfterValidator(
 
 class DrawnFlaws(_Drawn):
     """A kind of damage of `scenes.target.flaws`. Each pair is a range. The size that ``size_of`` names and the depth
-    are drawn as those of holes, all other quantities uniformly and independently; a single number holds for all
-    boards."""
+    are drawn as those of holes, all other quantities uniformly and independently; a single number is not drawn."""
 
     kind: Any
 

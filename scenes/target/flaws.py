@@ -1,5 +1,4 @@
-"""Damage other than drilled holes and ball dents: slots, gouges, pressed dents and bumps, corrosion, chips,
-protrusions.
+"""Damage other than drilled holes and ball dents: slots, gouges, pressed sheets, corrosion, chips, protrusions.
 
 Each is a depth over its own frame, which touches the face at the damage's centre: s runs along the damage, t across it,
 and depth counts along the face's normal there, into the board. A kind gives its depth on a grid of (s, t) whose border

@@ -229,8 +229,7 @@ def maxima(data: HitsAndMisses, start: np.ndarray, tolerance: float = TOLERANCE)
 def penalised_maxima(data: HitsAndMisses, tolerance: float = TOLERANCE) -> np.ndarray:
     """Return the intercepts and slopes (d, 2) with the largest penalised likelihood of several studies; they are finite
     for separated data too. Logit and probit have one maximum. For cloglog and loglog, the highest of those is returned
-    that are reached from a flat start, from the gap between largest miss and smallest hit, and from the best `CLIMBED`
-    others."""
+    that are reached from a flat start, the gap between largest miss and smallest hit, and the best `CLIMBED` others."""
     z, hits = data.z, data.hits
     below = np.where(data.misses > 0, z, -np.inf).max(axis=1)
     gap = np.where(hits > 0, z, np.inf).min(axis=1) - below

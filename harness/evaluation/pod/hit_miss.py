@@ -49,8 +49,7 @@ STEEPEST = 1e3
 """Largest slope in standardised sizes: a curve that rises within a thousandth of the sizes' spread is a step."""
 NEAR_DEVIANCE = 2.0
 """Largest excess over the least deviance, with one inspection per target, of a model that is hardly worse than the
-best. All models have equally many parameters: it is a difference of 2 in AIC (Burnham and Anderson 2002, section
-2.6)."""
+best. With equally many parameters, it is a difference of 2 in AIC (Burnham and Anderson 2002, 2.6)."""
 STARTS = 10
 """Points of a coarse grid from which the search for the maximum with floor or ceiling starts."""
 
@@ -169,8 +168,8 @@ def near_models(fits: Sequence[HitMissFit]) -> tuple[HitMissFit, ...]:
 def floor_ceiling_tests(fit: HitMissFit) -> tuple[FloorCeilingTest, ...]:
     """Test three or four parameters against the two of ``fit`` by the likelihood ratio. A floor of 0 and a ceiling of 1
     lie on the boundary: the distribution is 1/2 chi2(0) + 1/2 chi2(1) for either, and 1/4, 1/2, 1/4 of chi2(0),
-    chi2(1), chi2(2) for both (Self and Liang, JASA 82 (1987), 605, cases 5 and 7, without their correlation). None for
-    separated data."""
+    chi2(1), chi2(2) for both (Self and Liang, JASA 82 (1987), 605, cases 5 and 7, without their correlation). No test
+    of separated data."""
     tests, sides = [], (("floor", (0.0, 0.5), (1.0, 1.0)), ("ceiling", (0.0, 0.0), (0.5, 1.0)))
     cases: tuple[tuple[Any, ...], ...] = (*sides, ("both", (0.0, 0.5), (0.5, 1.0)))
     for beyond, floor, ceiling in cases if fit.method == "ML" else ():

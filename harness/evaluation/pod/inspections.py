@@ -203,8 +203,7 @@ def _thousands(path: Path, name: str, texts: list[str]) -> tuple[set[str], str]:
 
 
 def _rows(path: Path, column: str) -> Rows:
-    """Return (line, fields) of every row that is not blank. The header is the first row with ``column``: titles may
-    precede it."""
+    """Return (line, fields) of every row that is not blank. The header is the first row with ``column``."""
     try:
         content = bounded_bytes(path, TABLE_BYTES)
     except OSError as error:
@@ -218,8 +217,7 @@ def _rows(path: Path, column: str) -> Rows:
 
 
 def _text_rows(path: Path, content: bytes, column: str) -> Rows:
-    """Return the rows of a CSV file in UTF-8, UTF-16 or Latin-1. The separator is that of ``sep=``, or fits the
-    header."""
+    """Return the rows of a CSV file in UTF-8, UTF-16 or Latin-1, separated as ``sep=`` says or to fit the header."""
     try:
         text = content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
     except UnicodeDecodeError:

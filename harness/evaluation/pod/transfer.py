@@ -45,8 +45,7 @@ LIMIT_AT = float(stats.norm.cdf(np.sqrt(criterion(CONFIDENCE))))
 
 @dataclass(frozen=True)
 class BoardStep:
-    """The state after a number of boards. ``a50``, ``a90``: posterior medians. ``a90_95``: of a90, quantile
-    `LIMIT_AT`."""
+    """The state after some boards. ``a50``, ``a90``: posterior medians. ``a90_95``: of a90, quantile `LIMIT_AT`."""
 
     board: str
     targets: int
@@ -72,8 +71,7 @@ class Transfer:
 
     @cached_property
     def own_covariance(self) -> np.ndarray:
-        """The covariance (2, 2) of the simulated curve's ln a50 and ln w: from that of mu, sigma by the delta
-        method."""
+        """The covariance (2, 2) of the simulated curve's ln a50 and ln w, from that of mu, sigma (delta method)."""
         curve, half = self.curve, float(link_ppf(self.curve.link, np.array(0.5)))
         middle = curve.mu + half * curve.sigma
         slopes = np.array([[1.0, half], [0.0, 1.0 / curve.sigma]])
@@ -170,8 +168,7 @@ class Transfer:
 
 
 def quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
-    """Return the interpolated value at which the cumulated weights (n,) of values (n,) reach this share of their
-    sum."""
+    """Return the interpolated value at which the cumulated weights (n,) of values (n,) reach a share of their sum."""
     order = np.argsort(values, kind="stable")
     sorted_weights = weights[order]
     below = np.cumsum(sorted_weights) - sorted_weights / 2

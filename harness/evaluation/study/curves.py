@@ -55,8 +55,7 @@ def chance_hits(
 
 
 def _shuffled(places: pd.DataFrame, runs: pd.DataFrame, findings: pd.DataFrame, radius_mm: float) -> tuple[float, int]:
-    """Return the share of places, moved to runs of other boards, that have an unmatched finding near, and their
-    number."""
+    """Return the share of places, moved to runs of other boards, with an unmatched finding near, and their number."""
     at, own = places[["true_x_mm", "true_y_mm"]].to_numpy(float), places["board"]
     judged = runs[runs["role"].isin(("damaged", "hole_free"))]
     on_own = judged.loc[judged["role"] == "damaged", "board"].map(own.value_counts()).sum()

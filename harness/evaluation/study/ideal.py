@@ -9,7 +9,7 @@ number of maxima on the pixels. A damage is found if any pixel around its place 
 
 C is stationary except for its scale: C = D R D, with the deviations D of each pixel and the autocovariance R of noise
 in deviations, pooled over boards and units and faded out by Parzen's window. Not modelled: tails that are not Gaussian,
-noise that differs within damage, information in missing returns, size and depth as unknowns (with which a bank of
+noise that differs within damage, information in missing returns, size and depth as unknowns (with them, a bank of
 templates has a higher threshold)."""
 
 from __future__ import annotations

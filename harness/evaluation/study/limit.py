@@ -84,8 +84,7 @@ def weights_in_blocks(draws: int, *rows: tuple[np.ndarray, str]) -> Iterator[tup
 
 def refitted_sizes(targets: Targets, curve: PodCurve, pods: tuple[float, ...], draws: int = DRAWS) -> np.ndarray:
     """Refit ``curve``'s link and axis to resampled boards: sizes (len(pods), draws) in mm, by Firth's likelihood if
-    hits and misses are separated. Infinite if nothing is found or POD does not grow; the smallest size if all is
-    found."""
+    hits and misses are separated. Infinite if nothing is found or POD does not grow; smallest if all is found."""
     rows = [(targets.board, "damaged")] + ([] if targets.unit is None else [(targets.unit, "units")])
     blocks = (_refitted(targets, curve, pods, np.multiply.reduce(w)) for w in weights_in_blocks(draws, *rows))
     return np.concatenate(list(blocks), axis=1)
@@ -116,8 +115,7 @@ def _refitted(targets: Targets, curve: PodCurve, pods: tuple[float, ...], weight
 
 
 def crossings(b: np.ndarray, link: str, pods: tuple[float, ...]) -> np.ndarray:
-    """Return the sizes (len(pods), draws) at which curves ``b`` (draws, 2) have these PODs; infinite if there are
-    none."""
+    """Return the sizes (len(pods), draws) at which curves ``b`` (draws, 2) have these PODs; infinite if none."""
     levels = link_ppf(link, np.array(pods))[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(b[:, 1] > 0, (levels - b[:, 0]) / b[:, 1], np.inf)

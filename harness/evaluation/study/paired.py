@@ -1,7 +1,6 @@
 """Comparison of two set-ups by hits, a90, signals and false calls. Boards are the units, because damages of one board
 share its render, its pose and its surface. The tests of hits and limits ignore that each set-up drew its own
-calibration of the threshold; those of signals and false calls do not. The first of two one-sided p-values means
-worse."""
+calibration of the threshold; those of signals and false calls do not. The first of two p-values means worse."""
 
 from __future__ import annotations
 
@@ -112,7 +111,7 @@ SAME = 1e-6
 @dataclass(frozen=True)
 class SignalChange:
     """Change of the signals of ``damages``, each divided by the least signal that is found (``found_from``: first,
-    second). ``ratio``: median, as a factor. ``error``: of its logarithm, over boards and calibrations. p: one-sided,
+    second). ``ratio``: median, as a factor. ``error``: of its logarithm, over boards, calibrations. p: one-sided,
     normal."""
 
     damages: int
@@ -181,8 +180,8 @@ def _threshold_error(record: SetUpRecord) -> float:
 class CallsChange:
     """False calls, each as (first, second): ``calls`` on ``areas_m2`` of hole-free boards, and ``calling`` of
     ``boards`` with a call in their first repeat. ``more_p``, ``fewer_p``: one-sided. ``way``: "signs", the signs of
-    boards are randomised (same frames and threshold); "calibrations", two draws of them (different frames); "both", the
-    larger p."""
+    boards are randomised (same frames and threshold); "calibrations", two draws of the calibration (different frames);
+    "both", the larger p."""
 
     calls: tuple[int, int]
     areas_m2: tuple[float, float]

@@ -300,8 +300,7 @@ class SetUpResult:
 
 @dataclass(frozen=True, eq=False)
 class StudyResult:
-    """``set_ups``: in the record's order. ``axes``: lines along swept axes. ``validity``: limits of validity.
-    ``facts``: the resolved experiment."""
+    """``set_ups``: in the record's order. ``axes``: lines along swept axes. ``facts``: the resolved experiment."""
 
     record: StudyRecord
     set_ups: tuple[SetUpResult, ...]
@@ -319,7 +318,7 @@ class StudyResult:
 def evaluate_study(
     record: StudyRecord, tables: ResultTables, facts: Mapping[str, Any], *, draws: int = DRAWS
 ) -> StudyResult:
-    """Evaluate a study. ``facts``: its resolved experiment, plain data. Deterministic. Limits without a curve say
+    """Evaluate a study. ``facts``: its resolved experiment, plain data. Deterministic. A limit without a curve says
     why."""
     set_ups = tuple(_set_up(one, tables, record.hit_radius_mm, draws) for one in record.set_ups)
     limits = tuple(one.limit for one in set_ups)

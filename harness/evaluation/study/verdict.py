@@ -40,8 +40,7 @@ Pair = tuple[SetUpRecord | None, SetUpRecord | None]
 
 @dataclass(frozen=True, eq=False)
 class ComparedSetUps:
-    """One set-up of two studies. ``*_p``: adjusted p for (worse, better), 1 without a test. ``why``: reason of
-    ``mark``."""
+    """One set-up of two studies. ``*_p``: adjusted p for (worse, better), 1 without a test. ``why``: reason."""
 
     first: SetUpLimit | None
     second: SetUpLimit | None
