@@ -143,7 +143,7 @@ class MatchedDetector(LocalDetector):
     def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
         """Return the mean covariance of the clouds' residuals by lag, in squared deviations of the local noise."""
         pictures = (self.picture(cloud) for cloud in hole_free)
-        seen = [_covariance(*_in_deviations(*one.residuals)[::2]) for one in pictures]
+        seen = [_covariance(*_in_deviations(*picture.residuals)[::2]) for picture in pictures]
         return {"covariance": np.mean(seen, axis=0)} if seen else {}
 
     def calibrated(self, learned: Mapping[str, np.ndarray]) -> MatchedDetector:

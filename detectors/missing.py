@@ -154,7 +154,7 @@ def one_damage_once(
             kept.append(hole)
         else:
             same = [other for other in same if other is not largest]
-        depth = [other for other in depth if all(other is not one for one in same)]
+        depth = [other for other in depth if all(other is not each for each in same)]
     return tuple(sorted((*depth, *kept), key=lambda each: -each.score))
 
 

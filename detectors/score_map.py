@@ -105,10 +105,10 @@ class Findings:
     @classmethod
     def of(cls, detections: Sequence[Detection]) -> Findings:
         """Convert detections to arrays."""
-        numbers = np.repeat(np.arange(len(detections)), [len(one.pixels) for one in detections])
-        pixels = np.concatenate([np.zeros(0, np.int64), *(one.pixels for one in detections)])
-        centres = np.array([one.centre_m for one in detections]).reshape(-1, 3)
-        return cls(np.array([one.score for one in detections]), pixels, numbers, centres)
+        numbers = np.repeat(np.arange(len(detections)), [len(detection.pixels) for detection in detections])
+        pixels = np.concatenate([np.zeros(0, np.int64), *(detection.pixels for detection in detections)])
+        centres = np.array([detection.centre_m for detection in detections]).reshape(-1, 3)
+        return cls(np.array([detection.score for detection in detections]), pixels, numbers, centres)
 
     @property
     def detections(self) -> tuple[Detection, ...]:

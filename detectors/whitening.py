@@ -220,7 +220,7 @@ def worths(power: np.ndarray, window_px: int) -> tuple[Worth, ...]:
             for each, (across, along) in zip(energy.tolist(), halves.tolist(), strict=True)
         ]
     most = max(crowds)
-    return tuple(one._replace(raised=math.log(most / crowd)) for one, crowd in zip(found, crowds, strict=True))
+    return tuple(worth._replace(raised=math.log(most / crowd)) for worth, crowd in zip(found, crowds, strict=True))
 
 
 @lru_cache(maxsize=6)

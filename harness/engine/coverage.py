@@ -72,21 +72,21 @@ def survey(experiment: Experiment, poses: Sequence[Pose], cache: Path, folder: P
         patches = patches_of(family.board)
         target, wholes = family.drawn("hole_free", 0), [_bare(batch) for batch in group.then]
         configs = [PoseConfig(distance_m=distance_m, tilt_x_deg=x, tilt_y_deg=y) for distance_m, x, y in poses]
-        placed = (target.model_copy(update={"pose": one}) for one in configs)
-        views = [batch_of(one, "hole_free", source, cache, 0) for one in placed]
+        placed = (target.model_copy(update={"pose": pose}) for pose in configs)
+        views = [batch_of(board, "hole_free", source, cache, 0) for board in placed]
         if lost := render_missing((job for batch in (*wholes, *views) for job in batch.renders), engine):
             raise UserError(f"a view could not be rendered: {lost[0].in_short}")
         for point in group.points:
             if point.digest not in outcome.thresholds:
-                why = next((one.in_short for one in outcome.failures), "no hole-free run ended")
+                why = next((failure.in_short for failure in outcome.failures), "no hole-free run ended")
                 raise UserError(f"{point.label or point.variant} has no threshold: {why}")
             task = point_task(point, outcome.thresholds[point.digest], group.learned.get(point.digest))
             boards = _each(_board_seen, zip(group.then, wholes, strict=True), (task, group.seed), engine)
-            some = _inspections([one for one in boards if one is not None], point, scores)
+            some = _inspections([each for each in boards if each is not None], point, scores)
             found = findable(some, outcome.thresholds[point.digest])
             blind = np.full(len(patches.areas_m2), np.inf)
             seen = _each(_part_seen, ((view,) for view in views), (task, group.seed, patches), engine)
-            seen = [Seen(blind, np.ones(len(blind)), np.ones(len(blind))) if one is None else one for one in seen]
+            seen = [Seen(blind, np.ones(len(blind)), np.ones(len(blind))) if each is None else each for each in seen]
             surveys.append(Survey(point, task, patches, found, dict(zip(poses, seen, strict=True))))
     return surveys
 
@@ -136,7 +136,7 @@ def _widened(group: Group, poses: Sequence[Pose]) -> Group:
     wide = {"tilt_deg": tilt_deg, "distance_m": (near_m + far_m) / 2, "distance_jitter_mm": jitter_mm}
     family, cache = family.model_copy(update=wide), group.then[0].renders[0].folder
     then = tuple(batch_of(family.drawn("damaged", n), "damaged", source, cache, n) for n in range(BOARDS))
-    often = [replace(one, config=one.config.model_copy(update={"repeats": LOOKS})) for one in group.points]
+    often = [replace(point, config=point.config.model_copy(update={"repeats": LOOKS})) for point in group.points]
     return replace(group, points=tuple(often), then=then)
 
 
@@ -185,9 +185,9 @@ def _unit_m(batch: Batch, point: PointTask, seed: int) -> np.ndarray:
         task = TrialTask(batch.before(repeat), seed, "hole_free", repeat, (point,), None, batch.board)
         evidence = detector_of(point.detector, point.settings_json, point.learned).analyse(cloud_of(task, point))
         known = np.isfinite(evidence.score)
-        fields.append([known, *(np.where(known, one**2, 0.0) for one in (evidence.residual_m, evidence.score))])
+        fields.append([known, *(np.where(known, image**2, 0.0) for image in (evidence.residual_m, evidence.score))])
     known, *squares = np.mean(fields, axis=0)
-    square, of_score = (ndimage.uniform_filter(one, AROUND_PX) for one in squares)
+    square, of_score = (ndimage.uniform_filter(image, AROUND_PX) for image in squares)
     judged = (known >= 0.5) & (square > 0) & (of_score > 0)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(judged, np.sqrt(square / of_score / ndimage.uniform_filter(known, NEAR_PX)), np.inf)

@@ -268,7 +268,7 @@ def judge_scans(
     )  # fmt: skip
     detector = detector_of(judging.detector, judging.settings_json)
     camera_data = camera_of(unit_config(camera, scans[0].lens)[0]).to_data()
-    set_ups, files = [], [str(path) for one in scans for path in one.recording.files]
+    set_ups, files = [], [str(path) for scan in scans for path in scan.recording.files]
     for count in frames:
         holes, runs = (of[of["frames"] == count] for of in (tables.holes, tables.runs))
         set_ups.append(

@@ -77,7 +77,7 @@ def judge(
     if threshold is None:
         return JudgedCloud(run, [], detector, evidence)
     detections = detector.find(cloud, evidence, threshold)
-    places_m = known.on_board(np.array([one.centre_m for one in detections]).reshape(-1, 3))
+    places_m = known.on_board(np.array([detection.centre_m for detection in detections]).reshape(-1, 3))
     pairs, parts = matched(known, detections, radius_m, overlap)
     of_damage = 0 if hole_free else len(pairs) + parts
     run |= {"detections": len(detections), "false_calls": len(detections) - of_damage}

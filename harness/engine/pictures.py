@@ -68,7 +68,7 @@ def _cloud_examples(group: Group, thresholds: Mapping[str, float]) -> list[Examp
         marks.append(HoleInView(str(damage.id), float(u - region.col0), float(v - region.row0), radius_px, *sizes_mm))
     examples = []
     for point in (point for found in by_variant.values() for point in (found[0], *found[1:][-1:])):
-        judged = _judged(task, point, max(one.frames for one in task.points))
+        judged = _judged(task, point, max(each.frames for each in task.points))
         example = ExampleCloud(
             frames=point.frames,
             variant=point.variant,

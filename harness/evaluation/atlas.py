@@ -113,7 +113,7 @@ def surfaces_of(limits: pd.DataFrame) -> list[LimitSurface]:
     held = {axis: column for axis, column in AXES.items() if column in rows}
     rows = rows.rename(columns={column: axis for axis, column in held.items()})
     groups = [(group, group.iloc[0]) for _, group in rows.groupby([CAMERA, "kind", DETECTOR], sort=False)]
-    return [_surface(one[CAMERA], one["kind"], one[DETECTOR], group, list(held)) for group, one in groups]
+    return [_surface(key[CAMERA], key["kind"], key[DETECTOR], group, list(held)) for group, key in groups]
 
 
 def _surface(camera: str, kind: str, detector: str, rows: pd.DataFrame, axes: Sequence[str]) -> LimitSurface:

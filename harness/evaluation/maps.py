@@ -72,7 +72,7 @@ def maps_of(tables: ResultTables) -> list[MapSetUp]:
 def compare_maps(tables: ResultTables, summary: pd.DataFrame) -> pd.DataFrame:
     """Return the rows of `compare_set_ups` for all set-ups with a map, and the fields of `MapSetUp`. Over runs on the
     damaged board: mean ``views_left_out``, median ``seconds_map``, and the noise's deviation ``surface_std_mm``."""
-    maps = pd.DataFrame([asdict(one) for one in maps_of(tables)])
+    maps = pd.DataFrame([asdict(each) for each in maps_of(tables)])
     compared = compare_set_ups(tables, summary, [str(name) for name in maps["variant"]], half_sizes=False)
     if compared.empty:
         return compared
@@ -169,12 +169,12 @@ class MapCase:
     @property
     def set_ups(self) -> list[MapSetUp]:
         """Maps of set-ups, without variations."""
-        return [one for one in self.maps if not one.is_variation]
+        return [each for each in self.maps if not each.is_variation]
 
     def variant(self, views: int, registration: str, merge: str) -> str | None:
         """Return the name of the set-up. All registrations of a single view are the same, so any of them will do."""
-        alike = [one for one in self.set_ups if (one.views, one.merge) == (views, merge)]
-        named = [one for one in alike if one.registration == registration]
+        alike = [each for each in self.set_ups if (each.views, each.merge) == (views, merge)]
+        named = [each for each in alike if each.registration == registration]
         chosen = named or (alike if views == 1 else [])
         return chosen[0].variant if chosen else None
 
@@ -199,39 +199,39 @@ class MapCase:
 
     def single(self, frames: int | None = None) -> Map | None:
         """Return the map of a single view, by the thesis' merging if that was tried."""
-        merges = [THESIS_MERGE, *(one.merge for one in self.set_ups)]
+        merges = [THESIS_MERGE, *(each.merge for each in self.set_ups)]
         singles = (self.named(1, THESIS_REGISTRATION, merge, frames) for merge in dict.fromkeys(merges))
-        return next((one for one in singles if one is not None), None)
+        return next((each for each in singles if each is not None), None)
 
-    def holes(self, one: Map) -> pd.DataFrame:
+    def holes(self, chosen: Map) -> pd.DataFrame:
         """Return the rows of one map in the table of holes."""
-        return _rows(with_columns(self.tables.holes), one)
+        return _rows(with_columns(self.tables.holes), chosen)
 
-    def runs(self, one: Map) -> pd.DataFrame:
+    def runs(self, chosen: Map) -> pd.DataFrame:
         """Return the rows of one map in the table of runs."""
-        return _rows(self.tables.runs, one)
+        return _rows(self.tables.runs, chosen)
 
-    def status(self, one: Map) -> dict[str, HoleState]:
+    def status(self, chosen: Map) -> dict[str, HoleState]:
         """Return the state of each hole."""
-        return found_holes(self.summary, one.variant, one.frames)
+        return found_holes(self.summary, chosen.variant, chosen.frames)
 
     def registrations(self, frames: int) -> pd.DataFrame:
         """Return the registrations of the set-ups with this number of frames."""
         rows = self.tables.registrations
-        return rows[(rows["frames"] == frames) & rows["variant"].isin([one.variant for one in self.set_ups])]
+        return rows[(rows["frames"] == frames) & rows["variant"].isin([each.variant for each in self.set_ups])]
 
 
-def _rows(table: pd.DataFrame, one: Map) -> pd.DataFrame:
-    return table[(table["variant"] == one.variant) & (table["frames"] == one.frames)]
+def _rows(table: pd.DataFrame, chosen: Map) -> pd.DataFrame:
+    return table[(table["variant"] == chosen.variant) & (table["frames"] == chosen.frames)]
 
 
 def map_cases(tables: ResultTables, summary: pd.DataFrame) -> list[MapCase]:
     """Make one case for each place, in the order of the set-ups."""
     maps = maps_of(tables)
-    places = dict.fromkeys(one.place for one in maps if not one.is_variation)
+    places = dict.fromkeys(each.place for each in maps if not each.is_variation)
     alike = tables.variants.assign(**{CAMERA_UNIT: ""}) if CAMERA_UNIT in tables.variants else tables.variants
-    without = {one.variant: one.place for one in maps_of(replace(tables, variants=alike))}
-    groups = ((place, [one for one in maps if one.place == place]) for place in places)
+    without = {each.variant: each.place for each in maps_of(replace(tables, variants=alike))}
+    groups = ((place, [each for each in maps if each.place == place]) for place in places)
     return [MapCase(tables, summary, group, place, without[group[0].variant]) for place, group in groups]
 
 
@@ -257,11 +257,11 @@ def against_one(case: MapCase, registration: str, merge: str) -> AgainstOne | No
     frames = case.common_frames(*(case.variant(views, registration, merge) for views in (1, 2)))
     if frames is None:
         return None
-    one, several = (case.named(n, registration, merge, frames) for n in (1, 2))
-    assert one is not None and several is not None
-    sizes = size_errors(case.holes(one), case.holes(several))
+    single, several = (case.named(n, registration, merge, frames) for n in (1, 2))
+    assert single is not None and several is not None
+    sizes = size_errors(case.holes(single), case.holes(several))
     large = sizes.diameters_mm >= LARGE_MM - 1e-9
-    states, runs = (case.status(one), case.status(several)), (case.runs(one), case.runs(several))
+    states, runs = (case.status(single), case.status(several)), (case.runs(single), case.runs(several))
     lost, gained = (
         tuple(hole for hole, state in here.items() if state == "found" and there.get(hole) == "missed")
         for here, there in (states, states[::-1])

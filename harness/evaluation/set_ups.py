@@ -175,8 +175,8 @@ def effect_costs(tables: ResultTables) -> pd.DataFrame:
         by_switches = {frozenset(name for name, is_on in of.items() if is_on): name for name, of in switches.items()}
         everything = max(by_switches, key=len)
         effects = [(name.replace("_", " "), frozenset([name])) for name in switches[by_switches[everything]]]
-        wanted = [(effect, "nothing", nothing, one) for effect, one in effects]
-        wanted += [(effect, "all others", everything - one, everything) for effect, one in effects]
+        wanted = [(effect, "nothing", nothing, alone) for effect, alone in effects]
+        wanted += [(effect, "all others", everything - alone, everything) for effect, alone in effects]
         wanted.append(("all", "nothing", nothing, everything))
         holes = tables.holes[tables.holes["variant"].isin(by_switches.values())]
         for frames, rows in holes.groupby("frames"):

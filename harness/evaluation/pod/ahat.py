@@ -134,7 +134,7 @@ def choose_axes(
     log_signals = (False, True) if min(lowest, decision) > 0 else (False,)
     fit = partial(fit_ahat, sizes, signals, decision=decision, left=left, right=right, inspections=inspections)
     fits = [fit(log_size=one, log_signal=other) for one, other in product(log_sizes, log_signals)]
-    return tuple(sorted(fits, key=lambda one: one.deviance))
+    return tuple(sorted(fits, key=lambda each: each.deviance))
 
 
 def ahat_bound(fit: AhatFit, pod: float = 0.9, confidence: float = 0.95) -> Bound:

@@ -263,7 +263,7 @@ def profile(data: HitsAndMisses, z0: float, level: float, slope: float = 1.0) ->
     # far out, only slopes near that of the line through the mean probability have a likelihood that is not tiny
     rate = link_ppf(data.link, data.hits.sum() / (data.hits + data.misses).sum())
     starts = np.array([[slope], [(level - float(rate)) / max(z0, 1.0)]])
-    best, _ = ascend(line.climb, starts[[np.argmax(np.concatenate([line.value(one[None]) for one in starts]))]], 1e-5)
+    best, _ = ascend(line.climb, starts[[np.argmax(np.concatenate([line.value(s[None]) for s in starts]))]], 1e-5)
     best = np.maximum(best, 0.0)
     return float(line.value(best)[0]), float(best[0, 0])
 

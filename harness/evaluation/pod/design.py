@@ -77,7 +77,7 @@ def recommend(plans: Sequence[StudyPlan], goal: float | None = None) -> tuple[St
     studies demonstrate ``goal`` (None: no goal), and True; else the plan with the most targets, and False."""
     most = max(plan.targets for plan in plans)
     # below the handbook's minimum, the largest number of targets is nearest to it
-    allowed = sorted((plan for plan in plans if plan.targets >= min(LEAST_TARGETS, most)), key=lambda one: one.targets)
+    allowed = sorted((plan for plan in plans if plan.targets >= min(LEAST_TARGETS, most)), key=lambda p: p.targets)
     reaching = [plan for plan in allowed if goal is None or plan.high <= goal]
     return (reaching or allowed[-1:])[0], None if goal is None else bool(reaching)
 

@@ -156,7 +156,7 @@ def choose_model(
     logs = (False, True) if np.all(np.asarray(size, float) > 0) else (False,)
     fit = partial(fit_hit_miss, size, hit, inspections=inspections)
     fits = [fit(link=link, log_size=log_size) for log_size, link in product(logs, links)]
-    return tuple(sorted(fits, key=lambda one: one.deviance))
+    return tuple(sorted(fits, key=lambda fit: fit.deviance))
 
 
 def near_models(fits: Sequence[HitMissFit]) -> tuple[HitMissFit, ...]:
@@ -301,7 +301,7 @@ def largest_bound(fits: Sequence[HitMissFit], design_effects: Sequence[float] = 
     """Return the largest a90/95 of several models; infinite if any of them has none. ``design_effects``: by model."""
     effects = design_effects or [1.0] * len(fits)
     bounds = (bound(fit, design_effect=of) for fit, of in zip(fits, effects, strict=True))
-    return max(bounds, key=lambda one: one.value)
+    return max(bounds, key=lambda limit: limit.value)
 
 
 def criterion(confidence: float) -> float:

@@ -234,7 +234,7 @@ def _text_rows(path: Path, content: bytes, column: str) -> Rows:
         return []
     first = next((line for line in filled if column in line), filled[0])
     separator = (
-        stated.group(1) if stated else max(SEPARATORS, key=lambda one: len(next(csv.reader([first], delimiter=one))))
+        stated.group(1) if stated else max(SEPARATORS, key=lambda mark: len(next(csv.reader([first], delimiter=mark))))
     )
     reader = csv.reader(lines[skipped:], delimiter=separator)
     try:

@@ -115,7 +115,7 @@ class PodStatement:
         limits = [row.bound.value for row in self.models if row.deviance <= most]
         if max(limits) <= (1 + APART) * min(limits):
             return doubts
-        texts = [f"{one:.3g}" if np.isfinite(one) else "not demonstrated" for one in (min(limits), max(limits))]
+        texts = [f"{limit:.3g}" if np.isfinite(limit) else "not demonstrated" for limit in (min(limits), max(limits))]
         return [f"{len(limits)} models fit about equally well, and their a90/95 differ: {' to '.join(texts)}", *doubts]
 
     def to_data(self) -> dict[str, Any]:
@@ -156,12 +156,12 @@ def state_hits(
     with threadpool_limits(1, user_api="blas"):
         size, hit = read.size, read.response
         tried = hit_miss.choose_model(size, hit, inspections=read.target)
-        left = [one for one in tried if link in (None, one.curve.link) and log_size in (None, one.curve.log_size)]
+        left = [fit for fit in tried if link in (None, fit.curve.link) and log_size in (None, fit.curve.log_size)]
         fit, near = left[0], hit_miss.near_models(left)
         curve, notes = fit.curve, [*read.notes, *fit.notes]
         tests = hit_miss.floor_ceiling_tests(fit) if tested else ()
-        models = [(one, hit_miss.bound(one, POD, CONFIDENCE)) for one in tried]
-        limit = max((limit for one, limit in models if one in near), key=lambda limit: limit.value)
+        models = [(fit, hit_miss.bound(fit, POD, CONFIDENCE)) for fit in tried]
+        limit = max((limit for fit, limit in models if fit in near), key=lambda limit: limit.value)
 
     if fit.targets < LEAST_TARGETS:
         notes.append(f"{fit.targets} independent targets; MIL-HDBK-1823A asks for at least {LEAST_TARGETS}")
@@ -210,9 +210,9 @@ def state_signals(
     numbers |= {"signals at or below --left": float(fit.below.sum())}
     numbers |= {"signals at or above --right": float(fit.above.sum()), "decision": fit.decision}
     numbers |= false_positives(read, fit)
-    models = [(one, ahat_bound(one, POD, CONFIDENCE)) for one in tried]
+    models = [(fit, ahat_bound(fit, POD, CONFIDENCE)) for fit in tried]
     reads = {True: f"doubtful at {LEVEL:.0%}", False: f"not rejected at {LEVEL:.0%}"}
-    tests = [(f"{one.assumption} ({one.test})", one.p_value, reads[one.p_value < LEVEL]) for one in diagnose(fit)]
+    tests = [(f"{test.assumption} ({test.test})", test.p_value, reads[test.p_value < LEVEL]) for test in diagnose(fit)]
     what = (read, "signal against size", unit, (), fit, _models(models, (fit,)), limit)
     return PodStatement(*what, numbers, (*read.notes, *fit.notes), tuple(tests))
 
@@ -229,7 +229,7 @@ def _models(tried: Sequence[tuple[Any, Bound]], near: Sequence[Any]) -> tuple[Mo
     return tuple(
         ModelRow(
             *(name(fit), fit.deviance, fit.curve.size_at(0.5), fit.curve.size_at(POD)),
-            *(limit, fit is near[0], any(fit is one for one in near)),
+            *(limit, fit is near[0], any(fit is each for each in near)),
         )
         for fit, limit in tried
     )
@@ -262,7 +262,7 @@ def drawn_sizes(size: np.ndarray, log_size: bool, marks: tuple[float, ...]) -> n
     """Return sizes (`DRAWN`,) from just below the smallest to just above the largest, and beyond those ``marks`` that
     are at most twice the largest size; in equal steps, or in equal ratios if ``log_size``."""
     low, high = float(size.min()), float(size.max())
-    high = max([high, *(one for one in marks if np.isfinite(one) and high < one < 2 * high)])
+    high = max([high, *(mark for mark in marks if np.isfinite(mark) and high < mark < 2 * high)])
     if log_size:
         margin = (high / low) ** 0.04
         return np.geomspace(low / margin, high * margin, DRAWN)

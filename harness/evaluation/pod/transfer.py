@@ -146,7 +146,7 @@ class Transfer:
         weight = self.posterior(np.ones(len(self.size), bool))
         kept = weight > weight.max() * 1e-6
         columns, ends = np.exp(self._logs(self.grid[kept], sizes)[0]).T, (0.5, 1 - LIMIT_AT, LIMIT_AT)
-        middle, low, high = (np.array([quantile(one, weight[kept], share) for one in columns]) for share in ends)
+        middle, low, high = (np.array([quantile(column, weight[kept], share) for column in columns]) for share in ends)
         return middle, low, high
 
     def agreement(self, seed: int = 1) -> float:

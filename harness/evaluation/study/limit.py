@@ -137,7 +137,7 @@ def design_effect(targets: Targets, curve: PodCurve, pod: float) -> float:
     influence = (design * slope[:, None]) @ np.linalg.solve(information, gradient)
     _, which = np.unique(targets.board, return_inverse=True)
     units = (np.bincount(which, influence), influence)
-    of_boards, of_targets = (float((one**2).sum() * len(one) / (len(one) - 1)) for one in units)
+    of_boards, of_targets = (float((unit**2).sum() * len(unit) / (len(unit) - 1)) for unit in units)
     return of_boards / of_targets if of_targets > 0 else np.nan
 
 
@@ -200,7 +200,7 @@ def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | No
         b = _coefficients(design, hits[None], 1 - hits[None], link)[0]
         return float(-2 * HitsAndMisses(design, hits, 1 - hits, link).value(b)), np.pad(b, (0, 4 - len(b))), link
 
-    deviance, b, link = min((fit(link, crossed[:, :3]) for link in LINKS), key=lambda one: one[0])
+    deviance, b, link = min((fit(link, crossed[:, :3]) for link in LINKS), key=lambda made: made[0])
     if b[1] <= 0:
         return None, f"the probability of detection does not grow with {seen.size_of}"
     p, terms, note = np.nan, 3, "POD falls with depth" if b[2] < 0 else ""
@@ -333,7 +333,7 @@ def limit_of(record: SetUpRecord, *, draws: int = DRAWS, tested: bool = False) -
         over_boards = a90_95
         if statement.fits[0].method == "ML":
             effects = [design_effect(targets, fit.curve, POD) for fit in statement.fits]
-            effect, at_least_one = effects[0], [max(1.0, one) for one in effects]
+            effect, at_least_one = effects[0], [max(1.0, each) for each in effects]
             if max(at_least_one) > 1:
                 over_boards = largest_bound(statement.fits, at_least_one)
         if apart.unit is not None:

@@ -68,7 +68,7 @@ def _one_table(table: Any) -> Any:
 
 
 def _no_set_up_twice(set_ups: tuple[SetUpRecord, ...]) -> tuple[SetUpRecord, ...]:
-    names = [(one.variant, one.frames) for one in set_ups]
+    names = [(set_up.variant, set_up.frames) for set_up in set_ups]
     for variant, frames in names:
         if names.count((variant, frames)) > 1:
             raise ValueError(f"set-up {variant!r} with frames {frames} occurs twice")
@@ -206,7 +206,7 @@ class StudyRecord:
     @property
     def hit_rule(self) -> str:
         """Rule for a hit, as the end of a sentence that begins with a damage."""
-        long = any(one.inspected.size_of != "diameter" for one in self.set_ups)
+        long = any(set_up.inspected.size_of != "diameter" for set_up in self.set_ups)
         of = "its centre line" if long else "its own" if self.hit_overlap is None else "its centre"
         rule = f"where the centre of a finding lies within {self.hit_radius_mm:.3g} mm of {of}"
         if self.hit_overlap is None:
@@ -223,7 +223,7 @@ class StudyRecord:
 def record_text(record: StudyRecord) -> str:
     """Return the record as JSON text with one set-up per line, so that a changed baseline differs in few lines."""
     data = record.to_data()
-    lines = ",\n  ".join(json.dumps(one, sort_keys=True) for one in data.pop("set_ups"))
+    lines = ",\n  ".join(json.dumps(set_up, sort_keys=True) for set_up in data.pop("set_ups"))
     head = json.dumps(data, sort_keys=True, indent=1)[:-2]
     return f'{head},\n "set_ups": [\n  {lines}\n ]\n}}\n'
 
@@ -266,8 +266,8 @@ def _mistake(error: ValidationError, data: Any) -> str:
     first, *others = error.errors(include_url=False)
     path = [part for part in first["loc"] if not str(part).startswith(("float", "none"))]
     where, value = ".".join(map(str, path)), first.get("input")
-    if path[:1] == ["set_ups"] and len(path) > 1 and isinstance(one := data["set_ups"][path[1]], dict):
-        where += f" (set-up {one.get('variant')}, frames {one.get('frames')})"
+    if path[:1] == ["set_ups"] and len(path) > 1 and isinstance(set_up := data["set_ups"][path[1]], dict):
+        where += f" (set-up {set_up.get('variant')}, frames {set_up.get('frames')})"
     given = f", not {shown(value)}" if value is None or isinstance(value, str | int | float) else ""
     text = str(first.get("ctx", {}).get("error", first["msg"])).partition(" or an instance of")[0]
     return f"{where}: {text}{given}" + (f"; and {len(others)} more" if others else "")

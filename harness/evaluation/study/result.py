@@ -113,7 +113,7 @@ def validity_of(
     record: StudyRecord, limits: Sequence[SetUpLimit], chances: Sequence[ChanceHits | None], facts: Mapping[str, Any]
 ) -> tuple[Section, ...]:
     """Return headings with their sentences. ``facts``: the resolved experiment as plain data (``source``, ...)."""
-    radius, largest = record.hit_radius_mm, max((one.largest_mm for one in limits), default=np.nan)
+    radius, largest = record.hit_radius_mm, max((limit.largest_mm for limit in limits), default=np.nan)
     counted = "closest pairs first, each finding for one damage at most; fixed beforehand, the same for all sizes"
     hits = [f"A damage is hit {record.hit_rule} ({counted})."]
     if record.hit_overlap is not None:
@@ -158,9 +158,9 @@ def _inspected(limits: Sequence[SetUpLimit], sweep: Mapping[str, Sequence[Any]])
 def _departures(
     limits: Sequence[SetUpLimit], chances: Sequence[ChanceHits | None], facts: Mapping[str, Any]
 ) -> tuple[str, ...]:
-    a_board = max((one.targets / one.boards for one in limits if one.boards), default=1.0)
+    a_board = max((limit.targets / limit.boards for limit in limits if limit.boards), default=1.0)
     # Unflawed places are places of drawn damage on hole-free boards.
-    places = [one.sites / limit.targets for limit, one in zip(limits, chances, strict=True) if one and limit.targets]
+    places = [each.sites / limit.targets for limit, each in zip(limits, chances, strict=True) if each and limit.targets]
     fewest_places, failed = min(places, default=np.inf), sum(limit.record.failed for limit in limits)
     chosen = any(limit.statement is not None for limit in limits)
     all_found = any(limit.statement is None and limit.a90_95.demonstrated for limit in limits)
@@ -273,7 +273,7 @@ def conditions_of(facts: Mapping[str, Any], inspected: int | None = None) -> str
         for key in path.split("."):
             value = value.get(key) if isinstance(value, Mapping) else None
         varied = any(path.startswith(axis) for axis in facts.get("sweep") or {})
-        known = words.startswith("threshold") and any(one.startswith("threshold") for one in conditions)
+        known = words.startswith("threshold") and any(text.startswith("threshold") for text in conditions)
         if value is not None and not varied and not known:
             text = words.format(camera_title(value) if isinstance(value, str) else value)
             conditions.append(text.replace(" 1 false calls", " 1 false call"))
@@ -320,9 +320,9 @@ def evaluate_study(
 ) -> StudyResult:
     """Evaluate a study. ``facts``: its resolved experiment, plain data. Deterministic. A limit without a curve says
     why."""
-    set_ups = tuple(_set_up(one, tables, record.hit_radius_mm, draws) for one in record.set_ups)
-    limits = tuple(one.limit for one in set_ups)
-    validity = validity_of(record, limits, [one.chance for one in set_ups], facts)
+    set_ups = tuple(_set_up(each, tables, record.hit_radius_mm, draws) for each in record.set_ups)
+    limits = tuple(set_up.limit for set_up in set_ups)
+    validity = validity_of(record, limits, [set_up.chance for set_up in set_ups], facts)
     return StudyResult(record, set_ups, limits, axis_lines(limits), validity, facts)
 
 

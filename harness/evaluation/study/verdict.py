@@ -144,8 +144,8 @@ def paired_set_ups(first: StudyRecord, second: StudyRecord) -> tuple[Pair, ...]:
                 at = of_free.index(key)
                 partner[place] = free.pop(at)
                 of_free.pop(at)
-    pairs: list[Pair] = [(one, partner.get(place)) for place, one in enumerate(first.set_ups)]
-    return (*pairs, *((None, one) for one in free))
+    pairs: list[Pair] = [(record, partner.get(place)) for place, record in enumerate(first.set_ups)]
+    return (*pairs, *((None, record) for record in free))
 
 
 def not_comparable(first: StudyRecord, second: StudyRecord, one: SetUpRecord, other: SetUpRecord) -> str:
@@ -207,7 +207,7 @@ def _verdict(row: ComparedSetUps, alpha: float) -> tuple[Mark, str]:
     growth, grown = _growth(first, second), f"a90 {first.a90_mm:.2f} → {second.a90_mm:.2f} mm"
     if first.a90_95.demonstrated != second.a90_95.demonstrated:
         bounds = (first.a90_95, second.a90_95)
-        there, here = (f"{one.value:.2f} mm" if one.demonstrated else "not demonstrated" for one in bounds)
+        there, here = (f"{bound.value:.2f} mm" if bound.demonstrated else "not demonstrated" for bound in bounds)
         grown = f"a90/95 {there} → {here}"
     if why := _lost(first, second):
         return "newly failing", why
