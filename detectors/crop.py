@@ -22,7 +22,7 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud
 
 DOUBTFUL_BELOW = 0.8  # probability of a comparison below which the choice is called doubtful
-CROWD = 4  # the choice is doubtful too if so many other surfaces are at least half as large, as in a heap of stones
+CROWD = 4  # the choice is also doubtful if this many other surfaces are at least half as large, as in a heap of stones
 CENTRE_SPREAD = 0.25
 """Standard deviation of the pixels' weights as a share of the picture's sides: people aim at the target."""
 LYING_WEIGHT, STANDING_WEIGHT = 0.10, 0.02

@@ -52,14 +52,14 @@ class FlatField:
 
     @property
     def rms_m(self) -> float:
-        """Root mean square of the pattern, less the map's own noise."""
+        """Root mean square of the pattern without the map's own noise."""
         return float(np.sqrt(max(np.nanmean(self.error_m.astype(float) ** 2 - self.variance_m2), 0.0)))
 
 
 def corrected(cloud: Cloud, field: FlatField) -> Cloud:
-    """Return the cloud with its points moved along their rays to where they would be without the pattern; where it is
-    unknown they stay. ``mean_variance_m2`` is the frames' noise (None of a single frame) and the map's variance, or the
-    pattern's mean square. Raises UserError if the cloud has no pixel grid or is of another camera, size or lens."""
+    """Return the cloud with its points moved along their rays to remove the pattern; points where it is unknown stay.
+    ``mean_variance_m2`` is the frames' noise (None for a single frame) and the map's variance, or the pattern's mean
+    square. Raises UserError if the cloud has no pixel grid or is of another camera, size or lens."""
     _refuse_other(cloud, field)
     at = cloud.region.within(field.lens.whole)
     error_m, variance_m2 = field.error_m[at].astype(float), field.variance_m2[at].astype(float)

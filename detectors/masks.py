@@ -30,7 +30,7 @@ def notches_filled(mask: np.ndarray, radius_px: int) -> np.ndarray:
         depths = np.asarray(cv2.distanceTransform(np.pad(gaps, 1).astype(np.uint8), cv2.DIST_L2, 5))
         return depths[1:-1, 1:-1] > 1 + radius_px / 4
 
-    # a closing stays within the convex hull: it is slow, so it is computed only there
+    # a closing is slow and stays within the convex hull, so it is computed only there
     rows, hull = np.flatnonzero(mask.any(axis=1)), np.zeros(mask.shape, np.uint8)
     ends = np.append(mask[rows].argmax(axis=1), mask.shape[1] - 1 - mask[rows, ::-1].argmax(axis=1))
     outline = cv2.convexHull(np.column_stack([ends, np.tile(rows, 2)]).astype(np.int32))

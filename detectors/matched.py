@@ -15,7 +15,7 @@ shoulder of a neighbouring hole. What pixels along the target's outline share be
 Upsampled depth is judged on squares of pixels in which its noise reaches no farther than a camera's window.
 
 Not modelled: slots that no template fits; slots within `RIM_PX` of outlines and of removed findings; distortion of
-templates on steep surfaces; missing returns, except the few that are no findings by themselves (`detectors.missing`).
+templates on steep surfaces; missing returns, except the few that are not findings by themselves (`detectors.missing`).
 The denominator takes the share of a template's whitened energy on known pixels for t' C^-1 t, by a rectangle that
 spreads as widely; a template does not judge places where less than `LEAST_SEEN` of it is visible. Slots are scored on
 every second pixel."""

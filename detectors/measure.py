@@ -151,7 +151,7 @@ def measure_detection(
 
 def _sides(around: _Surroundings, near: np.ndarray) -> tuple[float, float, np.ndarray]:
     """Return length, width and direction (3,) of the length of the rectangle on the surface that has the second moments
-    of the residual within ``near`` (h, w) bool, less those of the blur."""
+    of the residual within ``near`` (h, w) bool, minus those of the blur."""
     residual = around.patch.residual_m[near] - around.offset_m
     weight = np.maximum(around.sign * residual, 0.0)
     v, u = np.nonzero(near)

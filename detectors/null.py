@@ -46,7 +46,7 @@ MARKED = 8.0
 MOST_MASKED = 0.5  # largest share of the judged area under objects: the rest must represent the whole
 RIM_PX, RIM_CALLS = 10, 2
 """Depth of the target's rim, and number of calls behind the surface along it that chance does not explain."""
-CONTRADICTED = 0.1  # probability of so many peaks above the threshold at which a tail is rejected
+CONTRADICTED = 0.1  # a tail is rejected if the probability of the number of peaks above the threshold is lower
 MOST_SKEW = 0.15
 """Difference of the quartiles' distances from the median, over their sum: 0.15 means 1.35 times as far on one side."""
 DRAWS = 4000
@@ -185,7 +185,7 @@ class Tail:
         return float((self.weights * self.peaks * (1.0 + excesses / self.sums) ** -(self.peaks + NORMAL_PEAKS)).sum())
 
     def threshold(self, number: float) -> float:
-        """Return the threshold at which so many peaks are expected; the floor if fewer are expected there."""
+        """Return the threshold at which this number of peaks is expected; the floor if fewer are expected there."""
         if number >= self.peaks:
             return self.floor
 

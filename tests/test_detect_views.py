@@ -327,7 +327,7 @@ def test_poses_are_read_in_both_forms(tmp_path: Path) -> None:
         ('{"a": 1, "a": 2}', "holds no poses (the key a occurs twice)"),
         (json.dumps({"T_reference_view": 3}), "holds no poses"),
         (json.dumps({"T_reference_view": [np.eye(4).tolist()]}), "1 poses for 2 views"),
-        (json.dumps([np.eye(4).tolist()]), "1 poses for 2 views .. one line a view"),
+        (json.dumps([np.eye(4).tolist()]), "1 poses for 2 views .. one line per view"),
         (json.dumps({"views": 1, "poses": []}), "holds no poses (an object without the key T_reference_view)"),
         ("[" * 100_000, "holds no poses"),
         ("[", "holds no poses"),

@@ -40,7 +40,7 @@ AnyMerge = GridMerge | FusedMerge | VolumeMerge
 class MappingConfig(Config):
     """Settings of crop (in each view's own frame), marks, registration and merge."""
 
-    views: int | None = Field(default=None, ge=1, le=1000, description="uses the first so many; null: all")
+    views: int | None = Field(default=None, ge=1, le=1000, description="number of views to use; null: all")
     crop: CropConfig = Field(default_factory=AutoCrop)
     marks: MarksConfig = Field(default_factory=ColourMarks)
     registration: RegistrationConfig = Field(default_factory=lambda: PlainRegistration(method="marks"))

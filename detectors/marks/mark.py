@@ -14,8 +14,8 @@ from harness.vocabulary.geometry import MM
 
 LEAST_MARKS = 3
 OFF_LINE_SIGMAS, OFF_LINE_SHARE = 5.0, 0.02
-"""Marks count as lying on a line if their root mean square distance from it is less than so many standard deviations of
-a mark's position, or than this share of their spread along it: there, a millimetre of error at a mark becomes 50 mm."""
+"""Marks count as lying on a line if their root mean square distance from it is below this many standard deviations of a
+mark's position, or below this share of their spread along it: there, a millimetre of error at a mark becomes 50 mm."""
 
 
 class RedMarks(Config):

@@ -111,7 +111,7 @@ LEGAL_LENS = (
 FOUND_BESIDE = (
     *("intrinsic", "intrinsics", "camera_intrinsic", "camera_intrinsics", "camera", "camera_info", "calibration"),
     *("rtabmap_calib", "scene_camera", "depth_intrinsics", "intrinsic_depth", "transforms"),
-)  # stems of the files that are taken for the lens of the frames beside or below them
+)  # stems of the files that count as the lens of the frames beside or below them
 BARE_MATRICES = (
     *("intrinsics.txt", "intrinsic.txt", "camera-intrinsics.txt", "intrinsic_depth.txt", "K.txt", "cam_K.txt"),
     *("camera_intrinsics.txt", "camera_intrinsic.txt", "depth_intrinsics.txt"),

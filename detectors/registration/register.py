@@ -112,7 +112,7 @@ def judge(
     error_m, limit_m = float(np.hypot(within, across)), max(UNDETERMINED_PITCHES * ours.pitch_m, BLUR_M)
     undetermined, apart = "", _apart(agreement)
     if error_m > limit_m:
-        undetermined = "not determined: the points let the target slide or turn (they lie on a line, or the surface"
+        undetermined = "not determined: the points let the target slide or rotate (they lie on a line, or the surface"
         undetermined += (
             f" slides in itself); the predicted error over it is {error_m / MM:.1f} mm, which would blur the map"
         )

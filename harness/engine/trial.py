@@ -108,7 +108,7 @@ def _left_out(capture: SimulatedCapture, summer: AtOnce, config: AverageConfig, 
 
 
 def _disturbed(cloud: Cloud, noise_m: float, config: AverageConfig) -> bool:
-    """Return whether so many pixels lose their range or change that frames may be left out."""
+    """Return whether enough pixels lose their range or change for frames to be left out."""
     judged = 2 * cloud.count > cloud.n_frames
     if not judged.any():
         return True

@@ -24,7 +24,7 @@ RESAMPLES = 1000
 """Draws of the bootstrap: its 2.5 % quantile is the 25th smallest, stable to about 5 % of the interval's width."""
 HALF = 0.5
 LIMIT_RULE = (
-    "The detection limit is the smallest true diameter from which on every hole as large or larger counts as found. "
+    "The detection limit is the smallest true diameter for which every hole as large or larger counts as found. "
     "The 50 % size is where the detection rate, made monotone in the diameter by isotonic regression and interpolated "
     "linearly between sizes, reaches one half; its 95 % interval is a bootstrap over the holes of each size (where "
     "there are several) and over the repeats."

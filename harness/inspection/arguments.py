@@ -61,7 +61,7 @@ def refuse_misfits(arguments: argparse.Namespace, paths: list[Path]) -> None:
             raise UserError(what, legal=several)
         whole = [path for path in paths if path.is_dir() or path.suffix.lower() in WHOLE_CAPTURES]
         if len(paths) > 1 and whole:
-            fix = f"run each alone, or, as views of one target, together: {several}"
+            fix = f"run each separately, or register them as views of one target: {several}"
             raise UserError(f"{len(paths)} PATHs, but {whole[0]} is a whole capture", fix=fix)
         return
     if len(paths) < 2:
@@ -207,7 +207,7 @@ def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
         why = f"cannot be read ({error.strerror})" if isinstance(error, OSError) else f"holds no poses ({error})"
         raise UserError(f"{path}: {why}", legal=LEGAL_POSES) from error
     if len(poses) != count:
-        fix = "keep one pose for each PATH, in the same order (of a sequence's groundtruth.txt one line a view)"
+        fix = "keep one pose for each PATH, in the same order (one line per view for groundtruth.txt of a sequence)"
         raise UserError(f"{path}: {len(poses)} poses for {count} views", legal=LEGAL_POSES, fix=fix)
     from_first = [np.eye(4)]
     for number, pose in enumerate(poses):

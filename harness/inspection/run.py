@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 DEFAULT_K = (
     5.0  # robust standard deviations, if the capture sets no threshold; 0.6 of a million normal pixels lie beyond
 )
-FAINT_CALLS = 0.05  # noise explains a finding if at least so many false calls as strong are expected
+FAINT_CALLS = 0.05  # noise explains a finding if at least this many false calls of its score are expected
 THRESHOLDS = ("threshold", "quiet_capture", "false_calls")  # arguments of which each sets the threshold
 
 

@@ -20,7 +20,7 @@ from harness.vocabulary.geometry import MM, rotation_xyz_deg
 from harness.vocabulary.meshes import FileUnit, FrontAxis
 from scenes.target.flaws import AnyFlawConfig, Coordinate, FlawConfig, PlacedConfig, PlaceMm
 
-NEAR_NM = 20.0  # an albedo holds so far around its wavelength: wood and paint change by a per cent or two (a guess)
+NEAR_NM = 20.0  # range of wavelengths for which an albedo holds: wood and paint change by a per cent or two (a guess)
 Albedo = Annotated[float, Field(ge=0.0, le=1.0)]
 Rgb = tuple[Albedo, Albedo, Albedo]
 Length = Annotated[float, Field(ge=1.0, le=1e4)]
@@ -247,7 +247,7 @@ class ReflectanceConfig(Config):
 
 
 class MaterialConfig(ReflectanceConfig):
-    """Reflectance of one board; ``grain_seed`` tells it from boards of the same material."""
+    """Reflectance of one board; ``grain_seed`` distinguishes it from boards of the same material."""
 
     grain_seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 1
 

@@ -152,7 +152,7 @@ class RoundConfig(_FlawConfig):
 
     @property
     def pressed(self) -> bool:
-        """Tell whether the sheet's back moves too."""
+        """Return whether the sheet's back moves too."""
         return self.kind != "protrusion"
 
     def relief(self) -> Relief:

@@ -110,7 +110,7 @@ def _sweep(corners: np.ndarray, low: np.ndarray, high: np.ndarray, strips: np.nd
 
 @numba.njit(cache=True, nogil=True)
 def _pierces(one: np.ndarray, other: np.ndarray) -> bool:
-    """Tell whether an edge of one triangle passes through the inside of another."""
+    """Return whether an edge of one triangle passes through the inside of another."""
     a, b, c = other[0], other[1], other[2]
     for k in range(3):
         p, q = one[k], one[(k + 1) % 3]

@@ -169,8 +169,8 @@ def state_hits(
         notes.append(f"a90/95 = {limit.value:.3g} lies beyond the largest size inspected, {largest:.4g}")
     if any(test.needed for test in tests):
         likeliest = min(tests, key=lambda test: test.p_value)
-        speaks = f"the data suggest {TESTED[likeliest.beyond]} (p = {likeliest.p_value:.2g})"
-        notes.append(f"the curve has no floor or ceiling, and {speaks}{DOUBTED}")
+        suggests = f"the data suggest {TESTED[likeliest.beyond]} (p = {likeliest.p_value:.2g})"
+        notes.append(f"the curve has no floor or ceiling, and {suggests}{DOUBTED}")
     texts = []
     for test in tests:
         fitted = f"(floor {test.floor:.3f}, ceiling {test.ceiling:.3f})"

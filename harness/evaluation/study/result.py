@@ -171,8 +171,8 @@ def _departures(
     independent = "a90/95 takes them as independent; the bound with their design effect stands beside it"
     counted = "and count once each, the criterion of a90/95 scaled by the number of inspections"
     rules = (
-        (simulated, "Boards and camera are simulated. The handbook speaks of real flaws and the real system."),
-        (a_board > 1, f"Targets share boards, {a_board:.3g} to a board. {independent} (Rao and Scott 1984)."),
+        (simulated, "Boards and camera are simulated. The handbook demands real flaws and the real system."),
+        (a_board > 1, f"Targets share boards, {a_board:.3g} per board. {independent} (Rao and Scott 1984)."),
         (repeated, f"Targets were inspected more than once with new noise {counted}."),
         (
             units > 1,
