@@ -278,7 +278,7 @@ def test_a_file_of_bare_numbers_needs_its_layout(tmp_path: Path) -> None:
         ("1 2 3\nfour five six\n", "cannot be read as points"),
         ("x y z i\n1 2 3\n", "names the columns"),
         (" ".join(["1"] * 40) + "\n", "name depth.npy"),
-        ("9" * 400 + " 1 1\n", "wrong unit|not one valid|finite"),
+        ("9" * 400 + " 1 1\n", "wrong unit|no valid pixel|finite"),
     ),
 )
 def test_a_faulty_list_of_points_is_explained(tmp_path: Path, text: str, told: str) -> None:
