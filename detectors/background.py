@@ -29,7 +29,7 @@ MOST_CELLS, CELL_POINTS, EVEN_CELL_POINTS, ENOUGH_CELLS, FEW_CELLS = 3600, 16, 6
 TILE_CELLS, FOLDS = 3, 5
 """Side, in cells, of a tile that is predicted as a whole, and the number of folds into which the tiles are dealt."""
 LEAST_SCALE_M = 0.04
-"""By default, damage is assumed to be narrower than this: no free form that could follow it is chosen."""
+"""Largest width of damage, unless the settings differ: no free form that could follow it is chosen."""
 WORTH = 0.1
 """A shape is as good as the best if its error of prediction is larger by at most this share of a pixel's noise."""
 NOISIER = 1.25
