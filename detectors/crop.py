@@ -165,19 +165,19 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
         ours = borders[front].get(back)
         if ours is None or not ours.is_step:
             return None
-        it, other = described[front], described[back]
-        covered = f"{100 * it.share:.2g} % of the view"
+        this, other = described[front], described[back]
+        covered = f"{100 * this.share:.2g} % of the view"
         if encloses(front, back):
             opening = surfaces.own[back].sum() / max(surfaces.filled[front].sum(), 1)
             return _probability(0.5 / max(opening, 1e-6)), "a surface is seen through a large opening of another"
-        if ours.part >= SURROUNDED and ours.behind_m <= it.extent_m[1]:
+        if ours.part >= SURROUNDED and ours.behind_m <= this.extent_m[1]:
             why = f"an object that covers {covered} lies on a larger surface or close to it"
-            return _probability(it.weight / LYING_WEIGHT), why
+            return _probability(this.weight / LYING_WEIGHT), why
         if other.cut_off < CUT_OFF:
-            ratio = it.extent_m[0] * it.extent_m[1] / max(other.extent_m[0] * other.extent_m[1], 1e-12)
+            ratio = this.extent_m[0] * this.extent_m[1] / max(other.extent_m[0] * other.extent_m[1], 1e-12)
             why = f"an object that covers {covered} stands in front of a surface whose outline is whole"
             return _probability(ratio / OBSTACLE_AREA), why
-        return _probability(it.weight / STANDING_WEIGHT), f"the nearer surface covers only {covered}"
+        return _probability(this.weight / STANDING_WEIGHT), f"the nearer surface covers only {covered}"
 
     def judged(i: int, j: int) -> tuple[float, str]:
         """Return the probability that surface i rather than j is the target, and the reason for a doubt."""
@@ -189,10 +189,10 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
         if behind is not None:
             return 1.0 - behind[0], behind[1]
         # if the two only meet or are apart, weight, a frontal view and nearness decide
-        it, other = described[i], described[j]
-        ratio = it.weight / max(other.weight, 1e-9)
-        facing = math.cos(math.radians(it.tilt_deg)) / max(math.cos(math.radians(other.tilt_deg)), 1e-2)
-        near = other.depths_m[1] / max(it.depths_m[1], 1e-6)
+        this, other = described[i], described[j]
+        ratio = this.weight / max(other.weight, 1e-9)
+        facing = math.cos(math.radians(this.tilt_deg)) / max(math.cos(math.radians(other.tilt_deg)), 1e-2)
+        near = other.depths_m[1] / max(this.depths_m[1], 1e-6)
         return _probability(ratio**0.5 * facing**2 * near), "two surfaces are about as large and as near"
 
     table = [[judged(i, j) for j in numbers] for i in numbers]

@@ -130,8 +130,8 @@ def each_object_once(cloud: Cloud, evidence: Evidence, found: tuple[Detection, .
         rest = [each for each in kept if each.score > height or not near[each.pixels].any()]
         if len(kept) - len(rest) >= 2:
             pixels = np.flatnonzero(region & cloud.valid)
-            thing = Detection(height, pixels, extents(cloud.points_m.reshape(-1, 3)[pixels])[1], "object")
-            kept = [*rest, thing]
+            centre_m = extents(cloud.points_m.reshape(-1, 3)[pixels])[1]
+            kept = [*rest, Detection(height, pixels, centre_m, "object")]
     return tuple(sorted(kept, key=lambda each: -each.score))
 
 

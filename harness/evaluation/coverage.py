@@ -38,9 +38,9 @@ class Patches:
     normals: np.ndarray
     areas_m2: np.ndarray
 
-    def share(self, some: np.ndarray) -> float:
-        """Return the share of the area that the patches ``some`` (n,) bool cover."""
-        return float(self.areas_m2[some].sum() / self.areas_m2.sum())
+    def share(self, chosen: np.ndarray) -> float:
+        """Return the share of the area that the patches ``chosen`` (n,) bool cover."""
+        return float(self.areas_m2[chosen].sum() / self.areas_m2.sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,19 +125,19 @@ def _design(size_mm: np.ndarray, cosine: np.ndarray, range_m: np.ndarray) -> np.
     return np.column_stack([np.ones(len(size_mm)), np.log(size_mm), cosine, cosine**2, np.log(range_m)])
 
 
-def findable(some: ScoredDamage, threshold: float) -> Findable:
+def findable(scored: ScoredDamage, threshold: float) -> Findable:
     """Fit the law to inspections of damage where the detector judges. Raises UserError if these do not suffice."""
-    judged = np.isfinite(some.seen.deviation_m) & (some.seen.cosine > 0)
-    damages, of = len(np.unique(some.damage[judged])), len(np.unique(some.damage))
+    judged = np.isfinite(scored.seen.deviation_m) & (scored.seen.cosine > 0)
+    damages, total = len(np.unique(scored.damage[judged])), len(np.unique(scored.damage))
     if damages < FEWEST:
         fix = "check the detector's crop, and the sizes of the damage"
-        raise UserError(f"only {damages} of {of} damages were judged: no limit can be learnt", fix=fix)
-    size_mm, cosine, score = some.size_mm[judged], some.seen.cosine[judged], some.score[judged]
-    design = _design(size_mm, cosine, some.seen.range_m[judged])
+        raise UserError(f"only {damages} of {total} damages were judged: no limit can be learnt", fix=fix)
+    size_mm, cosine, score = scored.size_mm[judged], scored.seen.cosine[judged], scored.score[judged]
+    design = _design(size_mm, cosine, scored.seen.range_m[judged])
     below, found = np.isnan(score), np.sort(score[score > threshold])
     far = max(FAR * threshold, *found[np.isfinite(found)][:FEWEST])
     above = score > far
-    signal = np.log(np.minimum(np.where(below, threshold, score), far) * some.seen.deviation_m[judged])
+    signal = np.log(np.minimum(np.where(below, threshold, score), far) * scored.seen.deviation_m[judged])
 
     def fitted(growth: float) -> tuple[float, CensoredFit]:
         """Return the log-likelihood with a scatter proportional to cosine^-growth, and the fit to weighted rows."""
@@ -149,12 +149,12 @@ def findable(some: ScoredDamage, threshold: float) -> Findable:
     best = int(np.nanargmax([value for value, _ in fits]))
     growth, (coefficients, scatter, _, _) = float(GROWTHS[best]), fits[best][1]
     if coefficients[1] <= 0:
-        what = f"what is found does not follow the {some.size_of} of the damage: no limit can be learnt"
+        what = f"what is found does not follow the {scored.size_of} of the damage: no limit can be learnt"
         raise UserError(what, fix="ask for fewer or less tilted poses, or run a study in the pose wanted")
     ratio = np.exp(special.ndtri(POD) * scatter / np.median(cosine) ** growth / coefficients[1])
     sizes_mm = (float(size_mm.min()), float(size_mm.max()))
     law = (coefficients, scatter, growth, float(ratio), threshold)
-    return Findable(some.size_of, *law, sizes_mm, float(cosine.min()), damages)
+    return Findable(scored.size_of, *law, sizes_mm, float(cosine.min()), damages)
 
 
 def in_turn(patches: Patches, found: Sequence[np.ndarray], given: int, further: int) -> list[tuple[int, float, float]]:
@@ -163,7 +163,7 @@ def in_turn(patches: Patches, found: Sequence[np.ndarray], given: int, further: 
     adds, and the share that all poses so far cover."""
     covered, rows = np.zeros(len(patches.areas_m2), bool), list[tuple[int, float, float]]()
     for turn in range(given + further):
-        gains = [patches.share(some & ~covered) for some in found]
+        gains = [patches.share(each & ~covered) for each in found]
         best = turn if turn < given else int(np.argmax(gains))
         if turn >= given and gains[best] <= 0:
             break
