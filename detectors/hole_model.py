@@ -53,7 +53,7 @@ def sight(centre_m: np.ndarray, per_px_m: np.ndarray, emitter_m: np.ndarray, sha
     share of the image that this viewpoint contributes. ``centre_m`` (3,): camera frame. ``per_px_m``: (2, 3).
 
     A circle at depth h along the normal has the image of the same circle on the surface, moved by h * drift / (1 + h *
-    shrinking) and divided by that divisor. Light from depth h entered at beam * h / (h + height) from it."""
+    shrinking) and divided by that divisor. Light from depth h entered beam * h / (h + height) away from it."""
     normal = normal_of(per_px_m)
     normal = normal / np.copysign(np.linalg.norm(normal), normal @ centre_m)
     ray, z = centre_m / centre_m[2], centre_m[2]

@@ -341,7 +341,7 @@ def limit_of(record: SetUpRecord, *, draws: int = DRAWS, tested: bool = False) -
             units = over_units(*rows, statement.curve, over_boards)
     elif n and seen.hit.all():
         # If the POD of the 29th smallest target were below 90 %, so would that of the 28 smaller ones, and all 29
-        # would be found in less than 5 % of studies. So a90 lies below its size, if only POD grows with size.
+        # would be found in less than 5 % of studies. So a90 lies below its size, provided that POD grows with size.
         a50 = a90 = float(targets.size_mm.min())
         a90_95 = _all_found(targets.size_mm, "targets")
         smallest = [targets.size_mm[targets.board == board].min() for board in np.unique(targets.board)]
