@@ -74,7 +74,7 @@ def design(
 
 def recommend(plans: Sequence[StudyPlan], goal: float | None = None) -> tuple[StudyPlan, bool | None]:
     """Return the plan with the fewest targets, at least `LEAST_TARGETS` if any plan has them, in which 90 % of the
-    studies demonstrate ``goal`` (None: no goal), and True; else the plan with the most targets, and False."""
+    studies demonstrate ``goal``, and True; else the plan with the most targets, and False. No goal: (fewest, None)."""
     most = max(plan.targets for plan in plans)
     # below the handbook's minimum, the largest number of targets is nearest to it
     allowed = sorted((plan for plan in plans if plan.targets >= min(LEAST_TARGETS, most)), key=lambda p: p.targets)
