@@ -81,8 +81,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     if not 0 < options.share <= 1:
         raise UserError(f"--share {options.share:g}", legal="a share above 0, up to 1")
     if len(experiment.points) > 1 and not options.goal:
-        said = f"{name}: has {len(experiment.points)} set-ups, and coverage is of one; --goal compares them"
-        raise UserError(said, fix="choose one by --set, such as sweep={} and the values of its axes")
+        what = f"{name}: has {len(experiment.points)} set-ups, and coverage is of one; --goal compares them"
+        raise UserError(what, fix="choose one by --set, such as sweep={} and the values of its axes")
     asked = options.goal or options.size
     size_mm = length_m("--goal" if options.goal else "--size", asked) / MM if asked else None
     for point in experiment.points:
@@ -116,24 +116,24 @@ def main(options: argparse.Namespace, command: str) -> int:
     provenance = {**record(command), "results_version": RESULTS_VERSION, "experiment": name}
     provenance |= {"digest": experiment.digest, "seed": experiment.config.seed}
     write_tables(folder, {table: table.frame(each) for table, each in rows.items()}, provenance)
-    warnings, said = warnings_of(one.found, one.seen), answer(one.found, patches, limits_mm, wanted, len(poses))
+    warnings, summary = warnings_of(one.found, one.seen), answer(one.found, patches, limits_mm, wanted, len(poses))
     if (added := len(poses) - len(given)) < options.suggest:
-        told = f"{added} of {many(options.suggest, 'pose')} suggested: no other pose adds to what is covered"
-        warnings.insert(0, told)
+        fewer = f"{added} of {many(options.suggest, 'pose')} suggested: no other pose adds to what is covered"
+        warnings.insert(0, fewer)
     if goals:
         word = f"Least time of capture ({goals[0]['capture_s']:.0f} s)"
         if not goals[0]["reached"]:
             word = f"{100 * options.share:g} % of the face is not reached; nearest to it"
         frames = many(goals[0]["frames"], "frame")
-        said = f"{word}: {goals[0]['camera']}, {frames}, {goals[0]['distance_m']:g} m. {said}"
+        summary = f"{word}: {goals[0]['camera']}, {frames}, {goals[0]['distance_m']:g} m. {summary}"
     config, scene = one.point.config, scene_of(patches, limits_mm, one.found)
     camera = config.simulated.camera
     detector = f"the detector {config.detector.name} at a threshold of {one.task.threshold:.3g}"
     unit = f"unit {camera.unit_seed} of {camera_title(Path(camera.name).stem)}, {many(config.capture.frames, 'frame')}"
-    first = f"Simulated, for {unit}, {detector}. {one.found.said}"
-    write_text(folder / COVERAGE_PAGE.name, coverage_html(name, said, first, scene, poses, goals, warnings, command))
+    first = f"Simulated, for {unit}, {detector}. {one.found.statement}"
+    write_text(folder / COVERAGE_PAGE.name, coverage_html(name, summary, first, scene, poses, goals, warnings, command))
     grids = [table.grid(rows[table], terminal=True) for table in (GOALS, POSES) if rows[table]]
-    show([*(f"warning: {text}" for text in warnings), said, first, *grids])
+    show([*(f"warning: {text}" for text in warnings), summary, first, *grids])
     print(f"page: {folder / COVERAGE_PAGE.name}")
     return 0
 

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from detectors.interface import Detection, Evidence, Measurement
 from harness import detect
 from harness.inspection.arguments import crop_from_text
-from harness.inspection.told import print_findings
+from harness.inspection.output import print_findings
 from harness.report.findings import finding_of
 from harness.tables.trials import FINDINGS_OF_CAPTURE
 from harness.vocabulary.errors import UserError

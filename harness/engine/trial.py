@@ -64,7 +64,7 @@ def averages_of(
 
 @lru_cache(maxsize=4)
 def flat_field_of(camera: CameraConfig, config: FlatFieldConfig, seed: int) -> FlatField:
-    """Return a unit's flat field, measured on a plane across its axis. Raises UserError where no pixel has a range."""
+    """Return a unit's flat field, measured on a plane across its axis. Raises UserError if no pixel has a range."""
     facts = camera_of(camera)
     view = plane_view(facts, facts.nominal_lens.whole, config.distance_m, FLAT_ALBEDO)
     capture = SimulatedUnit(facts, camera, view).capture(config.frames, seed, "flat field")
@@ -104,7 +104,7 @@ def _left_out(capture: SimulatedCapture, summer: AtOnce, config: AverageConfig, 
 
 
 def _disturbed(cloud: Cloud, noise_m: float, config: AverageConfig) -> bool:
-    """Return whether so many pixels lose their range or change that frames may be left out."""
+    """Return whether enough pixels lose their range or change for frames to be left out."""
     judged = 2 * cloud.count > cloud.n_frames
     if not judged.any():
         return True
@@ -117,7 +117,7 @@ def _disturbed(cloud: Cloud, noise_m: float, config: AverageConfig) -> bool:
 
 
 def _cloud(capture: SimulatedCapture, totals: FrameTotals, left_out: tuple[LeftOut, ...]) -> Cloud | None:
-    """Return the average from sums over frames, as `detectors.average` computes it; None where no pixel has a range."""
+    """Return the average from sums over frames, as `detectors.average` computes it; None if no pixel has a range."""
     count = totals.count
     if not count.any():
         return None

@@ -1,4 +1,4 @@
-"""The arguments of `harness.detect` as settings: a detector, a way from views to one cloud, captures, stated poses."""
+"""The arguments of `harness.detect` as settings: a detector, the merging of views, captures, stated poses."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ MARKS = ("colour", "red", "coded")
 WHOLE_CAPTURES = (".mcap", ".db3", ".mkv", ".npy", ".npz", ".mat", ".tif", ".tiff", ".pfm")
 DEFAULT_FALSE_CALLS = 1.0  # expected false calls in the capture
 DEFAULT_DETECTOR = "matched"
-PREFIX = "mapping."  # begins the --set keys from views to one cloud; all others are the detector's
+PREFIX = "mapping."  # prefix of the --set keys for merging views; all other keys are the detector's
 STATED_SURFACE = ("surface=", "surface.degree", "surface.method", "surface.drop")
-"""Settings that state a polynomial: without any of them the surface's shape is chosen by evidence."""
+"""Settings that state a polynomial: without them, the surface's shape is chosen by evidence."""
 LEGAL_CROP = "auto, none, box:x0,x1,y0,y1,z0,z1 (mm, camera frame), polygon:u,v,u,v,u,v.. (pixels)"
 
 
@@ -36,7 +36,7 @@ READING = ("unit", "topic", "array", "pitch", "raw")  # options that `open_captu
 
 
 def add_reading(add: Callable[..., Any]) -> None:
-    """Add the options that say how captures are read, by a parser's or a group's ``add_argument``."""
+    """Add the options for reading captures with ``add_argument`` of a parser or group."""
     add("--unit", help="unit of stored distances: mm, m, cm, um, in, tum (5000/m) or N/m; default: from the data")
     add("--intrinsics", metavar="FILE|CAMERA", help="lens of the depth pixels: a file, or a camera (nominal lens)")
     add("--topic", help="topic of a ROS bag with depth images or clouds (default: the only one)")
@@ -51,18 +51,18 @@ def reading_of(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def refuse_misfits(arguments: argparse.Namespace, paths: list[Path]) -> None:
-    """Raise UserError for arguments of several views with one capture, and the other way round."""
+    """Raise UserError for arguments of several views with one capture, and vice versa."""
     several = f"--register {'|'.join(METHODS)}"
     if arguments.register is None:
         given = [name for name in ("merge", "marks", "poses") if getattr(arguments, name) is not None]
         given += [f"set {assignment}" for assignment in arguments.set if assignment.startswith(PREFIX)]
         if given:
-            what = f"--{given[0]}: concerns several views, and without --register all PATHs are one capture"
+            what = f"--{given[0]}: concerns several views, but without --register all PATHs are one capture"
             raise UserError(what, legal=several)
         whole = [path for path in paths if path.is_dir() or path.suffix.lower() in WHOLE_CAPTURES]
         if len(paths) > 1 and whole:
-            fix = f"run each alone, or, as views of one target, together: {several}"
-            raise UserError(f"{len(paths)} PATHs, and {whole[0]} is a capture of its own", fix=fix)
+            fix = f"run each separately, or register them as views of one target: {several}"
+            raise UserError(f"{len(paths)} PATHs, but {whole[0]} is a whole capture", fix=fix)
         return
     if len(paths) < 2:
         fix = "name the other views, or leave out --register"
@@ -71,12 +71,12 @@ def refuse_misfits(arguments: argparse.Namespace, paths: list[Path]) -> None:
     if arguments.register == "nominal" and arguments.poses is None:
         raise UserError("--register nominal uses the stated poses, and none are stated", fix="give --poses FILE")
     if arguments.quiet_capture is not None:
-        what = "--quiet-capture is one cloud, and its noise is not that of a cloud merged from several views"
-        raise UserError(what, fix="state with --threshold a value at which undamaged views have no finding")
+        what = "--quiet-capture is one cloud, and its noise differs from that of a cloud merged from several views"
+        raise UserError(what, fix="use --threshold with a value at which undamaged views have no finding")
 
 
 def refuse_repeats(paths: Sequence[Path]) -> None:
-    """Raise UserError where a capture is named twice."""
+    """Raise UserError if a capture is named twice."""
     places = [path.resolve() for path in paths]
     for path, place in zip(paths, places, strict=True):
         if places.count(place) > 1:
@@ -87,16 +87,16 @@ def refuse_repeats(paths: Sequence[Path]) -> None:
 def detector_of(
     arguments: argparse.Namespace, crop: str, assignments: Sequence[str]
 ) -> tuple[Detector, dict[str, Any]]:
-    """Return the detector with a crop and settings as --crop and --set state them, and all of its settings."""
+    """Return the detector with the crop and settings of --crop and --set, and all of its settings."""
     from detectors import detector_type, load_detector
 
     settings: dict[str, Any] = {}
     known = detector_type(arguments.detector).settings_type
     if "crop" in known.model_fields:
-        # of several views --crop is the mapping's, and so is --target
+        # with several views, --crop and --target belong to the mapping
         settings["crop"] = crop_from_text(crop, arguments.target if crop == arguments.crop else None)
     elif arguments.target is not None:
-        raise UserError(f"--target {arguments.target}: detector {arguments.detector} has no crop to choose it")
+        raise UserError(f"--target {arguments.target}: detector {arguments.detector} has no crop for it")
     reference = getattr(arguments, "reference", None)
     if reference is not None:
         if "surface" not in known.model_fields:
@@ -111,7 +111,7 @@ def detector_of(
 
 
 def mapping_of(arguments: argparse.Namespace) -> MappingConfig:
-    """Return the settings that merge views to one cloud. Raises UserError with every problem at once."""
+    """Return the settings that merge views into one cloud. Raises UserError with every problem at once."""
     from detectors.mapping.settings import MappingConfig
     from harness.vocabulary.declaration.diagnose import settings_of
 
@@ -128,10 +128,10 @@ def mapping_of(arguments: argparse.Namespace) -> MappingConfig:
 
 
 def crop_from_text(text: str, target: int | None = None) -> dict[str, Any]:
-    """Return the crop's declaration from text, with the automatic crop's candidate. Raises UserError."""
+    """Return the crop's declaration from text, with the number of the automatic crop's candidate. Raises UserError."""
     kind, _, values = text.partition(":")
     if target is not None and text != "auto":
-        what = f"--target {target}: chooses among what --crop auto finds, but --crop {text} is another crop"
+        what = f"--target {target}: chooses among the surfaces of --crop auto, but --crop {text} is another crop"
         raise UserError(what, fix="leave out one of the two")
     try:
         numbers = [float(value) for value in values.split(",")] if values else []
@@ -151,7 +151,7 @@ def crop_from_text(text: str, target: int | None = None) -> dict[str, Any]:
 
 
 def assign(settings: dict[str, Any], assignment: str) -> None:
-    """Put one KEY=VALUE into nested settings; the value is JSON where it can be, else text. UserError without one."""
+    """Put one KEY=VALUE into nested settings; the value is JSON if possible, else text. UserError without one."""
     path, equals, text = assignment.partition("=")
     if not (path and equals):
         raise UserError(f"--set {assignment}: has no value", legal="KEY=VALUE, for instance surface.degree=5")
@@ -195,7 +195,7 @@ FARTHEST_M = 100.0  # Largest distance of two views of one target: poses in mill
 
 def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
     """Return ``T_first_view`` (4, 4) of each view, the first the identity, from poses to any common frame. Raises
-    UserError where the file cannot be read, has another number of poses, or one that is not rigid or too far."""
+    UserError if the file cannot be read, has another number of poses, or one that is not rigid or too far."""
     import numpy as np
 
     from harness.vocabulary.geometry import invert
@@ -207,7 +207,7 @@ def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
         why = f"cannot be read ({error.strerror})" if isinstance(error, OSError) else f"holds no poses ({error})"
         raise UserError(f"{path}: {why}", legal=LEGAL_POSES) from error
     if len(poses) != count:
-        fix = "keep one pose for each PATH, in the same order (of a sequence's groundtruth.txt one line a view)"
+        fix = "keep one pose for each PATH, in the same order (one line per view for groundtruth.txt of a sequence)"
         raise UserError(f"{path}: {len(poses)} poses for {count} views", legal=LEGAL_POSES, fix=fix)
     from_first = [np.eye(4)]
     for number, pose in enumerate(poses):
@@ -227,7 +227,7 @@ def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
 
 
 def _from_json(path: Path, text: str) -> list[np.ndarray]:
-    """Parse a list of matrices: bare, or in an object that `harness.export` wrote, or without version by hand."""
+    """Parse a list of matrices: bare, in an object from `harness.export`, or in one without a version."""
     import numpy as np
 
     data = strict_json(text)

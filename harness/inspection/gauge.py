@@ -1,4 +1,4 @@
-"""A gauge board: its declaration, where a capture shows it by its coded marks, and which of its holes were found."""
+"""A gauge board: its declaration, its place in a capture by its coded marks, and which of its holes were found."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class GaugeMark(Config):
 
 
 class GaugeHole(Config):
-    """A hole to drill: its centre on the board, and its depth, None where it goes through."""
+    """A hole to drill: its centre on the board, and its depth (None for a through-hole)."""
 
     id: Annotated[int, Field(ge=1)]
     diameter_mm: Length
@@ -51,7 +51,7 @@ class GaugeHole(Config):
 
 
 class GaugeBoard(Config):
-    """One board: x to the right and y up from its centre, seen from the printed side."""
+    """One board: x to the right and y up from its centre, as seen from the printed side."""
 
     name: Annotated[str, Field(min_length=1)]
     width_mm: Length
@@ -61,7 +61,7 @@ class GaugeBoard(Config):
 
 
 class Gauge(Config):
-    """All boards, the dictionary of their codes (OpenCV's name), and how near a finding is a hit."""
+    """All boards, the dictionary of their codes (OpenCV's name), and the hit radius."""
 
     dictionary: str
     hit_radius_mm: Length
@@ -69,7 +69,7 @@ class Gauge(Config):
 
 
 def read_gauge(path: Path) -> Gauge:
-    """Read the truth file of `harness.gauge`. Raises UserError where it cannot be read or is another file."""
+    """Read the truth file of `harness.gauge`. Raises UserError if it cannot be read or is not such a file."""
     legal = "the gauge.json that python -m harness.gauge wrote"
     try:
         data = strict_json(bounded_bytes(path, RECORD_BYTES))
@@ -83,8 +83,8 @@ def read_gauge(path: Path) -> Gauge:
 
 @dataclass(frozen=True)
 class GaugeRow:
-    """A hole in a capture. ``found`` "NA": it was not judged all around; ``offset_mm`` and ``score`` of the hit.
-    ``counted``: detector with its version, its threshold in units of score, and the hit radius, mm."""
+    """A hole in a capture. ``counted``: detector with its version, threshold in units of score, and hit radius in mm.
+    ``found``: "NA" if the hole was not judged on all sides. ``offset_mm``, ``score``: of the hit."""
 
     board: str
     hole: GaugeHole
@@ -105,12 +105,12 @@ HITS_AND_MISSES = Table(
         Column("board", "board", "board", "name of the board"),
         Column("target", "hole", lambda row: f"{row.board}:{row.hole.id}", "board and number of the hole"),
         Column("diameter_mm", "diameter (mm)", "hole.diameter_mm", "of the drill"),
-        Column("depth_mm", "depth (mm)", "hole.depth_mm", "none where it goes through", text=_number),
-        Column("found", "found", "found", "hit, miss, or NA where not all around it was judged", text=str),
+        Column("depth_mm", "depth (mm)", "hole.depth_mm", "none for a through-hole", text=_number),
+        Column("found", "found", "found", "hit, miss, or NA if it was not judged on all sides", text=str),
         Column("offset_mm", "offset (mm)", "offset_mm", "of the finding's centre from the hole's", text=_number),
-        Column("score", "score", "score", "of that finding", text=_number),
-        Column("detector", "", lambda row: row.counted[0], "that looked for it, with its version"),
-        Column("threshold", "", lambda row: row.counted[1], "beyond which it finds, units of score"),
+        Column("score", "score", "score", "of the hit", text=_number),
+        Column("detector", "", lambda row: row.counted[0], "that searched for it, with its version"),
+        Column("threshold", "", lambda row: row.counted[1], "above which it detects, units of score"),
         Column("hit_radius_mm", "", lambda row: row.counted[2], "within which a finding is a hit"),
     ),
     formats=("csv",),
@@ -119,7 +119,7 @@ HITS_AND_MISSES = Table(
 
 @dataclass(frozen=True)
 class GaugeSeen:
-    """The boards that a capture shows. ``false_calls``: findings on them that hit no hole and lie on no mark."""
+    """The boards in a capture. ``false_calls``: findings on them that hit no hole and lie on no mark."""
 
     rows: tuple[GaugeRow, ...]
     false_calls: int
@@ -166,7 +166,7 @@ def seen_on(gauge: Gauge, judged: Judged, detector: str, threshold: float) -> Ga
         rows += own
         calls += beside
     if not rows:
-        why = found.problem or f"{len(by_code)} codes are read, and no board has three of them"
+        why = found.problem or f"{len(by_code)} codes were read, but no board has three of them"
         fix = "show the whole board, nearer to the camera, in the picture that is recorded beside the depth"
         raise UserError(f"--gauge: no board is recognised: {why}", fix=fix)
     return GaugeSeen(tuple(rows), calls, tuple(warnings), tuple(notes))
@@ -175,11 +175,11 @@ def seen_on(gauge: Gauge, judged: Judged, detector: str, threshold: float) -> Ga
 def _matched(
     board: GaugeBoard, counted: tuple[str, float, float], judged: Judged, T_board_camera: np.ndarray
 ) -> tuple[list[GaugeRow], int]:
-    """Return the rows of a board's holes, and how many findings on the board are false calls."""
+    """Return the rows of a board's holes, and the number of false calls among the findings on the board."""
     radius_m = counted[2] * MM
 
     def on_face(points_m: np.ndarray) -> np.ndarray:
-        """Return (n, 2): the board's face where lines of sight through points (n, 3) in the camera's frame meet it."""
+        """Return the points (n, 2) where lines of sight through points (n, 3) of the camera's frame meet the face."""
         points, lens = transform_points(T_board_camera, points_m.reshape(-1, 3)), T_board_camera[:3, 3]
         return np.asarray((lens + (points - lens) * (lens[2] / (lens[2] - points[:, 2]))[:, None])[:, :2])
 

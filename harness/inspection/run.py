@@ -1,4 +1,4 @@
-"""`harness.detect` step by step: one capture, or several views that become one cloud, judged and reported alike."""
+"""The steps of `harness.detect`: one capture, or several views merged into one cloud, judged and reported alike."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from detectors.noise import REACH_FRAMES, noise_reach_px
 from detectors.null import each_object_once, own_threshold
 from detectors.views import PreparedView, View
 from harness.inspection import arguments as asked
-from harness.inspection import told
+from harness.inspection import output
 from harness.inspection.gauge import HITS_AND_MISSES, GaugeSeen, read_gauge, seen_on
 from harness.report.findings import Judged, write_findings
 from harness.tables.outputs import GAUGE_ROWS
@@ -44,13 +44,15 @@ if TYPE_CHECKING:
     from detectors.recordings import Recording
     from detectors.registration.registered import Registration
 
-DEFAULT_K = 5.0  # Robust standard deviations, where the capture cannot tell; 0.6 of a million normal pixels lie beyond
-FAINT_CALLS = 0.05  # Expected false calls as strong as a finding, from which on noise explains the finding
+DEFAULT_K = (
+    5.0  # robust standard deviations, if the capture sets no threshold; 0.6 of a million normal pixels lie beyond
+)
+FAINT_CALLS = 0.05  # noise explains a finding if at least this many false calls of its score are expected
 THRESHOLDS = ("threshold", "quiet_capture", "false_calls")  # arguments of which each sets the threshold
 
 
 def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: float) -> Judged:
-    """Find damage beyond a threshold and missing returns, each damage and each object once, and measure them."""
+    """Find damage above a threshold and missing returns, each damage and each object once, and measure them."""
     missing = missing_returns(cloud, evidence)
     unseen = () if missing is None else missing.detections
     searched = detector.find(cloud, evidence, threshold)
@@ -65,18 +67,18 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
 
 
 def analysed(detector: Detector, cloud: Cloud) -> Evidence:
-    """Return the detector's evidence, with a warning where it fitted a stated surface that does not fit."""
+    """Return the detector's evidence, with a warning if it fitted a stated surface that does not fit."""
     evidence = detector.analyse(cloud)
     doubt = "" if "misfit_share" in evidence.notes else misfit(cloud, evidence.residual_m, "the stated surface")
     return replace(evidence, warnings=(*evidence.warnings, doubt)) if doubt else evidence
 
 
 OPEN_MM, FILTER_PX = 75.0, 3.0
-"""Depth beyond which a hole shows what lies far behind it, and the least width of a filter that hides its rim."""
+"""Depth beyond which a hole shows objects far behind it; least width of a filter that hides its rim."""
 
 
 def refuse_thresholds(arguments: argparse.Namespace) -> None:
-    """Raise UserError where several arguments set the threshold, or its value is not legal."""
+    """Raise UserError if several arguments set the threshold, or its value is not legal."""
     given = [f"--{name.replace('_', '-')}" for name in THRESHOLDS if getattr(arguments, name) is not None]
     if len(given) > 1:
         raise UserError(f"{' and '.join(given)} set the threshold", fix="give one of them")
@@ -92,9 +94,9 @@ def threshold_of(
     evidence: Evidence,
     quiet: Callable[[], tuple[float, str]],
 ) -> tuple[float, str, Evidence]:
-    """Return the threshold, its origin, and the evidence to search with it: given, calibrated on a quiet capture
-    (``quiet`` does it), the detector's own, or by the peaks of the capture towards the camera, which may leave out a
-    rim that cannot be judged; where these cannot be trusted, a fallback with warnings."""
+    """Return the threshold, its origin, and the evidence to search with it. The threshold is given, calibrated on a
+    quiet capture (by ``quiet``), the detector's own, or from the capture's peaks towards the camera, which may leave
+    out a rim that cannot be judged; if these cannot be trusted, it is a fallback with warnings."""
     if arguments.threshold is not None:
         return arguments.threshold, "given", evidence
     if arguments.quiet_capture is not None:
@@ -110,7 +112,7 @@ def threshold_of(
     if own.objects:
         peaks += f"; expect more beside objects, tags and edges in the picture ({own.objects} places)"
     if not cloud.organised:
-        peaks += "; objects on the target were not looked for"
+        peaks += "; objects on the target were not sought"
     if own.rim_pixels:
         peaks += f"; {own.rim_pixels} pixels along the rim are mixed with the background and are not judged"
     if own.doubts:
@@ -124,9 +126,9 @@ def threshold_of(
 
 
 def with_faint_warning(judged: Judged, threshold: float) -> Judged:
-    """Add a warning where noise explains more of the findings than false calls are expected, in a capture that set its
-    own threshold. The logarithm of their number is taken to fall with the square of the score, as normal
-    noise's does, through the peaks above the floor and the upper 95 % bound of what is expected at the threshold."""
+    """Add a warning if noise explains more of the findings than the expected false calls, in a capture that set its own
+    threshold. The logarithm of the number of false calls is assumed to fall with the square of the score, as for normal
+    noise, through the peaks above the floor and the upper 95 % bound of the number expected at the threshold."""
     null = judged.evidence.notes.get("own_null", {"threshold": None})
     if threshold != null["threshold"] or not FAINT_CALLS < null["high"] < null["peaks"]:
         return judged
@@ -143,8 +145,8 @@ def with_faint_warning(judged: Judged, threshold: float) -> Judged:
 
 
 def with_size_warnings(judged: Judged) -> Judged:
-    """Add warnings where findings reach the rim of what is judged, as the rest of them was not seen, and where the room
-    behind shows through holes whose rim the camera's filter, as wide as the noise's reach, draws over them."""
+    """Add warnings if findings reach the rim of the judged area, because the rest of them was not seen, and if distant
+    surfaces show through holes: the camera's filter, as wide as the noise's reach, then draws them over the rim."""
     cloud = judged.cloud
     if not cloud.organised:
         return judged
@@ -170,7 +172,7 @@ START_FROM_MARKS = ("icp", "cpd")  # methods that need a start; `joint` finds it
 
 @dataclass(frozen=True)
 class Inspection:
-    """Everything that a run found. ``mapped`` None: one capture; ``registrations``: data of registrations.json."""
+    """The results of a run. ``mapped``: None for one capture. ``registrations``: data of registrations.json."""
 
     arguments: argparse.Namespace
     recordings: list[Recording]
@@ -187,7 +189,7 @@ class Inspection:
 
     @property
     def cell_m(self) -> float | None:
-        """The side of a map's cells, None where the cloud is no map."""
+        """The side of a map's cells, None if the cloud is not a map."""
         surface_map = self.mapped.merged.surface_map if self.mapped else None
         return surface_map.cell_m if surface_map else None
 
@@ -206,7 +208,7 @@ def inspect(arguments: argparse.Namespace) -> int:
     recordings = [_opened(arguments, group) for group in ([[path] for path in paths] if config else [paths])]
     quiet = [] if arguments.quiet_capture is None else [_opened(arguments, [arguments.quiet_capture])]
 
-    # a view's name is its path's last part, or the whole path where these are not distinct
+    # a view's name is the last part of its path, or the whole path if these parts are not distinct
     names = [path.resolve().name for path in paths] if config else [recordings[0].name]
     names = names if len(set(names)) == len(names) else list(map(str, paths))
     views: list[View] = []
@@ -215,7 +217,7 @@ def inspect(arguments: argparse.Namespace) -> int:
         views.append(View(name, _averaged(arguments, recording, field), guess))
     for view in views:
         with _mistakes_named(view if config else None):
-            choices.append(told.choice_by(config or getattr(detector, "settings", None), view.cloud))
+            choices.append(output.choice_by(config or getattr(detector, "settings", None), view.cloud))
     mapped, registrations = None, dict[str, Any]()
     if config:
         mapped, registrations = _merged(arguments, config, recordings, views, choices)
@@ -260,7 +262,7 @@ def _averaged(arguments: argparse.Namespace, recording: Recording, field: FlatFi
 
 @contextmanager
 def _mistakes_named(view: View | None) -> Iterator[None]:
-    """Name the view, if there are several, in a UserError of one of its steps."""
+    """Name the view, if there are several, in a UserError from one of its steps."""
     try:
         yield
     except UserError as mistake:
@@ -275,21 +277,21 @@ def _merged(
     views: Sequence[View],
     choices: Sequence[Choice | None],
 ) -> tuple[Mapped, dict[str, Any]]:
-    """Find targets and marks (printed at once, as they explain later failures), register and merge; return also the
-    data of registrations.json. Raises UserError if a view has no target, or for each view that cannot be placed."""
+    """Find targets and marks (printed at once, as they explain later failures), register and merge. Also return the
+    data of registrations.json. Raises UserError if a view has no target, or for all views that cannot be placed."""
     from detectors.mapping.merge import Mapped, merge, prepare
     from detectors.registration.by_marks import register_by_marks
     from detectors.registration.register import register
 
     for view, choice in zip(views, choices, strict=True):
-        told.print_warnings(f"view {view.name}: {why}" for why in (choice.warnings if choice else ()))
+        output.print_warnings(f"view {view.name}: {why}" for why in (choice.warnings if choice else ()))
     prepared: list[PreparedView] = []
     for recording, view, choice in zip(recordings, views, choices, strict=True):
         with _mistakes_named(view):
             ready = prepare(view, config)
-        told.print_choice(choice)
-        told.print_capture(recording, view.cloud, view.name, ready.inside, arguments.crop)
-        told.print_marks(ready)
+        output.print_choice(choice)
+        output.print_capture(recording, view.cloud, view.name, ready.inside, arguments.crop)
+        output.print_marks(ready)
         prepared.append(ready)
     reference, has_poses = prepared[0], arguments.poses is not None
     if config.registration.method in START_FROM_MARKS and not has_poses:
@@ -308,7 +310,7 @@ def _merged(
         reasons = "\n  ".join(f"{each.view}: {each.failure.removeprefix(f'{each.view}: ')}" for each in failed)
         several = f"{len(failed)} of {len(registrations)} views" if len(failed) > 1 else "one view"
         what = f"{several} cannot be registered to {registrations[0].view} by {failed[0].method}:\n  {reasons}"
-        pose = "correct --poses where it is wrong" if has_poses else "state where they stand (--poses)"
+        pose = "correct --poses" if has_poses else "state their poses (--poses)"
         raise UserError(what, fix=f"leave such views out, {pose}, or choose another --register or --marks")
     mapped = Mapped(tuple(prepared), registrations, merge(tuple(prepared), registrations, config.merge))
     return mapped, _registration_data(mapped)
@@ -363,46 +365,46 @@ def _print(run: Inspection) -> None:
     # with several views, doubts about their targets were printed before the registration
     doubts = choice.warnings if run.mapped is None and choice else ()
     of_gauge = run.seen.warnings if run.seen else ()
-    told.print_warnings((*recorded, *doubts, *evidence.warnings, *of_gauge))
+    output.print_warnings((*recorded, *doubts, *evidence.warnings, *of_gauge))
     kept = np.isfinite(evidence.residual_m)
     if run.mapped is None:
-        told.print_choice(choice)
-        told.print_capture(run.recordings[0], cloud, run.recordings[0].name, kept, crop)
+        output.print_choice(choice)
+        output.print_capture(run.recordings[0], cloud, run.recordings[0].name, kept, crop)
         if not cloud.organised and crop == "auto" and (off := cloud.valid.sum() - kept.sum()) > 0:
             print(f"note: {off} points lie off the target or on its rim: not judged; --crop none judges all of them")
     else:
-        told.print_registrations(run.registrations)
+        output.print_registrations(run.registrations)
         merged = run.mapped.merged
-        told.print_notes(merged.notes)
+        output.print_notes(merged.notes)
         height, width = cloud.valid.shape
-        grid = f", a map of {width} x {height} cells of {told.mm(run.cell_m)}" if run.cell_m is not None else ""
+        grid = f", a map of {width} x {height} cells of {output.mm(run.cell_m)}" if run.cell_m is not None else ""
         print(f"merged: {len(merged.views_used)} views, {cloud.valid.sum()} points, {kept.sum()} judged{grid}")
-    unit = evidence.unit or f"{told.mm(evidence.scale_m)} at the median point"
+    unit = evidence.unit or f"{output.mm(evidence.scale_m)} at the median point"
     print(f"surface: {evidence.notes.get('surface', '')}; one unit of score is {unit}")
     if run.result.missing is not None:
         print(run.result.missing.blind_text)
-    print(f"threshold: {told.threshold_text(run.threshold, evidence)} ({run.origin})")
-    told.print_findings(run.result.findings, grid="px" if run.cell_m is None else "cell")
+    print(f"threshold: {output.threshold_text(run.threshold, evidence)} ({run.origin})")
+    output.print_findings(run.result.findings, grid="px" if run.cell_m is None else "cell")
     if run.seen is not None:
-        told.print_notes(run.seen.notes)
+        output.print_notes(run.seen.notes)
         show([HITS_AND_MISSES.grid(run.seen.rows, terminal=True)])
         print(run.seen.answer)
 
 
 def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
-    """Return the facts that the JSON holds beside the findings, with the origin and digests of all files read."""
+    """Return the facts in the JSON file besides the findings, with the origin and digests of all files read."""
     evidence, arguments = run.result.evidence, run.arguments
     settings: dict[str, Any] = {"average": arguments.average, "unit": arguments.unit}
     facts: dict[str, Any] = {}
     if run.mapped is None or run.config is None:
-        facts["target"] = told.choice_facts(run.choices[0])
-        facts["capture"] = told.capture_facts(run.recordings[0], run.result.cloud)
+        facts["target"] = output.choice_facts(run.choices[0])
+        facts["capture"] = output.capture_facts(run.recordings[0], run.result.cloud)
     else:
         merged, cell_mm = run.mapped.merged, None if run.cell_m is None else run.cell_m / MM
-        facts["frame"] = "of the merged cloud; registrations.json says where it stands to the first view's camera"
+        facts["frame"] = "of the merged cloud; registrations.json has its pose relative to the first view's camera"
         facts["captures"] = [
-            {"view": ready.view.name, **told.capture_facts(each, ready.view.cloud), "target": told.choice_facts(choice)}
-            for each, ready, choice in zip(run.recordings, run.mapped.views, run.choices, strict=True)
+            {"view": view.view.name, **output.capture_facts(each, view.view.cloud), "target": output.choice_facts(own)}
+            for each, view, own in zip(run.recordings, run.mapped.views, run.choices, strict=True)
         ]
         facts["merged"] = {"views": merged.views_used, "cell_mm": cell_mm, "notes": merged.notes}
         settings["mapping"] = run.config.to_data()
@@ -428,22 +430,22 @@ def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
 def _write(run: Inspection, facts: dict[str, Any]) -> None:
 
     mapped, beside = run.mapped, dict[str, Callable[[Path], object]]()
-    count, limit = len(run.result.detections), told.threshold_text(run.threshold, run.result.evidence)
+    count, limit = len(run.result.detections), output.threshold_text(run.threshold, run.result.evidence)
     subject = f"{len(mapped.merged.views_used)} views" if mapped else run.recordings[0].name
     title = f"{subject}: {count} findings beyond {limit}"
     if run.seen is not None:
         table = HITS_AND_MISSES.frame(run.seen.rows).to_csv(index=False, float_format="%.6g", lineterminator="\n")
         beside[GAUGE_ROWS.name] = lambda path: path.write_text(table, encoding="utf-8")
     if mapped is None:
-        beside |= told.pictures(run.choices[0])
+        beside |= output.pictures(run.choices[0])
     else:
         from harness.report.view3d import write_view3d
 
-        scene = told.scene_of(mapped, run.result)
+        scene = output.scene_of(mapped, run.result)
         beside["registrations.json"] = lambda path: path.write_text(plain_json(run.registrations), encoding="utf-8")
         beside["view3d.html"] = lambda path: write_view3d(path, scene, title)
         for number, choice in enumerate(run.choices, start=1):
-            beside |= told.pictures(choice, f"targets-{number}.png")
+            beside |= output.pictures(choice, f"targets-{number}.png")
     name = "merged.ply" if mapped else "cloud.ply"
     for path in write_findings(run.arguments.out, run.result, facts, title, cloud_name=name, beside=beside):
         print(f"wrote {path}")

@@ -50,18 +50,18 @@ def answer(found: Findable, patches: Patches, limits_mm: np.ndarray, size_mm: fl
 
 def warnings_of(found: Findable, seen: Mapping[Any, Seen]) -> list[str]:
     """Return what makes the figures unreliable, in sentences."""
-    said = [found.doubt] if found.doubt else []
+    warnings = [found.doubt] if found.doubt else []
     if unseen := sum(bool(np.isinf(each.deviation_m).all()) for each in seen.values()):
-        said.append(f"the detector judges nothing in {unseen} of the {len(seen)} poses looked at")
-    return said
+        warnings.append(f"the detector judges nothing in {unseen} of the {len(seen)} poses looked at")
+    return warnings
 
 
 def coverage_html(
-    name: str, said: str, first: str, scene: Scene3d, poses: Sequence[Mapping[str, Any]],
+    name: str, summary: str, first: str, scene: Scene3d, poses: Sequence[Mapping[str, Any]],
     goals: Sequence[Mapping[str, Any]], warnings: Sequence[str], command: str,
 ) -> str:  # fmt: skip
     """The page as text. It needs no network."""
     turns = tag("iframe", srcdoc=view3d_html(scene, name), kind="turns", title="the part, which turns as it is dragged")
     ways = [heading("Ways to the goal"), GOALS.grid(goals).html()] if goals else []
     body = [turns, *ways, heading("Poses"), POSES.grid(poses).html(), note(METHOD), *command_of(command)]
-    return page(f"Coverage: {name}", said, body, [note(first)], warnings)
+    return page(f"Coverage: {name}", summary, body, [note(first)], warnings)
