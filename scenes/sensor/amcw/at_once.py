@@ -311,7 +311,7 @@ class AtOnce:
 
     def totals(
         self, parts: Sequence[np.ndarray], errors_m: np.ndarray, stream: Callable[[int], np.random.Generator]
-    ) -> list[FrameTotals]:
+    ) -> Sequence[FrameTotals]:
         """Return the sums over the first of ``parts``, over the first two, and so on: each has numbers of frames (t,),
         no number twice. ``errors_m``: displacements by number. The noise of frames `LANES` k to `LANES` (k + 1) - 1
         comes from ``stream`` (k), whichever of them are requested."""
