@@ -50,7 +50,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     from detectors.flat_field import save_flat_field
     from harness.inspection.output import mm, print_warnings
     from harness.report.blocks import save_png
-    from harness.tables.flat_field import FLAT_CAPTURES, FLAT_FIGURES, figures_of
+    from harness.tables.characteristics import FLAT_CAPTURES, FLAT_FIGURES, figures_of
     from harness.tables.text import show
     from harness.vocabulary.files import write_json
     from harness.vocabulary.provenance import RESULTS_VERSION, record

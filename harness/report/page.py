@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +17,6 @@ from harness.report import blocks, sections
 from harness.report.blocks import COLOURS, MARKERS
 from harness.report.clouds import ExampleCloud, MappedExample, residual_figure
 from harness.report.perspectives import map_files, map_text, perspectives_html
-from harness.report.posterior import posterior_section
 from harness.report.summaries import Summaries, is_thesis, of_set_ups, summaries, verdicts_of
 from harness.report.view3d import write_view3d
 from harness.tables import trials
@@ -25,7 +25,7 @@ from harness.tables.study import axis_value
 from harness.tables.text import Grid, inches, many
 from harness.tables.trials import ERRORS, FALSE_CALLS, NOISE_BY_FRAMES, SET_UPS, SUMMARY, ResultTables
 from harness.thesis.claims import Verdict
-from harness.thesis.inference import borne_out_if
+from harness.thesis.inference import SET_UP, borne_out_if
 from harness.vocabulary.files import write_text
 from harness.vocabulary.path_names import in_words
 from harness.vocabulary.seeds import canonical_json
@@ -36,6 +36,34 @@ if TYPE_CHECKING:
 
 GUIDE = "#cfd6dd"
 MOST_ROWS = 4  # Rows of set-ups that the answer names one by one
+LIKELIEST = 10  # set-ups that the posterior's table shows
+
+
+def _posterior_section(posterior: pd.DataFrame) -> list[Any]:
+    """Heading, one small diagram for each axis, the likeliest set-ups; of `posterior_of`."""
+    axes = posterior[posterior["axis"] != SET_UP]
+    names = list(dict.fromkeys(axes["axis"]))
+
+    def draw(figure: Figure) -> None:
+        panels = figure.subplots(-(-len(names) // 4), min(4, len(names)), squeeze=False, sharey=True).ravel()
+        for panel, name in zip(panels, names, strict=False):
+            rows = axes[axes["axis"] == name]
+            panel.bar(rows["value"], rows["posterior_share"], color=blocks.BLUE, label="posterior")
+            panel.step(rows["value"], rows["prior_share"], where="mid", color=blocks.GREY, label="prior")
+            panel.set_title(fill(name, 24), fontsize=8)
+            panel.tick_params(axis="x", labelsize=8)
+            panel.set(ylim=(0, 1))
+        for panel in panels[len(names) :]:
+            panel.set_axis_off()
+        panels[0].legend()
+
+    figures = {"posterior": blocks.svg("posterior", (9, 2.4 * -(-len(names) // 4)), "posterior of each fact", draw)}
+    best = posterior[posterior["axis"] == SET_UP].head(LIKELIEST)
+    return [
+        blocks.heading("What would make the thesis true"),
+        blocks.figure(figures, "posterior", "Share of the posterior (bars) and of the prior (line) of each fact."),
+        trials.POSTERIOR.grid(sections.records(best)).html(),
+    ]
 
 
 def rates_figure(main: pd.DataFrame) -> str:
@@ -219,7 +247,7 @@ def set_ups_html(
         set_ups_answer(compared, layout, costs, verdict) if posterior is None else borne_out_if(posterior),
         figures,
         rule=sections.rule_note(int(compared["repeats"].max()) if len(compared) else 0, LIMIT_RULE, rule),
-        posterior=blocks.joined(posterior_section(posterior)) if posterior is not None else "",
+        posterior=blocks.joined(_posterior_section(posterior)) if posterior is not None else "",
         found=sections.set_ups_grid(compared).html(),
         rows=len(shown),
         costs="" if costs.empty else _costs_grid(costs).html(),

@@ -8,6 +8,7 @@ from typing import Any
 from markupsafe import Markup
 
 from harness.report.blocks import template
+from harness.vocabulary.declaration import shape
 from harness.vocabulary.path_names import camera_title, value_text
 
 BEHIND = ("source.target.backing.distance_mm", "source.target.backing_distance_mm")
@@ -36,7 +37,5 @@ def _values(facts: Mapping[str, Any], path: str) -> list[Any]:
     """Return the values of a setting: those of its axis, or the experiment's single value; empty where it has none."""
     if path in (axes := facts.get("sweep") or {}):
         return [value for value in axes[path] if value is not None]
-    value: Any = facts
-    for key in path.split("."):
-        value = value.get(key) if isinstance(value, Mapping) else None
+    value = shape.get(facts, tuple(path.split(".")))
     return [] if value is None else [value]

@@ -1,10 +1,15 @@
-"""Tables of a user's camera: figures of its captures and of simulations, points of its diagrams, its certificate."""
+"""Tables of a user's camera: its flat field, figures of its captures and of simulations, diagrams, its certificate."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 
 from harness.tables.schema import Column, Estimate, Table
+from harness.vocabulary.geometry import MM
 
 LEAST = {"mm": 0.01, "px": 0.05, "1": 0.05, "1/px": 0.01}
 """Measured values below these, by unit, are too small for a ratio to them to mean anything."""
@@ -96,3 +101,52 @@ CERTIFIED = Table(
     formats=(),
     left=4,
 )
+
+FLAT_CAPTURES = Table(
+    "flat_captures",
+    "one row per capture of the flat surface",
+    (
+        Column("capture", "capture", "name", "name of the capture"),
+        Column("frames", "frames", "frames", "number of averaged frames"),
+        Column("distance_m", "distance (m)", "distance_m", "median distance along the optical axis"),
+        Column("tilt_deg", "tilt (°)", "tilt_deg", "angle between the optical axis and the surface's normal"),
+        Column("pixels", "pixels", "pixels", "number of pixels used"),
+        Column("noise_mm", "noise (mm)", lambda one: one.noise_m / MM, "deviation of the average by temporal noise"),
+        Column(
+            "residual_mm",
+            "residual (mm)",
+            lambda one: float(np.sqrt(np.nanmean(one.residual_m**2))) / MM,
+            "root mean square of range minus a smooth fit: pattern, shape and noise",
+        ),
+    ),
+    formats=("csv",),
+)
+
+FLAT_FIGURES = Table(
+    "flat_field",
+    "one row per figure of the flat field",
+    (
+        Column("figure", "figure", note="name of the figure"),
+        Column("unit", "unit", note="mm, or 1 for shares and correlations"),
+        Column("value", "value", note="value; empty if the captures do not determine it"),
+        Column("meaning", "meaning", note="meaning of the figure", brief=False),
+    ),
+    formats=("csv",),
+    left=2,
+)
+
+
+def figures_of(found: Any) -> Iterator[dict[str, Any]]:
+    """Yield the rows of `FLAT_FIGURES` of a `detectors.flat_captures.Separated`."""
+
+    def row(figure: str, value: float | None, meaning: str, unit: str = "mm") -> dict[str, Any]:
+        return {"figure": figure, "value": value, "unit": unit, "meaning": meaning}
+
+    yield row("pattern", found.field.rms_m / MM, "rms of the unit's fixed pattern, without the map's noise")
+    yield row("noise of the map", found.noise_m / MM, "rms of the map's standard deviation")
+    shape = "the surface's shape" if found.separated else "the surface's shape, or a part of the pattern that changes"
+    yield row("between captures", found.surface_m / MM, f"deviation between captures beyond their noise: {shape}")
+    for part, what in ((found.in_time, "first and last captures"), (found.in_range, "near and far captures")):
+        excess, correlation = (None, None) if part is None else (part.excess_m / MM, part.correlation)
+        yield row(f"change, {what}", excess, f"rms of the difference of the maps of {what} beyond their noise")
+        yield row(f"correlation, {what}", correlation, f"correlation of the maps of {what}", "1")
