@@ -125,7 +125,7 @@ def test_arrays_of_objects_are_not_unpickled(tmp_path, suffix):
         ("a: !!python/object/apply:os.system ['touch touched']\n", "tag"),
         ("a: !!python/object:pathlib.Path {}\n", "tag"),
         (BOMB, "too many values"),
-        ("a: " + "[" * 100_000, "nested too deep"),
+        ("a: " + "[" * 100_000, "nested too deeply"),
         ("b: {" + "a," * 6_000 + "}", "too many values"),
         ("b: 1\na: [" + "1," * 11_000 + "]", "too many values"),
         ("k: v\n" * 5_000, "duplicate key"),

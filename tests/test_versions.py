@@ -44,12 +44,12 @@ def test_what_is_known_is_read(found, oldest):
         ),
         (1, "x.json: is a record of version 1\n  legal: versions 2 to 3\n  to do: run it again"),
         (None, "x.json: states no version of a record"),
-        (True, "states the version 'True', which is none"),
-        (2.0, "states the version '2.0', which is none"),
-        ("3", "states the version '3', which is none"),
-        (-1, "states the version '-1', which is none"),
-        ([3], "states the version '[3]', which is none"),
-        ("9" * 9999, "states the version '" + "9" * 40 + "', which is none"),
+        (True, "states the invalid version 'True'"),
+        (2.0, "states the invalid version '2.0'"),
+        ("3", "states the invalid version '3'"),
+        (-1, "states the invalid version '-1'"),
+        ([3], "states the invalid version '[3]'"),
+        ("9" * 9999, "states the invalid version '" + "9" * 40 + "'"),
     ],
 )
 def test_what_is_not_is_refused(found, told):
@@ -143,7 +143,7 @@ def test_findings_carry_it_in_a_column():
     [
         (RESULTS_VERSION + 1, f"newer tofpod: it is a file of poses of version {RESULTS_VERSION + 1}"),
         (0, "is a file of poses of version 0"),
-        ("1", "states the version '1', which is none"),
+        ("1", "states the invalid version '1'"),
         (None, "states no version"),
     ],
 )
