@@ -131,7 +131,7 @@ def test_what_all_set_ups_have_in_common_is_said_once(two: list[SetUpLimit]) -> 
     failed = [replace(one, record=replace(one.record, failed=3)) for one in two]
     failed[1] = replace(failed[1], a90_95=replace(failed[1].a90_95, value=np.inf, why="not demonstrated: of a ceiling"))
     notes = limit_notes(failed)
-    assert notes[0] == "every set-up: 3 trials failed and are missing"
+    assert notes[0] == "every set-up: 3 trials failed and are not included"
     assert notes[1] == "50 frames: of a ceiling"
     assert limit_notes(two[:1]) == []
     assert limit_notes([]) == []

@@ -43,7 +43,7 @@ def test_what_is_known_is_read(found, oldest):
             "x.json: was written by a newer tofpod: it is a record of version 4\n  legal: versions 2 to 3\n  to do: up",
         ),
         (1, "x.json: is a record of version 1\n  legal: versions 2 to 3\n  to do: run it again"),
-        (None, "x.json: states no version of a record"),
+        (None, "x.json: is a record that states no version"),
         (True, "states the invalid version 'True'"),
         (2.0, "states the invalid version '2.0'"),
         ("3", "states the invalid version '3'"),

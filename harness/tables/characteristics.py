@@ -1,4 +1,4 @@
-"""Tables of a user's camera: figures of its captures and of simulations, points of its diagrams, its certificate."""
+"""Tables of a user's camera: measured and simulated figures, points of diagrams, and the certificate."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from harness.tables.schema import Column, Estimate, Table
 
 LEAST = {"mm": 0.01, "px": 0.05, "1": 0.05, "1/px": 0.01}
-"""Measured values below these, by unit, are too small for a ratio to them to mean anything."""
+"""Measured values below these (by unit) are too small to divide by."""
 
 
 @dataclass(frozen=True)
 class OwnFigure:
-    """One figure: ``measured``, ``simulated`` from the camera file, and of the nearest ``known`` camera (or NaN)."""
+    """A figure as measured, as simulated from the camera file, and for the nearest known camera (or NaN)."""
 
     figure: str
     where: str
@@ -24,12 +24,12 @@ class OwnFigure:
 
     @property
     def ratio(self) -> float:
-        """Simulated over measured value; NaN where the measured value is close to 0."""
+        """The simulated value divided by the measured value; NaN if the measured value is close to 0."""
         return self._by_measured(self.simulated)
 
     @property
     def known_ratio(self) -> float:
-        """The known camera's over the measured value; NaN where the measured value is close to 0."""
+        """The known camera's value divided by the measured value; NaN if the measured value is close to 0."""
         return self._by_measured(self.known)
 
     def _by_measured(self, value: float) -> float:
@@ -41,14 +41,14 @@ OWN_FIGURES = Table(
     "characteristics",
     "one row per figure of the user's camera",
     (
-        Column("figure", "figure", "figure", "name of the figure, as makers name it"),
+        Column("figure", "figure", "figure", "name of the figure, as manufacturers use it"),
         Column("where", "where", "where", "surface, or direction and lag"),
         Column("unit", "unit", "unit", "mm, px or 1"),
         Column("measured", "measured", "measured", "value in the captures, with 95 % interval if known", interval=True),
         Column("simulated", "simulated", "simulated", "value in frames that are simulated from the camera file"),
-        Column("ratio", "ratio", "ratio", "simulated over measured value"),
+        Column("ratio", "ratio", "ratio", "simulated value divided by measured value"),
         Column("known", "known camera", "known", "value of the nearest known camera, simulated with the same surfaces"),
-        Column("known_ratio", "its ratio", "known_ratio", "known camera's over measured value", brief=False),
+        Column("known_ratio", "its ratio", "known_ratio", "known camera's value over measured value", brief=False),
         Column("meaning", "", "meaning", "meaning of the figure"),
     ),
     formats=("csv",),
@@ -62,8 +62,8 @@ OWN_CURVES = Table(
         Column("diagram", note="what y is, and what it is plotted against"),
         Column("source", note="measured, simulated or known camera"),
         Column("series", note="capture, or direction"),
-        Column("x", note="m, degrees, amplitude, pixels, cycles per pixel or number of the frame, by the diagram"),
-        Column("y", note="mm, share, correlation or density, by the diagram"),
+        Column("x", note="value on the x axis; the diagram decides whether m, degrees, amplitude, px, 1/px or frames"),
+        Column("y", note="value on the y axis; the diagram decides whether mm, share, correlation or density"),
     ),
     formats=("csv",),
 )
@@ -78,7 +78,7 @@ FLAT_SURFACES = Table(
         Column("form95_mm", "dispersion, 95 % (mm)", note="width of the layer that holds 95 % of a frame's points"),
         Column("form997_mm", "flatness, 99.7 % (mm)", note="width of the layer that holds 99.7 %"),
         Column("fill_rate", "fill rate", note="share of pixels and frames with a return"),
-        Column("lod95_1_mm", "LoD95, 1 frame (mm)", note="level of detection of one pixel's z, 1 frame"),
+        Column("lod95_1_mm", "LoD95, 1 frame (mm)", note="level of detection at 95 % of a pixel's z in 1 frame"),
         Column("lod95_10_mm", "10 frames (mm)", note="the same for the average of 10 frames"),
         Column("lod95_50_mm", "50 frames (mm)", note="the same for the average of 50 frames"),
     ),

@@ -19,12 +19,12 @@ FLAT_CAPTURES = Table(
         Column("distance_m", "distance (m)", "distance_m", "median distance along the optical axis"),
         Column("tilt_deg", "tilt (°)", "tilt_deg", "angle between the optical axis and the surface's normal"),
         Column("pixels", "pixels", "pixels", "number of pixels used"),
-        Column("noise_mm", "noise (mm)", lambda one: one.noise_m / MM, "deviation of the average by temporal noise"),
+        Column("noise_mm", "noise (mm)", lambda row: row.noise_m / MM, "temporal noise of the averaged distance"),
         Column(
             "residual_mm",
             "residual (mm)",
-            lambda one: float(np.sqrt(np.nanmean(one.residual_m**2))) / MM,
-            "root mean square of range minus a smooth fit: pattern, shape and noise",
+            lambda row: float(np.sqrt(np.nanmean(row.residual_m**2))) / MM,
+            "rms difference between the range and a smooth fit: pattern, shape and noise",
         ),
     ),
     formats=("csv",),
@@ -45,12 +45,12 @@ FLAT_FIGURES = Table(
 
 
 def figures_of(found: Any) -> Iterator[dict[str, Any]]:
-    """Yield the rows of `FLAT_FIGURES` of a `detectors.flat_captures.Separated`."""
+    """Yield the rows of `FLAT_FIGURES` for a `detectors.flat_captures.Separated`."""
 
     def row(figure: str, value: float | None, meaning: str, unit: str = "mm") -> dict[str, Any]:
         return {"figure": figure, "value": value, "unit": unit, "meaning": meaning}
 
-    yield row("pattern", found.field.rms_m / MM, "rms of the unit's fixed pattern, without the map's noise")
+    yield row("pattern", found.field.rms_m / MM, "rms of the unit's fixed pattern, corrected for the map's noise")
     yield row("noise of the map", found.noise_m / MM, "rms of the map's standard deviation")
     shape = "the surface's shape" if found.separated else "the surface's shape, or a part of the pattern that changes"
     yield row("between captures", found.surface_m / MM, f"deviation between captures beyond their noise: {shape}")

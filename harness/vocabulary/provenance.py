@@ -73,7 +73,7 @@ def check_version(
     legal, fix = f"version {known}" if first == known else f"versions {first} to {known}", again
     if isinstance(found, bool) or not isinstance(found, int) or found < 0:
         fault = "states no version" if found is None else f"states the invalid version {str(found)[:40]!r}"
-        message = f"{fault} of {what}"
+        message = f"is {what} that {fault}"
     elif found > known:
         message = f"was written by a newer tofpod: it is {what} of version {found}"
         fix = "upgrade tofpod, or use the version that wrote it"
