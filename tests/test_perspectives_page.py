@@ -62,8 +62,8 @@ def test_every_section_is_there_and_nothing_comes_from_outside(page):
         "Holes found",
         "Registration error",
         "Merged clouds",
-        "What each map gives",
-        "If facts were otherwise",
+        "Results of each map",
+        "If the facts were different",
         "Failures",
         "Provenance",
     ]

@@ -82,7 +82,7 @@ def test_the_stamp_of_a_text(text, found):
         (RECORD_VERSION + 1, f"newer tofpod: it is a record of version {RECORD_VERSION + 1}"),
         (OLDEST_VERSION - 1, f"is a record of version {OLDEST_VERSION - 1}"),
         (None, "states no version"),
-        ("one", "states the version 'one'"),
+        ("one", "states the invalid version 'one'"),
     ],
 )
 def test_a_studys_record(tmp_path, version, told):
@@ -111,7 +111,7 @@ def test_an_experiment_of_a_result_folder(tmp_path):
     for line, told in (
         (stamped("experiment", EXPERIMENT_VERSION + 1), "newer tofpod: it is an experiment of version"),
         (stamped("experiment", 0), "is an experiment of version 0"),
-        ("# tofpod experiment x1\n", "states the version 'x1'"),
+        ("# tofpod experiment x1\n", "states the invalid version 'x1'"),
     ):
         path.write_text(line + body)
         with pytest.raises(UserError, match=told):

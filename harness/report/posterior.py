@@ -1,4 +1,4 @@
-"""The part of a page that says which set-ups are compatible with the thesis' outcome."""
+"""The section of a page on set-ups that are compatible with the thesis' result."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SHOWN = 10
 
 
 def posterior_section(posterior: pd.DataFrame) -> list[Markup]:
-    """Heading, one small diagram for each axis, the likeliest set-ups; of `posterior_of`."""
+    """Return a heading, a small diagram for each axis, and the likeliest set-ups, from the result of `posterior_of`."""
     axes = posterior[posterior["axis"] != SET_UP]
     names = list(dict.fromkeys(axes["axis"]))
 
@@ -40,6 +40,6 @@ def posterior_section(posterior: pd.DataFrame) -> list[Markup]:
     best = posterior[posterior["axis"] == SET_UP].head(SHOWN)
     return [
         blocks.heading("What would make the thesis true"),
-        blocks.figure(figures, "posterior", "Share of the posterior (bars) and of the prior (line) of each fact."),
+        blocks.figure(figures, "posterior", "Posterior (bars) and prior (line) probability of each fact."),
         POSTERIOR.grid(sections.records(best)).html(),
     ]
