@@ -224,7 +224,7 @@ def test_bad_input_is_one_message(tmp_path, capsys):
     lens = ["--intrinsics", str(tmp_path / "lens.json"), "--out", str(tmp_path / "out")]
     for name, more, message in (
         ("equal.npz", [], "all frames are equal"),
-        ("short.npz", [], "2 frames; temporal noise needs repeats"),
+        ("short.npz", [], "2 frames: too few to measure temporal noise"),
         ("equal.npz", ["--albedo", "0"], "--albedo 0"),
         ("equal.npz", ["--rate", "-1"], "--rate -1"),
         ("equal.npz", ["--about", "firmware=1"], "need --certificate"),

@@ -278,7 +278,7 @@ def test_the_program_from_beginning_to_end(tmp_path, capsys, monkeypatch):
         (["--mask", "m.png"], "--mask belongs to a capture"),
         (["--capture", "x", "--figures", "own.yaml"], "--figures belongs to the scorecard"),
         (["--capture", "absent"], "absent: no such file or folder"),
-        (["--capture", "x", "--camera", "a", "--camera", "b"], "a capture comes from one camera"),
+        (["--capture", "x", "--camera", "a", "--camera", "b"], "a capture comes from a single camera"),
         (["--capture", "x", "--albedo", "0"], "--albedo 0"),
     ],
 )

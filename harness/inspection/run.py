@@ -1,4 +1,4 @@
-"""`harness.detect` step by step: one capture, or several views that become one cloud, judged and reported alike."""
+"""The steps of `harness.detect`: a capture, or several views that are merged into one cloud, is judged and reported."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ if TYPE_CHECKING:
     from detectors.recordings import Recording
     from detectors.registration.registered import Registration
 
-DEFAULT_K = 5.0  # Robust standard deviations, where the capture cannot tell; 0.6 of a million normal pixels lie beyond
-FAINT_CALLS = 0.05  # Expected false calls as strong as a finding, from which on noise explains the finding
-THRESHOLDS = ("threshold", "quiet_capture", "false_calls")  # arguments of which each sets the threshold
+DEFAULT_K = 5.0  # Fallback threshold in robust standard deviations, which 0.6 of a million normal pixels exceed
+FAINT_CALLS = 0.05  # Least expected number of false calls as strong as a finding by which noise explains the finding
+THRESHOLDS = ("threshold", "quiet_capture", "false_calls")  # arguments that each set the threshold
 
 
 def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: float) -> Judged:
-    """Find damage beyond a threshold and missing returns, each damage and each object once, and measure them."""
+    """Find damage beyond a threshold and missing returns, each damage and object once, and measure them."""
     missing = missing_returns(cloud, evidence)
     unseen = () if missing is None else missing.detections
     searched = detector.find(cloud, evidence, threshold)
@@ -58,28 +58,28 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
 
     def measure(each: Detection) -> Measurement:
         if each.kind == "object":
-            return measure_extents(cloud, each, "an object that lies on the target: no model of a hole fits it")
+            return measure_extents(cloud, each, "an object lies on the target, which the model of a hole does not fit")
         return (measure_missing if each.kind == "no return" else detector.measure)(cloud, evidence, each)
 
     return Judged(cloud, evidence, found, tuple(map(measure, found)), missing)
 
 
 def analysed(detector: Detector, cloud: Cloud) -> Evidence:
-    """Return the detector's evidence, with a warning where it fitted a stated surface that does not fit."""
+    """Return the detector's evidence, with a warning if the stated surface does not fit the target."""
     evidence = detector.analyse(cloud)
     doubt = "" if "misfit_share" in evidence.notes else misfit(cloud, evidence.residual_m, "the stated surface")
     return replace(evidence, warnings=(*evidence.warnings, doubt)) if doubt else evidence
 
 
 OPEN_MM, FILTER_PX = 75.0, 3.0
-"""Depth beyond which a hole shows what lies far behind it, and the least width of a filter that hides its rim."""
+"""Depth beyond which a hole shows the background, and the least width of a filter that hides its rim."""
 
 
 def refuse_thresholds(arguments: argparse.Namespace) -> None:
-    """Raise UserError where several arguments set the threshold, or its value is not legal."""
+    """Raise UserError if several arguments set the threshold, or if its value is not legal."""
     given = [f"--{name.replace('_', '-')}" for name in THRESHOLDS if getattr(arguments, name) is not None]
     if len(given) > 1:
-        raise UserError(f"{' and '.join(given)} set the threshold", fix="give one of them")
+        raise UserError(f"{' and '.join(given)} all set the threshold", fix="give only one of them")
     for name, value in (("threshold", arguments.threshold), ("false-calls", arguments.false_calls)):
         if value is not None and not 0 < value < float("inf"):
             raise UserError(f"--{name} {value:g}", legal="a number above 0")
@@ -92,9 +92,9 @@ def threshold_of(
     evidence: Evidence,
     quiet: Callable[[], tuple[float, str]],
 ) -> tuple[float, str, Evidence]:
-    """Return the threshold, its origin, and the evidence to search with it: given, calibrated on a quiet capture
-    (``quiet`` does it), the detector's own, or by the peaks of the capture towards the camera, which may leave out a
-    rim that cannot be judged; where these cannot be trusted, a fallback with warnings."""
+    """Return the threshold, its origin, and the evidence to search. The threshold is given, or calibrated on a quiet
+    capture (by ``quiet``), or the detector's own, or set by the capture's peaks towards the camera, which may exclude a
+    rim that cannot be judged. If those peaks are not reliable, it is a fallback with warnings."""
     if arguments.threshold is not None:
         return arguments.threshold, "given", evidence
     if arguments.quiet_capture is not None:
@@ -108,14 +108,14 @@ def threshold_of(
     notes = {**evidence.notes, "own_null": {name: getattr(own, name) for name in names}}
     peaks = f"{own.peaks} peaks towards the camera"
     if own.objects:
-        peaks += f"; expect more beside objects, tags and edges in the picture ({own.objects} places)"
+        peaks += f"; expect more next to objects, tags and edges in the image ({own.objects} places)"
     if not cloud.organised:
-        peaks += "; objects on the target were not looked for"
+        peaks += "; objects on the target were not searched for"
     if own.rim_pixels:
         peaks += f"; {own.rim_pixels} pixels along the rim are mixed with the background and are not judged"
     if own.doubts:
         k = max(DEFAULT_K, own.threshold) if math.isfinite(own.threshold) else DEFAULT_K
-        warnings = tuple(f"the capture cannot set its own threshold, {k:.3g} is used: {why}" for why in own.doubts)
+        warnings = tuple(f"the capture cannot set its own threshold, so {k:.3g} is used: {why}" for why in own.doubts)
         origin = f"a fallback, {k:.3g} units of score: the number of false calls is unknown; {peaks}"
         return k, origin, replace(own.evidence, notes=notes, warnings=(*evidence.warnings, *warnings))
     expected, low, high = map(_calls, (own.expected, own.low, own.high))
@@ -124,9 +124,9 @@ def threshold_of(
 
 
 def with_faint_warning(judged: Judged, threshold: float) -> Judged:
-    """Add a warning where noise explains more of the findings than false calls are expected, in a capture that set its
-    own threshold. The logarithm of their number is taken to fall with the square of the score, as normal
-    noise's does, through the peaks above the floor and the upper 95 % bound of what is expected at the threshold."""
+    """Add a warning if noise explains more findings than the expected false calls, in a capture that set its own
+    threshold. The logarithm of the number of false calls is assumed to fall with the square of the score, as for normal
+    noise, through the peaks above the floor and the upper 95 % bound of the number expected at the threshold."""
     null = judged.evidence.notes.get("own_null", {"threshold": None})
     if threshold != null["threshold"] or not FAINT_CALLS < null["high"] < null["peaks"]:
         return judged
@@ -137,14 +137,14 @@ def with_faint_warning(judged: Judged, threshold: float) -> Judged:
         return judged
     which = f"{len(faint)} of {len(judged.findings)} findings ({', '.join(faint)})"
     calls = f"{_calls(null['expected'])} false calls are expected, with scores up to about {sure:.2g}"
-    warning = f"{which} are so faint that noise explains them: {calls}"
+    warning = f"{which} are so faint that they may be noise: {calls}"
     evidence = replace(judged.evidence, warnings=(*judged.evidence.warnings, warning))
     return replace(judged, evidence=evidence)
 
 
 def with_size_warnings(judged: Judged) -> Judged:
-    """Add warnings where findings reach the rim of what is judged, as the rest of them was not seen, and where the room
-    behind shows through holes whose rim the camera's filter, as wide as the noise's reach, draws over them."""
+    """Add a warning for findings that reach the rim of the judged area, since a part of them was not seen, and for
+    holes that show the background, since the camera's filter (as wide as the noise's reach) blurs their rim."""
     cloud = judged.cloud
     if not cloud.organised:
         return judged
@@ -156,8 +156,8 @@ def with_size_warnings(judged: Judged) -> Judged:
     open_ = [str(each.id) for each in judged.findings if each.kind == "no return" or each.depth_mm > OPEN_MM]
     if open_ and cloud.noise_reach_px >= FILTER_PX:
         most_mm = cloud.noise_reach_px * float(np.nanmedian(np.abs(np.diff(cloud.points_m[..., 0], axis=1)))) / MM
-        far = f"holes that show what lies far behind, or nothing ({', '.join(open_)}), may be up to {most_mm:.2g} mm"
-        doubts.append(f"{far} wider than stated: the camera's filter mixes their rim into them")
+        far = f"holes that show the far background or nothing ({', '.join(open_)}) may be up to {most_mm:.2g} mm"
+        doubts.append(f"{far} wider than stated, because the camera's filter mixes their rim into them")
     return replace(judged, evidence=replace(judged.evidence, warnings=(*judged.evidence.warnings, *doubts)))
 
 
@@ -165,12 +165,12 @@ def _calls(expected: float) -> str:
     return f"{expected:.1f}" if expected >= 0.1 else f"{expected:.1g}" if expected >= 1e-4 else "0"
 
 
-START_FROM_MARKS = ("icp", "cpd")  # methods that need a start; `joint` finds its own, `odometry` goes view to view
+START_FROM_MARKS = ("icp", "cpd")  # methods that need a start; `joint` finds one, `odometry` goes from view to view
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """Everything that a run found. ``mapped`` None: one capture; ``registrations``: data of registrations.json."""
+    """The results of a run. ``mapped`` is None for a single capture; ``registrations`` is for registrations.json."""
 
     arguments: argparse.Namespace
     recordings: list[Recording]
@@ -187,13 +187,13 @@ class Inspection:
 
     @property
     def cell_m(self) -> float | None:
-        """The side of a map's cells, None where the cloud is no map."""
+        """The side length of a map's cells; None if the cloud is not a map."""
         surface_map = self.mapped.merged.surface_map if self.mapped else None
         return surface_map.cell_m if surface_map else None
 
 
 def inspect(arguments: argparse.Namespace) -> int:
-    """Open, average, register and merge views, judge, print, and write with --out. Returns 0. Raises UserError."""
+    """Open, average, register and merge views, judge them, print the results, and write them with --out. Returns 0."""
     config = asked.mapping_of(arguments) if arguments.register is not None else None
     paths = arguments.paths[: config.views] if config else arguments.paths
     asked.refuse_misfits(arguments, paths)
@@ -206,7 +206,7 @@ def inspect(arguments: argparse.Namespace) -> int:
     recordings = [_opened(arguments, group) for group in ([[path] for path in paths] if config else [paths])]
     quiet = [] if arguments.quiet_capture is None else [_opened(arguments, [arguments.quiet_capture])]
 
-    # a view's name is its path's last part, or the whole path where these are not distinct
+    # a view is named by the last part of its path, or by the whole path if these are not unique
     names = [path.resolve().name for path in paths] if config else [recordings[0].name]
     names = names if len(set(names)) == len(names) else list(map(str, paths))
     views: list[View] = []
@@ -225,7 +225,7 @@ def inspect(arguments: argparse.Namespace) -> int:
         undamaged = _averaged(arguments, quiet[0], field)
         threshold = detector.quiet_threshold(undamaged, detector.analyse(undamaged))
         frames = f"{undamaged.n_frames} frames, here {cloud.n_frames}"
-        return threshold, f"the lowest that is silent on {arguments.quiet_capture}, one repeat of {frames}"
+        return threshold, f"the lowest without a finding on {arguments.quiet_capture}, one repeat of {frames}"
 
     evidence = analysed(detector, cloud)
     doubted = dict.fromkeys(doubt for view in views if (doubt := unsteadiness(view.cloud)))
@@ -260,7 +260,7 @@ def _averaged(arguments: argparse.Namespace, recording: Recording, field: FlatFi
 
 @contextmanager
 def _mistakes_named(view: View | None) -> Iterator[None]:
-    """Name the view, if there are several, in a UserError of one of its steps."""
+    """Add the view's name to a UserError, if there are several views."""
     try:
         yield
     except UserError as mistake:
@@ -275,8 +275,8 @@ def _merged(
     views: Sequence[View],
     choices: Sequence[Choice | None],
 ) -> tuple[Mapped, dict[str, Any]]:
-    """Find targets and marks (printed at once, as they explain later failures), register and merge; return also the
-    data of registrations.json. Raises UserError if a view has no target, or for each view that cannot be placed."""
+    """Find targets and marks (printed at once, since they explain later failures), register and merge the views. Return
+    also the data of registrations.json. Raises UserError if views have no target or cannot be registered."""
     from detectors.mapping.merge import Mapped, merge, prepare
     from detectors.registration.by_marks import register_by_marks
     from detectors.registration.register import register
@@ -308,14 +308,14 @@ def _merged(
         reasons = "\n  ".join(f"{each.view}: {each.failure.removeprefix(f'{each.view}: ')}" for each in failed)
         several = f"{len(failed)} of {len(registrations)} views" if len(failed) > 1 else "one view"
         what = f"{several} cannot be registered to {registrations[0].view} by {failed[0].method}:\n  {reasons}"
-        pose = "correct --poses where it is wrong" if has_poses else "state where they stand (--poses)"
-        raise UserError(what, fix=f"leave such views out, {pose}, or choose another --register or --marks")
+        pose = "correct their --poses" if has_poses else "state their poses (--poses)"
+        raise UserError(what, fix=f"leave out these views, {pose}, or choose another --register or --marks")
     mapped = Mapped(tuple(prepared), registrations, merge(tuple(prepared), registrations, config.merge))
     return mapped, _registration_data(mapped)
 
 
 def _registration_data(mapped: Mapped) -> dict[str, Any]:
-    """Return registrations as plain data (metres in matrices, else millimetres), and checks that need no truth."""
+    """Return registrations as plain data (metres in matrices, else millimetres), with checks that need no truth."""
     from detectors.registration.by_marks import held_out_error_m
     from detectors.registration.registered import plane_through, predicted_error_m, thinned
 
@@ -360,7 +360,7 @@ def _registration_data(mapped: Mapped) -> dict[str, Any]:
 def _print(run: Inspection) -> None:
     cloud, evidence, crop, choice = run.result.cloud, run.result.evidence, run.arguments.crop, run.choices[0]
     recorded = [warning for recording in run.recordings for warning in recording.warnings]
-    # with several views, doubts about their targets were printed before the registration
+    # with several views, warnings about their targets were printed before the registration
     doubts = choice.warnings if run.mapped is None and choice else ()
     of_gauge = run.seen.warnings if run.seen else ()
     told.print_warnings((*recorded, *doubts, *evidence.warnings, *of_gauge))
@@ -369,7 +369,7 @@ def _print(run: Inspection) -> None:
         told.print_choice(choice)
         told.print_capture(run.recordings[0], cloud, run.recordings[0].name, kept, crop)
         if not cloud.organised and crop == "auto" and (off := cloud.valid.sum() - kept.sum()) > 0:
-            print(f"note: {off} points lie off the target or on its rim: not judged; --crop none judges all of them")
+            print(f"note: {off} points off the target or on its rim are not judged; --crop none judges all points")
     else:
         told.print_registrations(run.registrations)
         merged = run.mapped.merged
@@ -399,7 +399,7 @@ def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
         facts["capture"] = told.capture_facts(run.recordings[0], run.result.cloud)
     else:
         merged, cell_mm = run.mapped.merged, None if run.cell_m is None else run.cell_m / MM
-        facts["frame"] = "of the merged cloud; registrations.json says where it stands to the first view's camera"
+        facts["frame"] = "of the merged cloud; registrations.json gives its pose relative to the first view's camera"
         facts["captures"] = [
             {"view": ready.view.name, **told.capture_facts(each, ready.view.cloud), "target": told.choice_facts(choice)}
             for each, ready, choice in zip(run.recordings, run.mapped.views, run.choices, strict=True)
