@@ -230,7 +230,7 @@ def test_settings_that_are_varied_are_resolved_as_they_were_written(folder: Path
         ("{calibrate: {repeats: 4}}", "{}", ["x.yaml:9:12: `threshold`: give either `k` or `calibrate`"]),
         ("{calibrate:", "{k: 3.0, calibrate:", ["x.yaml:9:12: `threshold`: give either `k` or `calibrate`"]),
         ("{frames: 5}", "{frames: 20000}", ["x.yaml:7:19: `capture.frames` is 20000", "from 1 to 10000"]),
-        ("{frames: 5}", "{frames: 5, average: {frames: 2}}", ["x.yaml:7:32: an experiment counts its frames by"]),
+        ("{frames: 5}", "{frames: 5, average: {frames: 2}}", ["x.yaml:7:32: the number of frames is set by"]),
         (
             "azure_kinect_nfov",
             "azure_kinect",
@@ -330,7 +330,7 @@ def test_a_combination_that_cannot_be_is_named(folder: Path) -> None:
         (
             "frames: [1, 5]\n  vary",
             "frames: [1, 7]\n  vary",
-            ["16:15: 7 frames are not run in the main experiment", "of 1, 5"],
+            ["16:15: the main experiment has no set-up with 7 frames", "of 1, 5"],
         ),
         ("frames: [1, 5]\n  vary", "frames: [1, 1]\n  vary", ["are the same experiment"]),
         ("[0.5, 0.9]", "[0.5, 90]", ["19:21: `source.target.distance_m` is 90"]),

@@ -150,8 +150,7 @@ def json_text(judged: Judged, about: Mapping[str, Any]) -> str:
 
 
 def ply_bytes(cloud: Cloud, detections: Sequence[Detection]) -> bytes:
-    """Return the valid points (camera frame, metres, float32) as a binary PLY. Damage is magenta, the rest grey or
-    in the camera's colours."""
+    """Return the valid points (camera frame, metres, float32) as a binary PLY: damage magenta, the rest coloured."""
     import trimesh
 
     colours = np.full((cloud.valid.size, 3), 160, np.uint8)
