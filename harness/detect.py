@@ -1,4 +1,4 @@
-"""``python -m harness.detect``: finds the damage in a real capture; prints a table and, with --out, writes files."""
+"""``python -m harness.detect``: finds the damage in a real capture, prints a table and, with --out, writes files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     asked.add_reading(add)
     crop = f"the target: {asked.LEGAL_CROP}; auto: the nearest large smooth surface without its rim (crop.inset_px)"
     add("--crop", default="auto", metavar="KIND", help=crop)
-    target = "with --crop auto: inspect surface N of those that a run lists and targets.png shows"
+    target = "with --crop auto: inspect surface N of the list that a run prints and targets.png shows"
     add("--target", type=whole_number(10**9), metavar="N", help=target)
     add("--detector", default=asked.DEFAULT_DETECTOR, help=f"name of the detector (default: {asked.DEFAULT_DETECTOR})")
     setting = "a setting of the detector by dotted path: surface.degree=5"
@@ -42,9 +42,9 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group(
         "several views of one target",
         "Each PATH is one view. --crop cuts the target out of each view, and the detector judges the merged cloud (or"
-        " --set crop.kind=..). --set mapping.KEY=VALUE sets the rest: mapping.merge.cell_mm=1,"
-        " mapping.marks.dictionary=DICT_4X4_50, mapping.registration.points=target (icp and cpd on the whole target,"
-        " not on the points of the marks).",
+        " --set crop.kind=..). --set mapping.KEY=VALUE changes other settings: mapping.merge.cell_mm=1,"
+        " mapping.marks.dictionary=DICT_4X4_50, mapping.registration.points=target (icp and cpd use the whole target"
+        " instead of the points of the marks).",
     ).add_argument
     add("--register", choices=asked.METHODS, metavar="METHOD", help=f"register the views by {', '.join(asked.METHODS)}")
     add(
@@ -53,7 +53,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         metavar="KIND",
         help=f"merge them by {', '.join(asked.MERGES)} (default: fusion)",
     )
-    marks = "marks: colour (strips that stand apart; default), red (the thesis' rule), coded (ArUco, AprilTag)"
+    marks = "marks: colour (separate coloured strips; default), red (the thesis' rule), coded (ArUco, AprilTag)"
     add("--marks", choices=asked.MARKS, metavar="KIND", help=marks)
     poses = "poses from which registration starts: JSON with 4x4 matrices in metres, or TUM's groundtruth.txt"
     add("--poses", type=Path, metavar="FILE", help=poses)
@@ -61,8 +61,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Find damage in a real capture: average its frames, fit the surface, list what departs from it."
-    " With --register, each PATH is one view of the same target, and all of them become one cloud.",
+    "Find damage in a real capture: average its frames, fit the surface, and list what deviates from it."
+    " With --register, each PATH is one view of the same target, and all views are merged into one cloud.",
     epilog="examples: python -m harness.detect recording.mkv --crop box:-200,200,-150,150,400,900 --out found/"
     "; python -m harness.detect left.mcap right.mcap --register marks --merge fusion --out found/",
 )

@@ -319,7 +319,7 @@ def dropouts_of(captures: Sequence[StillCapture]) -> Dropouts:
 class SurfaceFigures:
     """Figures of a flat surface in mm, with manufacturers' names. ``temporal`` is the noise with its interval.
     ``frame_rms_mm`` is the rms distance of a frame's points from their own plane, ``average_rms_mm`` the average's.
-    Layers of ``form95_mm`` and ``form997_mm`` hold 95 and 99.7 % of the points. ``fill_rate`` is the share of returns."""
+    Layers of ``form95_mm`` and ``form997_mm`` hold 95 and 99.7 % of points. ``fill_rate`` is the share of returns."""
 
     capture: str
     number: int

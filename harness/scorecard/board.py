@@ -55,8 +55,8 @@ HOW = (
     "The board is declared, its view is rendered with light between its surfaces, the camera is simulated from its "
     "unchanged file, and the frames are resampled to the capture's pixels. The same analysis is applied to both: a "
     "quadratic surface is fitted to a ring of 6.5 to 13.5 mm around each hole, and the hole's peak is the largest "
-    "deviation from it within 6 mm of the centre. No other parameter is fitted. Not simulated: objects on the board, its "
-    "relief, and the maker's treatment of pixels between surfaces. Detectors see whole images and use one threshold."
+    "deviation from it within 6 mm of the centre. No other parameter is fitted. Not simulated: objects on the board, "
+    "its relief, and the maker's treatment of pixels between surfaces. Detectors see whole images, at one threshold."
 )
 CAPTION = (
     "Peak of each hole behind the face around it. Means over holes have Student's 95 % intervals; temporal deviations "
