@@ -86,7 +86,7 @@ def main(options: argparse.Namespace, command: str) -> int:
         known = known or camera_of_size(captures[0].lens)
         sources[KNOWN] = characteristics(simulated(with_lens(known, captures[0].lens), found, options.albedo), poses)
     rows, label = beside(found, twin, sources.get(KNOWN)), load_camera(known).title if known else ""
-    noise = ", ".join(f"{one.temporal.value:.3g} mm at {one.distance_m:.2f} m" for one in found.surfaces[:3])
+    noise = ", ".join(f"{face.temporal.value:.3g} mm at {face.distance_m:.2f} m" for face in found.surfaces[:3])
     answer = f"Temporal noise of single pixels: {noise}." if noise else "No flat surface was found."
     warnings = [*(warning for recording in recordings for warning in recording.warnings), *found.doubts]
     repeated = []

@@ -44,7 +44,7 @@ def main(options: argparse.Namespace, command: str) -> int:
         raise UserError(f"--alpha {options.alpha:g}", legal="1e-6 to 0.5")
     first, second = read_record(options.first), read_record(options.second)
     if not any(one is not None and other is not None for one, other in paired_set_ups(first, second)):
-        both = " / ".join("; ".join(one.label for one in study.set_ups) for study in (first, second))
+        both = " / ".join("; ".join(set_up.label for set_up in study.set_ups) for study in (first, second))
         what = f"no set-ups can be paired, since none has the same name and frames in both studies: {both}"
         legal = "set-ups with the same frames and the same name or values on the axes; or a single set-up in each"
         raise UserError(what, legal=legal, fix="run both studies with the same `sweep`, or each with a single set-up")

@@ -61,13 +61,13 @@ def main(options: argparse.Namespace, command: str) -> int:
     detectors = {point.config.detector.name for point in experiment.points}
     with in_use(cache), locked(folder), engine_of(run_options, detectors) as engine:
         ideal = ideal_of_set_ups(plan, engine, rate)
-        if unknown := [one.label for one in study.set_ups if (one.variant, one.frames) not in ideal]:
+        if unknown := [set_up.label for set_up in study.set_ups if (set_up.variant, set_up.frames) not in ideal]:
             what = f"{folder}: {EXPERIMENT.name} lacks the set-up {unknown[0]} of {STUDY.name}"
             raise UserError(what, fix="name an unchanged results folder, or run the study again")
-        rows = [efficiency_of(limit_of(one), ideal[one.variant, one.frames]) for one in study.set_ups]
+        rows = [efficiency_of(limit_of(set_up), ideal[set_up.variant, set_up.frames]) for set_up in study.set_ups]
         cameras, warnings = [point.config.simulated.camera for point in experiment.points], warnings_of(rows)
-        names = ", ".join(dict.fromkeys(one.name for one in cameras))
-        seeds = ", ".join(dict.fromkeys(str(one.unit_seed) for one in cameras))
+        names = ", ".join(dict.fromkeys(camera.name for camera in cameras))
+        seeds = ", ".join(dict.fromkeys(str(camera.unit_seed) for camera in cameras))
         first = (
             f"The ideal observer judges a new unit of {names} by the noise of {rows[0].ideal.units} units, at "
             f"{rate:g} false call{'' if rate == 1 else 's'} per m², with known size and depth; the detectors' hits are "

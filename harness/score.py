@@ -167,7 +167,7 @@ def _judged(
 
     def boards(split: str) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray, float]]:
         """Yield the boards of a split: name, scores (NaN if not inspected), places, damage, inspected area."""
-        for each in sorted(one for one in maps if one.startswith(f"{category}/{split}/")):
+        for each in sorted(name for name in maps if name.startswith(f"{category}/{split}/")):
             inspected, places, damage = read_arrays(options.dataset, each, *JUDGED_BY)
             scores, places_m = np.where(inspected, _read(maps[each]), np.nan), places.astype(float)
             yield each, scores, places_m, damage, float(np.nansum(pixel_areas(places_m)[inspected]))

@@ -286,7 +286,7 @@ def _drafts(
         chosen = [each for number in sorted(order) for each in [*groups.values()][number]]
     for settings in chosen:
         # a set-up has a name such as ``camera=kinect_v2, distance=0.75 m``
-        parts = [texts[id(one)] for one in settings if one.path in telling]
+        parts = [texts[id(setting)] for setting in settings if setting.path in telling]
         yield Draft(_label(settings), ", ".join(parts) or MAIN, settings, settings[-1].written_at if settings else ())
     common = _frame_settings(config.sensitivity and config.sensitivity.frames, ("sensitivity", "frames"))
     for variation in variations:

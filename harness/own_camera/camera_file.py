@@ -226,7 +226,7 @@ def _field(camera: AmcwCamera, found: Characteristics) -> Iterator[tuple[str, An
 
 def _gain(camera: Any, found: Characteristics, albedo: float) -> tuple[Any, float]:
     """Return the camera that reproduces the captures' temporal noise, and its gain, by secants on the logarithms."""
-    wanted, tried = {(one.capture, one.number): one.temporal.value for one in found.surfaces}, []
+    wanted, tried = {(surface.capture, surface.number): surface.temporal.value for surface in found.surfaces}, []
     gain = start = camera.photons.signal_electrons.value
     for _ in range(STEPS):
         camera = with_number(camera, "photons", "signal_electrons", gain)

@@ -73,12 +73,12 @@ def spacings_mm(found: Characteristics, poses: Sequence[np.ndarray]) -> Iterator
 def of_surfaces(found: Characteristics) -> Iterator[dict[str, Any]]:
     """Yield the rows of `FLAT_SURFACES`."""
     names = ("frame_rms_mm", "average_rms_mm", "form95_mm", "form997_mm", "fill_rate")
-    for one in found.surfaces:
-        lods = [level_of_detection_mm(found, (one.temporal.value * MM) ** 2, frames) for frames in LOD_FRAMES]
-        ends = one.temporal.interval
-        temporal = {"temporal_mm": one.temporal.value, "temporal_low_mm": ends.low, "temporal_high_mm": ends.high}
+    for face in found.surfaces:
+        lods = [level_of_detection_mm(found, (face.temporal.value * MM) ** 2, frames) for frames in LOD_FRAMES]
+        ends = face.temporal.interval
+        temporal = {"temporal_mm": face.temporal.value, "temporal_low_mm": ends.low, "temporal_high_mm": ends.high}
         levels = {f"lod95_{frames}_mm": lod for frames, lod in zip(LOD_FRAMES, lods, strict=True)}
-        yield {"surface": one.where, **temporal, **{name: getattr(one, name) for name in names}, **levels}
+        yield {"surface": face.where, **temporal, **{name: getattr(face, name) for name in names}, **levels}
 
 
 def certified(found: Characteristics, poses: Sequence[np.ndarray] | None) -> Iterator[dict[str, str]]:
@@ -107,17 +107,17 @@ def write_certificate(
     command: str,
 ) -> None:
     """Write certificate.html and .json. ``about`` states unit, mode, firmware and warm-up. May raise UserError."""
-    rows, limits = list(certified(found, poses)), [limit_of(one) for one in study.set_ups] if study else []
+    rows, limits = list(certified(found, poses)), [limit_of(set_up) for set_up in study.set_ups] if study else []
     surfaces = list(of_surfaces(found))
     share = "The camera's figures were measured."
     if study is not None:
         implanted = "For the detection limits, the frames were measured and the damage was simulated."
         share += f" {implanted if study.name == 'implant' else 'The detection limits were simulated.'}"
     answer = f"{many(found.frames, 'frame')} in {many(len(found.captures), 'capture')}, {len(found.jumps_m)} displaced."
-    for one in found.surfaces[:1]:
-        recorded = next(int(capture.kept.sum()) for capture in found.captures if capture.name == one.capture)
-        lod_mm = level_of_detection_mm(found, (one.temporal.value * MM) ** 2, frames := min(recorded, LOD_FRAMES[-1]))
-        noise = f"A pixel's noise is {one.temporal.value:.3g} mm at {one.distance_m:.2f} m"
+    for face in found.surfaces[:1]:
+        recorded = next(int(capture.kept.sum()) for capture in found.captures if capture.name == face.capture)
+        lod_mm = level_of_detection_mm(found, (face.temporal.value * MM) ** 2, frames := min(recorded, LOD_FRAMES[-1]))
+        noise = f"A pixel's noise is {face.temporal.value:.3g} mm at {face.distance_m:.2f} m"
         lod = f"the mean of {many(frames, 'recorded frame')} reveals a change of {lod_mm:.3g} mm (LoD95)"
         answer = f"{noise}; {lod}. {answer}"
     body = [PRINTED, heading("Unit"), bullets(f"{key}: {value}" for key, value in about.items())]

@@ -467,7 +467,7 @@ class Characteristics:
         if sigma_m < COARSE * first.step_m:
             notes.append(f"the noise ({sigma_m / MM:.2g} mm) is hidden by the rounding to {first.step_m / MM:.3g} mm,"
                         " and its size before rounding is uncertain")  # fmt: skip
-        if drifted := [one.name for one in self.captures if abs(one.drift_m) > JUMP_M]:
+        if drifted := [capture.name for capture in self.captures if abs(capture.drift_m) > JUMP_M]:
             notes.append(f"the distance drifts by more than {JUMP_M / MM:g} mm during {', '.join(drifted)}: the camera"
                         " warmed up or moved")  # fmt: skip
         if jumped := len(self.jumps_m):

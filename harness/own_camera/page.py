@@ -42,18 +42,18 @@ Told = tuple[str, str, str, float, str]
 
 def own_figures(found: Characteristics) -> Iterator[Told]:
     """Yield the figures of each surface and of the camera; all sources give the same figures in the same order."""
-    for one in found.surfaces:
+    for face in found.surfaces:
         relief = "includes the surface's own shape and the lens's error"
-        yield "temporal noise", one.where, "mm", one.temporal.value, "standard deviation of a pixel's z over frames"
+        yield "temporal noise", face.where, "mm", face.temporal.value, "standard deviation of a pixel's z over frames"
         forms = (
-            ("plane-fit rms, one frame", one.frame_rms_mm, "spatial noise of points about their own plane"),
-            ("plane-fit rms, average", one.average_rms_mm, "the same for the average of all frames"),
-            ("flat-form dispersion, 95 %", one.form95_mm, "layer with 95 % of the points, as in ISO 10360-13"),
-            ("flatness, 99.7 %", one.form997_mm, "layer with 99.7 % of the points, as in VDI/VDE 2634-2"),
+            ("plane-fit rms, one frame", face.frame_rms_mm, "spatial noise of points about their own plane"),
+            ("plane-fit rms, average", face.average_rms_mm, "the same for the average of all frames"),
+            ("flat-form dispersion, 95 %", face.form95_mm, "layer with 95 % of the points, as in ISO 10360-13"),
+            ("flatness, 99.7 %", face.form997_mm, "layer with 99.7 % of the points, as in VDI/VDE 2634-2"),
         )
         for name, value, meaning in forms:
-            yield name, one.where, "mm", value, f"{meaning}; {relief}"
-        yield "fill rate", one.where, "1", one.fill_rate, "share of pixels and frames with a return"
+            yield name, face.where, "mm", value, f"{meaning}; {relief}"
+        yield "fill rate", face.where, "1", face.fill_rate, "share of pixels and frames with a return"
     yield from shared_figures(found)
 
 
@@ -94,7 +94,7 @@ def beside(found: Characteristics, twin: Characteristics, known: Characteristics
         {(row[0], place.get(row[1], row[1])): row[3] for row in own_figures(each)} if each else {}
         for each, place in zip(every, places, strict=True)
     ]
-    ends = {("temporal noise", one.where): one.temporal.interval for one in found.surfaces}
+    ends = {("temporal noise", face.where): face.temporal.interval for face in found.surfaces}
     rows = []
     for name, where, unit, value, meaning in own_figures(found):
         key = name, places[0].get(where, where)

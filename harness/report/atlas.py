@@ -71,7 +71,7 @@ def save_atlas_png(path: Path, rows: Sequence[Row]) -> None:
             for frames, style in shown.items():
                 for title, colour in zip(titles, PALETTE, strict=False):
                     of = (damage, title, detector)
-                    line = [one for one in rows if (one.damage, one.title, one.surface.detector) == of]
+                    line = [row for row in rows if (row.damage, row.title, row.surface.detector) == of]
                     line = [one for one in line if one.place["frames"] == frames]
                     x = [one.place["distance_m"] for one in line]
                     names = ("low_mm", "a90_mm", "high_mm")

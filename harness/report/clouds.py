@@ -125,14 +125,14 @@ def examples_figure(name: str, examples: Sequence[StudyExample], title: str, *, 
     titles = TITLES if by_limit else SIZES
     columns = []
     for where in get_args(Where):
-        some = [one for one in examples if one.where == where]
-        columns.append(sorted(some, key=lambda one: (one.diameter_mm, one.board))[:MOST_DOWN])
+        some = [example for example in examples if example.where == where]
+        columns.append(sorted(some, key=lambda item: (item.diameter_mm, item.board))[:MOST_DOWN])
     rows = [
         [None if down >= len(line) else _example_cut(line[down], titles) for line in columns]
         for down in range(max(map(len, columns)))
     ]
     every = [one for line in columns for one in line]
-    captions = "; ".join(f"{one.diameter_mm:.1f} mm, {titles[one.where].lower()}, {_outcome(one)}" for one in every)
+    captions = "; ".join(f"{each.diameter_mm:.1f} mm, {titles[each.where].lower()}, {_outcome(each)}" for each in every)
     return _cuts(name, rows, f"{title}: {captions}.")
 
 

@@ -190,9 +190,9 @@ def findings_figure(cloud: Cloud, evidence: Evidence, detections: Sequence[Detec
             x, y = (cloud.points_m[..., k][judged] / MM for k in (0, 1))
             shown = axes[-1].scatter(x, y, c=residual_mm[judged], s=2, linewidths=0, **style)
         residual_bar(figure, shown, "mm behind (+) or before (−) the surface", ax=list(axes))
-        for one in axes:
-            _frame(one, cloud, box)
-            _circle(one, cloud, enumerate(detections, start=1))
+        for panel in axes:
+            _frame(panel, cloud, box)
+            _circle(panel, cloud, enumerate(detections, start=1))
 
     return _figure(title, panels * _height_in(box), draw)
 

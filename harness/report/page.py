@@ -271,7 +271,7 @@ def _costs_grid(costs: pd.DataFrame) -> Grid:
     rows = []
     for effect in dict.fromkeys(costs["effect"]):
         cells = [at.get((effect, against)) for at in places.values() for against in ("nothing", "all others")]
-        rows.append([effect.replace("all", "all together"), *("–" if one is None else cost_text(one) for one in cells)])
+        rows.append([effect.replace("all", "all together"), *("–" if row is None else cost_text(row) for row in cells)])
     return Grid.of(heads, rows)
 
 

@@ -94,11 +94,11 @@ VARIED = Table(
     "variations",
     "one row per variation and number of frames, beside the set-up that it changes",
     (
-        Column("", "variation", lambda one: in_words(one.variant["variant"])),
+        Column("", "variation", lambda row: in_words(row.variant["variant"])),
         Column("", "why", _why),
-        Column("", "changes", lambda one: in_words(one.variant["reference"] or "–")),
-        Column("", "frames", lambda one: "no trial of it finished" if one.row is None else one.row["frames"]),
-        Column("", "≠", lambda one: Cell("≠" if one.differs else "", "changed" if one.differs else "")),
+        Column("", "changes", lambda row: in_words(row.variant["reference"] or "–")),
+        Column("", "frames", lambda row: "no trial of it finished" if row.row is None else row.row["frames"]),
+        Column("", "≠", lambda row: Cell("≠" if row.differs else "", "changed" if row.differs else "")),
         *(
             _side(label, side)
             for label in ("found", "threshold (mm)", "surface noise (mm)")
@@ -147,7 +147,7 @@ def claims_section(title: str, verdicts: Sequence[Verdict]) -> Markup:
 
 def counted_verdicts(verdicts: Sequence[Verdict]) -> str:
     """Return ``Of 7 claims, 5 are borne out (C1, ...), 2 are undecided (...).``; empty without verdicts."""
-    named = {answer: [one.claim for one in verdicts if one.verdict == answer] for answer in MARKS}
+    named = {answer: [verdict.claim for verdict in verdicts if verdict.verdict == answer] for answer in MARKS}
     parts = [
         f"{len(names)} {'is' if len(names) == 1 else 'are'} {answer} ({', '.join(names)})"
         for answer, names in named.items()

@@ -32,10 +32,10 @@ ROW = 0.035
 
 def with_room(set_ups: Sequence[SetUpResult]) -> list[SetUpResult]:
     """Return the set-ups for figures: all, or `MOST_CURVES` spread evenly from the smallest limit to the largest."""
-    by_limit = sorted(set_ups, key=lambda one: one.limit.a90_95.value)
+    by_limit = sorted(set_ups, key=lambda set_up: set_up.limit.a90_95.value)
     places = np.linspace(0, len(by_limit) - 1, min(MOST_CURVES, len(by_limit))).round().astype(int)
     chosen = {id(by_limit[place]) for place in places}
-    return [one for one in set_ups if id(one) in chosen]
+    return [set_up for set_up in set_ups if id(set_up) in chosen]
 
 
 def overlay_figure(limits: Sequence[SetUpLimit]) -> str:
@@ -79,7 +79,7 @@ def draw_overlay(figure: Figure, limits: Sequence[SetUpLimit]) -> None:
 
 def depth_limits_figure(results: Sequence[SetUpResult]) -> str:
     """Draw the depth found 90 % of the time with its interval against diameter, with a line for each set-up."""
-    surfaces = [(one.limit, one.surface) for one in results if one.surface is not None][: len(COLOURS)]
+    surfaces = [(result.limit, result.surface) for result in results if result.surface is not None][: len(COLOURS)]
     deepest = max(surface.depth_range_mm[1] for _, surface in surfaces)
     shallowest = min(surface.depth_range_mm[0] for _, surface in surfaces)
 
@@ -247,7 +247,7 @@ def study_html(
     named: list[tuple[str, str]] = []
     for limit in (one.limit for one in shown):
         record = limit.record
-        some = [one for one in examples if (one.variant, one.frames) == (record.variant, record.frames)]
+        some = [example for example in examples if (example.variant, example.frames) == (record.variant, record.frames)]
         if some:
             title_of, name = name_of(limit), f"examples-{len(named) + 1}"
             named.append((title_of, name))
@@ -307,10 +307,10 @@ def _axis_caption(group: study.AxisGroup) -> str:
 def _surface_notes(result: StudyResult) -> list[str]:
     """Return the reasons why there is no surface over diameter and depth, or notes on it, with their set-ups."""
     reasons: dict[str, list[str]] = {}
-    for one in result.set_ups:
-        why = f"No surface: {one.surface_why}" if one.surface is None else one.surface.note
+    for set_up in result.set_ups:
+        why = f"No surface: {set_up.surface_why}" if set_up.surface is None else set_up.surface.note
         if why:
-            reasons.setdefault(why, []).append(name_of(one.limit))
+            reasons.setdefault(why, []).append(name_of(set_up.limit))
     every = len(result.set_ups)
     notes = {why: "" if len(names) == every else f" ({', '.join(names)})" for why, names in reasons.items()}
     return [f"{why}{where}." for why, where in notes.items()]

@@ -51,11 +51,11 @@ def run_scorecard(options: argparse.Namespace, command: str) -> int:
     began = time.perf_counter()
     options.out.mkdir(parents=True, exist_ok=True)
     every = scoring.read_figures(options.figures or scoring.FIGURES_FILE)
-    names = dict.fromkeys(options.camera) or dict.fromkeys(one.camera for one in every)
+    names = dict.fromkeys(options.camera) or dict.fromkeys(each.camera for each in every)
     titles = {name: load_camera(name).title for name in names}
-    figures = [one for one in every if one.camera in titles]
-    found = scoring.measured(dict.fromkeys(one.request for one in figures), FULL, options.jobs)
-    scores = [scoring.Score(one, found[one.request]) for one in figures]
+    figures = [each for each in every if each.camera in titles]
+    found = scoring.measured(dict.fromkeys(figure.request for figure in figures), FULL, options.jobs)
+    scores = [scoring.Score(figure, found[figure.request]) for figure in figures]
     provenance = {
         "results_version": RESULTS_VERSION,
         **record(command),

@@ -34,14 +34,14 @@ EFFICIENCY = Table(
         Column(
             "ideal_a50_mm",
             "ideal a50 (mm)",
-            lambda one: _ideal_size(one.half),
+            lambda row: _ideal_size(row.half),
             "diameter that the ideal observer finds 50 % of the time, with its 95 % interval over boards",
             interval=True,
         ),
         Column("ideal_is_at_most", "", "half.at_most", "whether it misses nothing: its sizes are then upper bounds"),
-        Column("a50_mm", "a50 (mm)", lambda one: a50_of(one.limit), "the detector's a50", interval=True),
-        Column("ideal_a90_mm", "ideal a90 (mm)", lambda one: _ideal_size(one.most), IDEAL_A90, interval=True),
-        Column("a90_mm", "a90 (mm)", lambda one: a90_of(one.limit), "the detector's a90", interval=True),
+        Column("a50_mm", "a50 (mm)", lambda row: a50_of(row.limit), "the detector's a50", interval=True),
+        Column("ideal_a90_mm", "ideal a90 (mm)", lambda row: _ideal_size(row.most), IDEAL_A90, interval=True),
+        Column("a90_mm", "a90 (mm)", lambda row: a90_of(row.limit), "the detector's a90", interval=True),
         Column("ideal_index_50", "", "half.ideal_index", f"{INDEX} that it finds 50 % of the time"),
         Column("index_50", "d' at 50 %", ("half.index", "half.index_interval"), INDEX_50),
         Column(

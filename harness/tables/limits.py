@@ -117,30 +117,30 @@ LIMITS = Table(
         Column(
             "a90_95_mm",
             "a90/95 (mm)",
-            lambda one: bound_estimate(one, one.a90_95),
+            lambda row: bound_estimate(row, row.a90_95),
             "upper bound of a90 at 95 % confidence, which is the limit to quote; empty if not demonstrated",
             bound_text,
-            tone=lambda one: "key" if is_within_sizes(one) else "bad",
+            tone=lambda row: "key" if is_within_sizes(row) else "bad",
         ),
-        Column("a90_95_verdict", "", lambda one: _verdict(one, one.a90_95), MET),
+        Column("a90_95_verdict", "", lambda row: _verdict(row, row.a90_95), MET),
         Column("a90_95_method", "", "a90_95.method", "method by which the bound was computed"),
         Column(
             "over_boards_mm",
             "over boards (mm)",
-            lambda one: bound_estimate(one, one.over_boards),
+            lambda row: bound_estimate(row, row.over_boards),
             "a90/95 that allows for correlated results of the damages on a board",
             bound_text,
-            tone=lambda one: "" if is_within_sizes(one, one.over_boards) else "bad",
+            tone=lambda row: "" if is_within_sizes(row, row.over_boards) else "bad",
         ),
-        Column("over_boards_verdict", "", lambda one: _verdict(one, one.over_boards), MET),
+        Column("over_boards_verdict", "", lambda row: _verdict(row, row.over_boards), MET),
         Column(
             "new_unit_mm",
             "new unit (mm)",
-            lambda one: bound_estimate(one, quoted(one)) if one.over_units else None,
+            lambda row: bound_estimate(row, quoted(row)) if row.over_units else None,
             "if there are several units: upper bound, at 95 % confidence, of the a90 of a new unit",
             lambda bound: text.UNKNOWN_TEXT if bound is None else bound_text(bound),
         ),
-        Column("new_unit_verdict", "", lambda one: _verdict(one, quoted(one)) if one.over_units else None, MET),
+        Column("new_unit_verdict", "", lambda row: _verdict(row, quoted(row)) if row.over_units else None, MET),
         Column("one_unit_mm", "one unit (mm)", _one_unit, "a90/95 of single units: median, lowest, highest", **BRIEF),
         Column("unit_spread", "", "over_units.spread", "standard deviation of ln a90 between units, noise included"),
         Column("units", "", "record.units", "number of units of the camera"),
@@ -148,8 +148,8 @@ LIMITS = Table(
         Column("a50_mm", "a50 (mm)", a50_of, f"{FOUND_50}, with its 95 % interval over boards", **BRIEF),
         Column("limit_of", "", "record.inspected.limit_of", OF),
         Column("is_at_most", "", "is_at_most", "whether everything was found, so that a50 and a90 are upper bounds"),
-        Column("smallest_mm", "", lambda one: _ends_mm(one)[0], "smallest size inspected"),
-        Column("largest_mm", "", lambda one: _ends_mm(one)[1], "largest size inspected"),
+        Column("smallest_mm", "", lambda row: _ends_mm(row)[0], "smallest size inspected"),
+        Column("largest_mm", "", lambda row: _ends_mm(row)[1], "largest size inspected"),
         *CALLS,
         Column(
             "beside_per_m2",
@@ -179,8 +179,8 @@ LIMITS = Table(
             lambda seconds: text.UNKNOWN_TEXT if np.isnan(seconds) else f"{1e3 * seconds:.0f}",
             brief=False,
         ),
-        Column("hits_by_depth", "", lambda one: (_kinds(one) or (None, None))[0], "hits by depth"),
-        Column("hits_by_no_return", "", lambda one: (_kinds(one) or (None, None))[1], "hits by missing returns"),
+        Column("hits_by_depth", "", lambda row: (_kinds(row) or (None, None))[0], "hits by depth"),
+        Column("hits_by_no_return", "", lambda row: (_kinds(row) or (None, None))[1], "hits by missing returns"),
         Column("targets", "targets", "targets", "number of damages", brief=False),
         Column("boards", "boards", "boards", "number of damaged boards"),
         Column("design_effect", "design effect", "design_effect", EFFECT, text.mm, brief=False),
@@ -190,7 +190,7 @@ LIMITS = Table(
         Column("detector", "", "record.detector", "name of the detector"),
         Column("detector_version", "", "record.detector_version", "version of the detector"),
         Column("failed", "", "record.failed", "number of trials that failed"),
-        Column("notes", "", lambda one: "; ".join(notes_of(one)), "remarks on the limit"),
+        Column("notes", "", lambda row: "; ".join(notes_of(row)), "remarks on the limit"),
     ),
     title="detection limits: sizes found 50 and 90 % of the time, and 90 % with 95 % confidence",
 )
@@ -308,7 +308,7 @@ def notes_of(limit: SetUpLimit) -> list[str]:
 def limit_notes(limits: Sequence[SetUpLimit]) -> list[str]:
     """Return notes on the limits: first those that all set-ups share, then a line for each set-up."""
     notes = [(limit.record.label, notes_of(limit)) for limit in limits]
-    shared = [one for one in notes[0][1] if all(one in these for _, these in notes)] if len(notes) > 1 else []
+    shared = [note for note in notes[0][1] if all(note in these for _, these in notes)] if len(notes) > 1 else []
     own = [("every set-up", shared), *((name, [one for one in these if one not in shared]) for name, these in notes)]
     return [f"{name}: {'; '.join(these)}" for name, these in own if these]
 

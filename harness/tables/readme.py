@@ -45,7 +45,7 @@ def results_readme() -> Iterator[str]:
     yield HEAD
     for of, title in GROUPS.items():
         yield from ("", f"## {title}", "", "| file | content |", "|---|---|")
-        yield from (f"| `{one.name}` | {one.note} |" for one in FILES if one.of == of)
+        yield from (f"| `{output.name}` | {output.note} |" for output in FILES if output.of == of)
     yield TABLES
     of_trials = [table for table in STORED if table not in STUDY_ONLY]
     yield from _tables("Trials", of_trials)

@@ -100,22 +100,22 @@ def set_by(limits: Sequence[SetUpLimit]) -> list[SetBy]:
 def threshold_warnings(limits: Sequence[SetUpLimit]) -> list[str]:
     """Return warnings about calibrated thresholds that are too high for noise or set by one place on the sensor."""
     rows = set_by(limits)
-    warnings, crowded = [], [one for one in rows if (one.same_pixels or 0) > max(one.runs / 2, 1)]
+    warnings, crowded = [], [row for row in rows if (row.same_pixels or 0) > max(row.runs / 2, 1)]
     if crowded:
-        counts = sorted({one.same_pixels or 0 for one in crowded})
+        counts = sorted({row.same_pixels or 0 for row in crowded})
         where = crowded[0].limit.record.label if len(crowded) == 1 else f"{len(crowded)} of {len(limits)} set-ups"
         warnings.append(
             f"{where}: {' to '.join(map(str, counts[:1] + counts[1:][-1:]))} of {crowded[0].runs} calibration boards "
             "have their highest score on the same pixels of the sensor: one place of this unit's fixed pattern sets "
             "the threshold (set study.units to draw several units)"
         )
-    for one in rows:
-        threshold = one.limit.record.threshold
+    for row in rows:
+        threshold = row.limit.record.threshold
         if threshold > HIGH_THRESHOLD:
-            where = one.place if one.place == OFF_BOARD else f"at x, y = {one.place} mm"
+            where = row.place if row.place == OFF_BOARD else f"at x, y = {row.place} mm"
             warnings.append(
-                f"{one.limit.record.label}: the threshold is {threshold:.3g} deviations, above {HIGH_THRESHOLD:g}: "
-                f"something other than noise sets it (calibration board {one.board}, {where}) and thus the limit"
+                f"{row.limit.record.label}: the threshold is {threshold:.3g} deviations, above {HIGH_THRESHOLD:g}: "
+                f"something other than noise sets it (calibration board {row.board}, {where}) and thus the limit"
             )
     return warnings
 
@@ -153,7 +153,7 @@ def operating_notes(results: Sequence[SetUpResult]) -> list[str]:
         "AU-PRO: area under the mean share of a damage's pixels above the threshold, against the share of undamaged "
         f"pixels above it, up to a share of {PRO_LIMIT:g} and divided by {PRO_LIMIT:g}, as in MVTec AD."
     )
-    without = [one for one in results if one.pixels is not None and one.pixels.why]
+    without = [result for result in results if result.pixels is not None and result.pixels.why]
     return [text, *(f"{name_of(one.limit)}: no AU-PRO: {one.pixels.why}." for one in without if one.pixels)]
 
 
@@ -252,12 +252,12 @@ AXES = Table(
     (
         Column("axis", "", "group.path", "dotted path of the axis"),
         Column("line", "set-ups", "line", "values of the line's set-ups on the other axes"),
-        Column("value", "", lambda one: on_one_line(one.value), "value on the axis"),
-        Column("", "value", lambda one: one.group.words(one.value)),
+        Column("value", "", lambda row: on_one_line(row.value), "value on the axis"),
+        Column("", "value", lambda row: row.group.words(row.value)),
         replace(SET_UP_OF, label=""),
-        Column("a50_mm", "a50 (mm)", lambda one: a50_of(one.limit), f"{FOUND_50}, with interval", interval=True),
-        Column("a90_mm", "a90 (mm)", lambda one: a90_of(one.limit), f"{FOUND_90}, with interval", interval=True),
-        Column("a90_95_mm", "a90/95 (mm)", lambda one: bound_estimate(one.limit, one.limit.a90_95), BOUND, bound_text),
+        Column("a50_mm", "a50 (mm)", lambda row: a50_of(row.limit), f"{FOUND_50}, with interval", interval=True),
+        Column("a90_mm", "a90 (mm)", lambda row: a90_of(row.limit), f"{FOUND_90}, with interval", interval=True),
+        Column("a90_95_mm", "a90/95 (mm)", lambda row: bound_estimate(row.limit, row.limit.a90_95), BOUND, bound_text),
         Column("", "a90 over the row above", _step_text),
         Column("ratio", "", ("step.ratio", "step.interval"), "a90 over a90 at the previous value, with interval"),
         Column("beyond_chance", "", "step.beyond_chance", "whether that interval excludes 1"),
@@ -296,7 +296,7 @@ class DepthAt(NamedTuple):
 def depths_at(results: Sequence[SetUpResult]) -> list[DepthAt]:
     """Return the contours at a probability of 90 % of all surfaces."""
     rows = []
-    for limit, surface in ((one.limit, one.surface) for one in results if one.surface is not None):
+    for limit, surface in ((result.limit, result.surface) for result in results if result.surface is not None):
         depths = np.stack([surface.d90_mm, surface.d90_low_mm, surface.d90_high_mm], axis=1).tolist()
         for diameter, (depth, low, high) in zip(surface.diameter_mm.tolist(), depths, strict=True):
             rows.append(DepthAt(limit, diameter, Estimate(depth, low, high, surface.depth_range_mm[1])))
@@ -321,7 +321,7 @@ def study_tables(result: StudyResult) -> dict[Table, list[Any]]:
     return {
         LIMITS: list(limits),
         THRESHOLDS: list(limits),
-        CHANCE: [one for one in set_ups if one.chance is not None],
+        CHANCE: [set_up for set_up in set_ups if set_up.chance is not None],
         OPERATING: list(set_ups),
         AXES: [row for group in axis_groups(result.axes) for row in axis_rows(group)],
         DEPTH_LIMITS: depths_at(set_ups),

@@ -280,7 +280,7 @@ SUMMARY = Table(
     (
         *COMMON[:2],
         Column("hole", "hole", note="number of the damage"),
-        *(replace(one, label={"true_diameter_mm": "true (mm)"}.get(one.name, "")) for one in TRUTH),
+        *(replace(column, label={"true_diameter_mm": "true (mm)"}.get(column.name, "")) for column in TRUTH),
         *_columns(n="number of trials", detected="number of trials that detected it"),
         Column("rate", note="share of trials that detected it, with Wilson's interval", interval=True),
         *_columns(status="found, missed or undecided: the interval lies above, lies below or contains 0.5"),

@@ -32,7 +32,7 @@ def _c7(case: maps.MapCase) -> tuple[Answer, str]:
     if alone is None:
         return "undecided", "Not judged: the experiment has no single view to compare with."
     rows = case.registrations(alone.frames)
-    most = max(one.views for one in case.set_ups)
+    most = max(set_up.views for set_up in case.set_ups)
     pairs = {method: maps.of_map(rows, method, most) for method in dict.fromkeys(rows["method"])}
     if not {"icp", "cpd"} <= set(pairs):
         return "undecided", "Not judged: the experiment does not try both ICP and CPD."
@@ -241,8 +241,8 @@ def score_views(cases: Sequence[maps.MapCase]) -> list[Verdict]:
 
 def _over_units(verdicts: Sequence[Verdict]) -> Verdict:
     """Combine the verdicts on units of a camera: their common verdict if they agree and are enough, or "undecided"."""
-    evidence = " ".join(one.evidence for one in verdicts)
-    answers = [one.verdict for one in verdicts]
+    evidence = " ".join(verdict.evidence for verdict in verdicts)
+    answers = [verdict.verdict for verdict in verdicts]
     if len(verdicts) < FEWEST_UNITS and set(answers) != {"undecided"}:
         on = f"{many(len(verdicts), 'unit')} of the camera"
         evidence = f"Judged on only {on}, so nothing follows for others: {', '.join(answers)}. {evidence}"
