@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harness.inspection import arguments as asked
+from harness.inspection import arguments as cli
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM
 from harness.vocabulary.program import program
@@ -44,13 +44,13 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--hit-radius", type=float, default=15.0, metavar="MM", help="largest distance of a hit (default: 15)")
     add("--apart", type=float, metavar="MM", help="least distance of damages (default: 2 hit radii plus 10)")
     add("--seed", type=int, default=1, help="seed of places, sizes and noise (default: 1)")
-    calls = f"expected number, which sets the threshold as in harness.detect (default: {asked.DEFAULT_FALSE_CALLS:g})"
+    calls = f"expected number, which sets the threshold as in harness.detect (default: {cli.DEFAULT_FALSE_CALLS:g})"
     add("--false-calls", type=float, metavar="N", help=calls)
     add("--threshold", type=float, metavar="K", help="threshold in units of score, instead of --false-calls")
-    add("--detector", default=asked.DEFAULT_DETECTOR, help=f"detector's name (default: {asked.DEFAULT_DETECTOR})")
+    add("--detector", default=cli.DEFAULT_DETECTOR, help=f"detector's name (default: {cli.DEFAULT_DETECTOR})")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of the detector: surface.degree=5")
-    add("--crop", default="auto", metavar="KIND", help=f"the target: {asked.LEGAL_CROP}")
-    asked.add_reading(add)
+    add("--crop", default="auto", metavar="KIND", help=f"the target: {cli.LEGAL_CROP}")
+    cli.add_reading(add)
     add("--out", type=Path, default=Path("results/implant"), metavar="DIR", help="default: results/implant")
 
 
@@ -97,7 +97,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     for name, number in [*numbers, *(("frames", each) for each in options.frames or ())]:
         if not 0 < number < math.inf:
             raise UserError(f"--{name} {number:g}", legal="above 0")
-    detector, settings = asked.detector_of(options, options.crop, options.set)
+    detector, settings = cli.detector_of(options, options.crop, options.set)
 
     def own_threshold(cloud: Any) -> tuple[float, tuple[str, ...]]:
         value, _, evidence = threshold_of(options, detector, cloud, analysed(detector, cloud), lambda: (0.0, ""))
@@ -105,8 +105,8 @@ def main(options: argparse.Namespace, command: str) -> int:
 
     how = (options.hit_radius * MM, options.threshold, own_threshold)
     judging = Judging(options.detector, canonical_json(settings), *how)
-    asked.refuse_repeats(options.paths)
-    reading = asked.reading_of(options)
+    cli.refuse_repeats(options.paths)
+    reading = cli.reading_of(options)
     opened = [opened_as(options.camera, [path], options.intrinsics, **reading) for path in options.paths]
     scans = [Scan(recording, judging) for recording in opened]
     family = _family(options, scans)
@@ -136,7 +136,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     }
     origin = record(command) | {"warnings": [COMPARED, *warnings], "seed": options.seed, "failures": []}
     title = f"Virtual damage in {recordings}"
-    expected = options.false_calls or asked.DEFAULT_FALSE_CALLS
+    expected = options.false_calls or cli.DEFAULT_FALSE_CALLS
     calls = f"{expected:g} false calls a capture: the median over groups of frames."
     own = f"Set by the undamaged frames, as in harness.detect, by noise towards the camera, for {calls}"
     thresholds = f"Given as {options.threshold:g}." if options.threshold else own

@@ -36,11 +36,11 @@ CAPTION = (
     "similar values of all three); correlation of noise and of fixed pattern along x and y, and their spectra (1 for "
     "white noise); displacement of whole frames; dropouts. Orange is the simulation from the camera file."
 )
-Told = tuple[str, str, str, float, str]
+FigureRow = tuple[str, str, str, float, str]
 """Name, place, unit, value and meaning of a figure."""
 
 
-def own_figures(found: Characteristics) -> Iterator[Told]:
+def own_figures(found: Characteristics) -> Iterator[FigureRow]:
     """Yield the figures of each surface and of the camera; all sources give the same figures in the same order."""
     for face in found.surfaces:
         relief = "includes the surface's own shape and the lens's error"
@@ -57,7 +57,7 @@ def own_figures(found: Characteristics) -> Iterator[Told]:
     yield from shared_figures(found)
 
 
-def shared_figures(found: Characteristics) -> Iterator[Told]:
+def shared_figures(found: Characteristics) -> Iterator[FigureRow]:
     """Yield the figures that do not belong to a single surface."""
     for axis, name in enumerate("xy"):
         for lag in SHOWN_LAGS:
