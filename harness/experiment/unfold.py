@@ -182,7 +182,7 @@ def _frame_settings(frames: Any, at: KeyPath) -> tuple[Setting, ...]:
 
 def _label(settings: Iterable[Setting]) -> str:
     parts = (setting.name or f"{setting.path}={on_one_line(setting.value)}" for setting in settings)
-    return ", ".join(parts) or "the experiment as it stands"
+    return ", ".join(parts) or "the unchanged experiment"
 
 
 def _axis_problems(axes: list[list[Setting]], source: Source) -> Iterator[Problem]:
