@@ -162,7 +162,7 @@ def test_edges_and_a_single_distance_without_amplitude(truth, tmp_path, capsys):
     given = [str(path), "--intrinsics", str(tmp_path / "lens.json"), "--out", str(tmp_path / "out"), "--rate", "15"]
     given.append("--certificate")
     assert characterise.main(given) == 0
-    assert "the mean of 12 recorded frames shows" in (tmp_path / "out" / "certificate.html").read_text()
+    assert "the mean of 12 recorded frames reveals" in (tmp_path / "out" / "certificate.html").read_text()
     printed = capsys.readouterr().out
     assert printed.index("no amplitude is recorded") < printed.index("temporal noise")
     own = read_camera(tmp_path / "out" / "my_camera.yaml")

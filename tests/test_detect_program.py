@@ -241,7 +241,7 @@ def test_a_quiet_capture_sets_the_threshold(capture: Path, tmp_path: Path, capsy
     assert {str(quiet), str(capture)} == {
         str(Path(file["path"]).parent.parent) for file in files if "depth" in file["path"]
     }
-    assert "silent on" in capsys.readouterr().out
+    assert "without a finding on" in capsys.readouterr().out
     k = json.loads((tmp_path / "a" / "findings.json").read_text())["threshold"]["k"]
     assert detect.main([str(quiet), "--threshold", str(k)]) == 0
     assert "no findings" in capsys.readouterr().out

@@ -329,7 +329,7 @@ BROKEN: list[tuple[Callable[..., None], type[Sound], str]] = [
     (checks.declares_itself, NoDefaults, "Field required"),
     (checks.declares_itself, StoresWrongly, "stored and read again"),
     (checks.gives_sound_evidence, ScoresInvalid, "pixels without a point have a score"),
-    (checks.gives_sound_evidence, OtherShape, "`residual_m` is an array of"),
+    (checks.gives_sound_evidence, OtherShape, "`residual_m` has the shape"),
     (checks.gives_sound_evidence, NoScale, "`scale_m` is 0"),
     (checks.gives_sound_evidence, Infinite, "a score is infinite"),
     (checks.gives_the_same_twice, Restless, "the second time"),

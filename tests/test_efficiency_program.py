@@ -77,7 +77,7 @@ def of_another_study(results: Path) -> None:
         (without_experiment, "has no experiment.yaml"),
         (without_study, "cannot be read"),
         (with_a_given_threshold, "no wanted rate of false calls"),
-        (of_another_study, "which study.json has"),
+        (of_another_study, "lacks the set-up"),
     ],
 )
 def test_mistakes_are_one_message(results, change, said, monkeypatch, capsys) -> None:

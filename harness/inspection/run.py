@@ -79,7 +79,7 @@ def refuse_thresholds(arguments: argparse.Namespace) -> None:
     """Raise UserError if several arguments set the threshold, or if its value is not legal."""
     given = [f"--{name.replace('_', '-')}" for name in THRESHOLDS if getattr(arguments, name) is not None]
     if len(given) > 1:
-        raise UserError(f"{' and '.join(given)} all set the threshold", fix="give only one of them")
+        raise UserError(f"{' and '.join(given)} set the threshold", fix="give only one of them")
     for name, value in (("threshold", arguments.threshold), ("false-calls", arguments.false_calls)):
         if value is not None and not 0 < value < float("inf"):
             raise UserError(f"--{name} {value:g}", legal="a number above 0")

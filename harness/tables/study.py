@@ -32,7 +32,7 @@ from harness.vocabulary.path_names import camera_title, differing, names_of, on_
 BLOB_PX = 5.0
 """Distance on the sensor within which two highest scores belong to the same blob: the width of a camera's filter."""
 HIGH_THRESHOLD = 10.0
-"""In standard deviations: a hole-free board's highest score is 4 with Gaussian noise, 5 to 6 with a fixed pattern."""
+"""Standard deviations. A hole-free board's highest score is 4 with Gaussian noise, 5 to 6 with a fixed pattern."""
 OFF_BOARD = "off the board"
 SHOWN_ROWS = 60
 BOUND = "upper bound of a90 at 95 % confidence; empty if not demonstrated"

@@ -1,4 +1,4 @@
-"""What all programs share: the parser, one message for a user's mistake, and exit codes."""
+"""The frame of all programs: the parser, one message for a user's mistake, and exit codes."""
 
 from __future__ import annotations
 
