@@ -53,14 +53,14 @@ def detector_type(name: str) -> Any:
         raise DETECTORS.broken(offer, "it has no `settings_type` that is a harness.vocabulary.config.Config")
     called = getattr(kind, "name", None)
     if isinstance(called, str) and called != name:
-        # results name a detector by itself, experiments by its offer
+        # results use the detector's own name, experiments that of its entry point
         raise DETECTORS.broken(offer, f"it is called {called!r}, but offered as {name!r}")
     return kind
 
 
 def load_detector(name: str, settings: dict[str, Any]) -> Detector:
     """Return the detector of that name with these settings (plain data, as YAML holds it). Raises UserError as
-    `detector_type`, and where the settings are not legal (every problem at once)."""
+    `detector_type`, and if the settings are not legal (every problem at once)."""
     from harness.vocabulary.declaration.diagnose import settings_of
 
     kind = detector_type(name)

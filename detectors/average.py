@@ -1,6 +1,5 @@
-"""Averages streamed frames into one cloud; frames that do not belong are left out and reported. The first
-`REFERENCE_FRAMES` are the reference: a source whose first frames are mostly bad, or a moving camera, is not
-repaired."""
+"""Averages streamed frames into one cloud. Frames that do not belong are left out and reported. The first
+`REFERENCE_FRAMES` are the reference: mostly bad first frames, or a moving camera, are not corrected."""
 
 from __future__ import annotations
 
@@ -18,7 +17,7 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, Frame, FrameSource, LeftOut, Reason
 
 REFERENCE_FRAMES = 5
-"""The median of five frames survives two bad ones, wherever they are, and needs no more memory than five frames."""
+"""The median of five frames tolerates any two bad frames, and needs no more memory than five frames."""
 SAMPLED_PIXELS = 4096
 """Pixels on which a frame is judged: they show a changed fraction of 5 % to 0.35 %, and a shift to 0.02 sigma."""
 CORRELATED_PIXELS = 25  # pixels that share one noise value in the worst case: a depth engine with a 5x5 filter
@@ -30,10 +29,10 @@ class AverageConfig(Config):
     """Settings for averaging frames into one cloud, and for leaving frames out.
 
     ``method``: ``mean`` as in the thesis; ``median`` per pixel (holds z of all frames in memory); ``clipped``: mean of
-    the samples within ``clip_sigmas`` of the pixel's median over the first five frames. ``frames``: use only the first
-    so many. A frame *jumps* if the median over pixels of its difference from the reference exceeds the larger of
+    the samples within ``clip_sigmas`` of the pixel's median over the first five frames. ``frames``: largest number of
+    frames to use. A frame *jumps* if the median over pixels of its difference from the reference exceeds the larger of
     ``jump_sigmas`` standard errors and ``jump_mm`` (ten times the wander of a static Azure Kinect). It is *disturbed*
-    if more than ``disturbed_fraction`` of its pixels (beyond 1.5 times what the reference frames show) lost their
+    if more than ``disturbed_fraction`` of its pixels (beyond 1.5 times the share in the reference frames) lost their
     range, or changed by more than the larger of ``changed_sigmas`` of one frame's noise and ``changed_mm``."""
 
     method: Literal["mean", "median", "clipped"] = "mean"
@@ -55,7 +54,7 @@ the pixels; frames of static real cameras differ from the first by 0.3 % beyond 
 
 
 def unsteadiness(cloud: Cloud) -> str:
-    """Return a warning if so many frames are left out that the recording was not steady, else ""."""
+    """Return a warning if too many frames are left out for a steady recording, else ""."""
     out, frames = len(cloud.left_out), cloud.n_frames + len(cloud.left_out)
     what = f"{out} of {frames} frames differ from the others and are left out: the camera or the scene moved"
     return what if out > MOST_LEFT_OUT * frames else ""
@@ -150,10 +149,10 @@ class FrameSums:
         self.jump_m = max(config.jump_sigmas * 1.2533 * sigma * np.sqrt(2.0 * shared), config.jump_mm * MM)
         self.change_m = max(config.changed_sigmas * sigma, config.changed_mm * MM)
         agreeing = stack[np.abs(between[:, middle]) <= self.jump_m]
-        # the median of two frames is their mean, which a fault in either one spoils
+        # the median of two frames is their mean, which a fault in either of them spoils
         z = pixel_medians(agreeing) if len(agreeing) > 2 else stack[middle]
         self.sampled_z_m, self.offset = z[self.sample], z.astype(np.float64)
-        # the reference frames look better than others, because they determined the judged pixels
+        # the reference frames differ less than others, because they determined the judged pixels
         usual = [self._change(row)[1] for row in agreeing]
         self.fraction = min(config.disturbed_fraction + 1.5 * float(np.median(usual)) if usual else 1.0, 1.0)
         self.gate: np.ndarray | None = None

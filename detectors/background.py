@@ -25,31 +25,31 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud
 
 MOST_CELLS, CELL_POINTS, EVEN_CELL_POINTS, ENOUGH_CELLS, FEW_CELLS = 3600, 16, 64, 600, 40
-"""Most cells; points per cell, at least and where there are enough; enough cells; fewest to question the shape."""
+"""Most cells; points per cell, at least and where there are enough; enough cells; fewest cells to choose a shape."""
 TILE_CELLS, FOLDS = 3, 5
 """Side, in cells, of a tile that is predicted as a whole, and the number of folds into which the tiles are dealt."""
 LEAST_SCALE_M = 0.04
-"""Damage is taken to be narrower than this unless the settings differ: no free form that could follow it is chosen."""
+"""Largest width of damage, unless the settings differ: no free form that could follow it is chosen."""
 WORTH = 0.1
 """A shape is as good as the best if its error of prediction is larger by at most this share of a pixel's noise."""
 NOISIER = 1.25
-"""Five standard errors of the median of 49 deviations of 16 pixels each; below it noise is taken to be even."""
+"""Five standard errors of the median of 49 deviations of 16 pixels each; a smaller ratio counts as even noise."""
 STEEPEST_DEG = 75.0
 """Incidence beyond which a surface is not judged: a pixel covers 4 times its width there, and its noise grows."""
 FREE_FORM_FROM, MISFIT_FROM = 0.02, 0.1
 """Share of the area with structure from which a free form is tried, and from which a warning of a misfit is given."""
 STATED = ("polynomial", "mesh")
-"""Shapes that are not chosen by evidence."""
+"""Shapes that the user states."""
 STRUCTURE_CELLS, STRUCTURE_SIGMAS, SEEN = 5, 4.0, 0.5
 """Side of the block averaged to see structure, least significance of structure, and share of a pixel's noise."""
 
 
 @dataclass(frozen=True)
 class Background:
-    """The surface without its damage. ``surface_z_m`` and ``residual_m`` (h, w): z of the surface, and of the cloud
-    less the surface; NaN where it is not judged. ``noise_m`` (h, w): standard deviation of the residuals round about,
+    """The surface without its damage. ``surface_z_m`` and ``residual_m`` (h, w): z of the surface, and z of the cloud
+    minus the surface; NaN where it is not judged. ``noise_m`` (h, w): standard deviation of the residuals nearby,
     without the surface's own misfit. ``scale_m``: width above which a free form follows shallow damage. ``warning``: a
-    sentence where remaining structure could be mistaken for damage."""
+    sentence if remaining structure could be mistaken for damage."""
 
     surface_z_m: np.ndarray
     residual_m: np.ndarray
@@ -62,8 +62,8 @@ class Background:
 
 @dataclass(frozen=True)
 class _Cells:
-    """``points`` (c, 3) metres: a ray through each cell and its median z; ``weights`` (c,); ``noise`` (c,): of a pixel
-    in it; ``level_noise``: of a median; ``of`` (n,): each point's cell or -1; ``side``: in the picture's units."""
+    """``points`` (c, 3) metres: a ray through each cell and its median z. ``weights`` (c,). ``noise`` (c,): of a pixel.
+    ``level_noise``: of a median. ``of`` (n,): each point's cell or -1. ``side``: in the picture's units."""
 
     points: np.ndarray
     weights: np.ndarray
@@ -110,7 +110,7 @@ class _Shape(NamedTuple):
 
 def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Background:
     """Choose, fit and judge the surface of the cloud's points where ``mask`` (h, w) is true. Deterministic. Raises
-    UserError where the points do not determine it."""
+    UserError if the points do not determine it."""
     points, central = np.ascontiguousarray(cloud.points_m[mask]), cloud.projection == "central"
     cells = _cells(points, cloud)
     if cells is None:
@@ -137,8 +137,8 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
     residuals = points[:, 2] - fitted
     unseen = ~np.isfinite(fitted)
     if cells.central:
-        # few pixels are near enough to the steepest incidence to be looked at each; a ray that misses the surface
-        # beside the pixel gives NaN: not below the limit either
+        # only the few pixels near the steepest incidence are examined one by one; a ray that misses the surface
+        # beside the pixel gives NaN, which is not below the limit either
         near = _incidence_deg(cells.points, fit, cells.side) > STEEPEST_DEG - 20.0
         looked = np.flatnonzero((cells.of < 0) | near[cells.of])
         unseen[looked] |= ~(_incidence_deg(points[looked], fit, 0.1 * cells.side) < STEEPEST_DEG)
@@ -155,7 +155,7 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
     if unseen.mean() > 0.001:
         steep = f"seen at more than {STEEPEST_DEG:g} degrees" + " or at an edge of the mesh" * (config.shape == "mesh")
         text += f"; {100 * unseen.mean():.1f} % of the target, {steep}, is not judged"
-    # a pixel's noise about each cell: the target's median, or the median over 7 x 7 cells where that is much more
+    # a pixel's noise near each cell: the target's median, or the median over 7 x 7 cells if that is much larger
     padded = np.pad(cells.image(cells.noise), 3, constant_values=np.nan)
     around = np.lib.stride_tricks.sliding_window_view(padded, (7, 7))[cells.row, cells.column].reshape(-1, 49)
     with np.errstate(all="ignore"):
@@ -168,7 +168,7 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
 
 
 def misfit(cloud: Cloud, residual_m: np.ndarray, surface: str) -> str:
-    """Return a sentence where a stated ``surface`` leaves structure in ``residual_m`` (h, w) like damage."""
+    """Return a sentence if a stated ``surface`` leaves structure like damage in ``residual_m`` (h, w), else ""."""
     mask = np.isfinite(residual_m)
     cells = _cells(cloud.points_m[mask], cloud)
     if cells is None:
@@ -188,7 +188,7 @@ def _stated(points: np.ndarray, config: SurfaceConfig, central: bool = True) -> 
 
 
 def _cells(points: np.ndarray, cloud: Cloud) -> _Cells | None:
-    """Return the cells of points (n, 3) of a cloud, not yet `refreshed`; None where they fill too few."""
+    """Return the cells of points (n, 3) of a cloud, not yet `refreshed`; None if too few are filled."""
     if len(points) < FEW_CELLS * CELL_POINTS:
         return None
     central = cloud.projection == "central" and float(points[:, 2].min()) > 0
@@ -218,7 +218,7 @@ def _cells(points: np.ndarray, cloud: Cloud) -> _Cells | None:
 
 @numba.njit(cache=True, nogil=True)
 def _group_medians(values: np.ndarray, group: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the median of each group's finite values, and their median distance from it over 0.6745; NaN without."""
+    """Return the median of each group's finite values, and their median distance from it over 0.6745; else NaN."""
     starts = np.zeros(groups + 1, np.int64)
     for i in range(len(values)):
         if group[i] >= 0 and np.isfinite(values[i]):
@@ -263,7 +263,7 @@ def _cell_noise(image: np.ndarray) -> tuple[float, float]:
         return sigma_of(some) if len(some) else 0.0
 
     near, far = bend(1), bend(2)
-    # of cells with variance s^2 and correlation r with their neighbours only: (6 - 8 r) s^2 and 6 s^2
+    # for cells with variance s^2 and correlation r with direct neighbours: (6 - 8 r) s^2 and 6 s^2
     deviation = max(near, far) / np.sqrt(6.0)
     return deviation, float(np.clip((6.0 - (near / max(deviation, 1e-12)) ** 2) / 8.0, 0.0, 0.5))
 
@@ -288,7 +288,7 @@ def _chosen(cells: _Cells, config: SurfaceConfig) -> _Shape:
     if auto and _misfit(cells, best.fit, "")[1]["misfit_share"] < FREE_FORM_FROM:
         return best
     base = shapes[int(np.argmin([each.mean() for each in errors]))]
-    # wavelengths in cells, long ones first: down to twice what is predicted together, or the least scale
+    # wavelengths in cells, longest first, down to twice the side of a tile or to the least scale
     ladder: list[float] = [max(int(np.ptp(cells.row)), int(np.ptp(cells.column))) + 1]
     while ladder[-1] / 1.6 >= max(2 * TILE_CELLS, 2 * LEAST_SCALE_M / cells.side_m):
         ladder.append(ladder[-1] / 1.6)
@@ -303,7 +303,7 @@ def _chosen(cells: _Cells, config: SurfaceConfig) -> _Shape:
 
 
 def _fitted(cells: _Cells, name: str, fit_to: Any, wavelength: float | None, widened: bool = False) -> _Shape | None:
-    """Fit with bisquare weights, ``widened`` by the flanks of dents; None if a fiftieth of the cells are missed."""
+    """Fit with bisquare weights, ``widened`` by the flanks of dents; None if the fit misses a fiftieth of the cells."""
     weights, floor = cells.weights, 0.2 * cells.pixel_noise / np.sqrt(CELL_POINTS)
     for _ in range(6):
         fit = fit_to(cells.points, weights)
@@ -316,7 +316,7 @@ def _fitted(cells: _Cells, name: str, fit_to: Any, wavelength: float | None, wid
         scale, before = max(sigma_of(error[known]), floor), weights
         robust = bisquare_weights(np.where(known, error, np.inf), BISQUARE_TUNING * scale)
         if widened:
-            # cells that have no weight, together with such a neighbour, and the neighbours of such pairs
+            # pairs of neighbouring cells without weight, and the neighbours of these pairs
             image = cells.image((robust == 0).astype(float), 0.0) > 0
             pairs = cv2.filter2D(image.astype(np.uint8), -1, np.ones((3, 3)), borderType=cv2.BORDER_CONSTANT) >= 3
             robust = robust * ~grown(image & pairs, 1)[cells.row, cells.column]
@@ -342,7 +342,7 @@ def _prediction_errors(cells: _Cells, shape: _Shape) -> np.ndarray:
 
 
 def _simplest(errors: list[np.ndarray], worth: float) -> int:
-    """Return the first shape whose mean error is above the least by no more than ``worth`` or a standard error."""
+    """Return the first shape whose mean error exceeds the least by at most ``worth`` or a standard error."""
     best = int(np.argmin([each.mean() for each in errors]))
     for i, each in enumerate(errors):
         difference = each - errors[best]
@@ -352,11 +352,11 @@ def _simplest(errors: list[np.ndarray], worth: float) -> int:
 
 
 def _misfit(cells: _Cells, fit: Fit, name: str) -> tuple[str, dict[str, Any]]:
-    """Return a warning where structure remains that would pass for damage, else ""."""
+    """Return a warning if structure remains that could be mistaken for damage, else ""."""
     error = cells.points[:, 2] - fit(cells.points)
     image = cells.image(np.where(np.isfinite(error) & (cells.weights > 0), error, np.nan))
     (noise, shared), pixel = _cell_noise(image), cells.pixel_noise
-    # compact findings stand out of their neighbourhood's median; structure makes the neighbourhood
+    # compact findings differ from their neighbourhood's median; structure is the neighbourhood itself
     valid = np.isfinite(image)
     limit = np.nanmedian(np.abs(image)) / 0.6745 * BISQUARE_TUNING
     used = valid & (np.abs(np.nan_to_num(image)) < max(limit, BISQUARE_TUNING * noise))
@@ -378,7 +378,7 @@ def _misfit(cells: _Cells, fit: Fit, name: str) -> tuple[str, dict[str, Any]]:
 
 
 def _incidence_deg(points: np.ndarray, fit: Fit, step: float) -> np.ndarray:
-    """Return the angle (n,) between the ray and the surface's normal, from the surface a ``step`` beside it."""
+    """Return the angles (n,) between the rays and the surface's normals, from the surface's slope over one ``step``."""
 
     def on_surface(dx: float, dy: float) -> np.ndarray:
         rays = points / points[:, 2:] + [dx, dy, 0.0]

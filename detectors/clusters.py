@@ -1,5 +1,5 @@
-"""Clusters of points by Euclidean distance, at one threshold of their scores or at several at once: as the threshold
-falls clusters only grow and join. Points stand in cells so small that all points of one belong together."""
+"""Clusters of points by Euclidean distance, at one threshold of their scores or at several. As the threshold falls,
+clusters only grow and join. Points are sorted into cells so small that all points of a cell belong to one cluster."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ PLAIN: dict[str, Any] = {"cache": True, "nogil": True}
 
 
 def euclidean_clusters(points_m: np.ndarray, distance_m: float, min_points: int = 1) -> np.ndarray:
-    """Label points (n, 3) so that two share a cluster if a chain of steps no longer than ``distance_m`` joins them, as
+    """Label points (n, 3): two are in one cluster if a chain of steps of at most ``distance_m`` joins them, as in
     MATLAB's ``pcsegdist``. Returns (n,) int64: 0, 1, ... in the order of each cluster's first point, -1 for points with
-    a NaN and for clusters smaller than ``min_points``. Raises UserError where the points spread over too many cells."""
+    a NaN and in clusters smaller than ``min_points``. Raises UserError if the points spread over too many cells."""
     labels = np.full(len(points_m), -1, dtype=np.int64)
     finite = np.flatnonzero(np.isfinite(points_m).all(axis=1))
     alike = np.zeros(len(finite))
@@ -29,18 +29,18 @@ def euclidean_clusters(points_m: np.ndarray, distance_m: float, min_points: int 
 def nested_clusters(
     points_m: np.ndarray, scores: np.ndarray, distance_m: float, min_points: int, thresholds: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Label finite points (n, 3) as `euclidean_clusters` does, those with a score (n,) above each of ``thresholds``
-    (t,), which rise: (t, n) int64, -1 also for the others. And return by label, (t, m), the lowest threshold at which
-    its cluster is no longer found, as parts of it that are large enough remain longest."""
+    """Label the finite points (n, 3) with a score (n,) above each of the rising ``thresholds`` (t,), as
+    `euclidean_clusters` does: (t, n) int64, -1 for the others. Also return by label, (t, m), the lowest threshold at
+    which no part of that cluster is found any more: parts with enough points last longest."""
     if not len(points_m):
         return np.zeros((len(thresholds), 0), np.int64), np.zeros((len(thresholds), 0))
-    # a little below distance / sqrt(3): rounding must not put two points of one cell beyond the distance
+    # slightly less than distance / sqrt(3): rounding must not put two points of a cell farther apart than the distance
     cells = np.floor((points_m - points_m.min(axis=0)) / (distance_m / np.sqrt(3.0) * (1.0 - 1e-9)))
     if cells.max() >= MAX_CELLS:
         what = f"points spread over {np.ptp(points_m, axis=0).max():.3g} m cannot be clustered with a distance of"
         fix = "crop the cloud, check its unit, or choose a larger cluster distance"
         raise UserError(f"{what} {distance_m * 1e3:.3g} mm", fix=fix)
-    # with a margin, so that the key of a neighbour is the sum of the keys of the cell and of the way to it
+    # the margin makes a neighbour's key the sum of the cell's key and the key of the offset
     x, y, z = cells.astype(np.int64).T + NEAR_CELLS
     falling = np.argsort(-scores, kind="stable")
     key = (((x << AXIS_BITS | y) << AXIS_BITS) | z)[falling]
@@ -56,7 +56,7 @@ def nested_clusters(
 
 @numba.njit(**PLAIN)
 def root_of(parent: np.ndarray, i: int) -> int:
-    """Return the root of a node in a forest of ``parent`` nodes, whose paths it shortens."""
+    """Return the root of a node in a forest of ``parent`` nodes, and shorten the path to it."""
     while parent[i] != i:
         parent[i] = parent[parent[i]]
         i = parent[i]
@@ -67,12 +67,12 @@ def root_of(parent: np.ndarray, i: int) -> int:
 def _nested(  # type: ignore[no-untyped-def]
     points, scores, falling, order, starts, keys, near, limit, least, thresholds, labels, strengths
 ):
-    """Fill in the results of `nested_clusters`, of points of which each cell c, by ascending ``keys``, holds those at
-    ``order[starts[c]:starts[c + 1]]``. ``limit``: the distance squared. ``falling``: the points by score."""
+    """Write the results of `nested_clusters`. Cell c, in the order of ``keys``, holds the points
+    ``order[starts[c]:starts[c + 1]]``. ``limit``: the squared distance. ``falling``: the points by score."""
     n, cells, side = len(falling), len(keys), 2 * NEAR_CELLS + 1
     parent, sizes, held = np.zeros(cells, np.int64), np.zeros(cells, np.int64), np.zeros(cells, np.int64)
     cell, stops, count = np.zeros(n, np.int64), np.zeros(cells + 1, np.int64), 0
-    # near to cell c are near[stops[c]:stops[c + 1]]: by each column of cells along z those from the first to the last
+    # near[stops[c]:stops[c + 1]] are near cell c: in each column along z, the cells from the first to the last
     first, last = np.zeros(side**2, np.int64), np.zeros(side**2, np.int64)
     completed = np.zeros(cells)
     for c in range(cells):
@@ -107,7 +107,7 @@ def _nested(  # type: ignore[no-untyped-def]
                     completed[root] = max(completed[root], completed[other])
             if sizes[root] >= least:
                 completed[root] = max(completed[root], scores[i])
-        # clusters are numbered from 1 here
+        # clusters are counted from 1 here
         names, count = np.zeros(cells, np.int64), 0
         for i in range(n):
             if scores[i] > thresholds[level]:

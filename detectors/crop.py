@@ -1,8 +1,8 @@
-"""The pixels that belong to the target: a box, a polygon in the image, or the nearest large smooth surface.
+"""The pixels that belong to the target: in a box, in a polygon of the image, or on the nearest large smooth surface.
 
-Every two surfaces are compared by what is seen at their outlines: one stands before the other, lies on it, shows
-through its hole, or they only meet. The surface with the best odds under a model of how people take pictures of a
-target is proposed; where the odds are poor, the choice is reported as doubtful."""
+Two surfaces are compared at their outlines: one is in front of the other, lies on it or is visible through its hole, or
+they only meet. The surface with the best odds under a model of how people photograph a target is proposed; if the odds
+are poor, the choice is reported as doubtful."""
 
 from __future__ import annotations
 
@@ -22,31 +22,31 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud
 
 DOUBTFUL_BELOW = 0.8  # probability of a comparison below which the choice is called doubtful
-CROWD = 4  # other surfaces that are half as large or larger, as in a heap of stones, from which on it is doubtful too
+CROWD = 4  # the choice is also doubtful if this many other surfaces are at least half as large, as in a heap of stones
 CENTRE_SPREAD = 0.25
-"""Deviation of the weight that pixels have, as a share of the picture's sides: people aim at the target."""
+"""Standard deviation of the pixels' weights as a share of the picture's sides: people aim at the target."""
 LYING_WEIGHT, STANDING_WEIGHT = 0.10, 0.02
-"""Weight in the view at which a thing is as likely the target as the surface that it lies on, or stands far before."""
+"""Weight in the view of an object that is as likely the target as the surface under it, or as one far behind it."""
 OBSTACLE_AREA = 0.2
-"""Area, as a part of that of a target seen whole behind it, at which a thing before it is as likely the target."""
+"""Area of an object that is as likely the target as the uncut surface behind it, as a share of that surface's area."""
 GRAZING = 0.5
-"""Cosine of the tilt, 60 degrees, beyond which a surface counts for less: nobody inspects at a grazing angle, and the
-pixels that mix two surfaces look like a third that is seen so."""
+"""Cosine of the tilt (60 degrees) from which a surface counts for less: nobody inspects at a grazing angle, and pixels
+that mix two surfaces look like a third surface at such an angle."""
 STEEPNESS = 2.0  # odds grow with this power of weights and areas
 SURROUNDED, BORDERING, STEP_PART = 0.7, 0.1, 0.3
-"""Part of the outline that borders on what a thing lies on; of neighbours; of a border that must be a step."""
+"""Shares of the outline on the surface under an object, and on a neighbour; share of a border that is a step."""
 CUT_OFF = 0.15
-"""Part of its outline on the edge of the picture from which on a surface goes on outside of it, as walls and floors."""
+"""Share of the outline on the picture's edge from which a surface continues outside it, as walls and floors do."""
 NOTCHES_PX = (8, 16)
-"""Radii of the discs that close the outline's notches: a strip of up to some 8 pixels between a hole and the edge is
-taken for the edge's own blur, and the hole opens to the outside. Wider gaps are the part's own shape."""
+"""Radii of the discs that close notches of the outline: the edge's blur hides a strip of up to about 8 pixels between a
+hole and the edge, and the hole opens to the outside. Wider gaps belong to the part's shape."""
 ENCLOSED, MOST_SAMPLES = 0.9, 20_000
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A surface that may be the target. ``own``, ``filled`` (h, w) bool on the choice's ``grid``: its pixels, and what
-    they enclose too; ``outline``: the same but for other candidates before it."""
+    """A surface that may be the target. ``own`` (h, w) bool on the choice's ``grid``: its pixels. ``filled``: the same
+    with all that they enclose. ``outline``: the same without other candidates in front of it."""
 
     own: np.ndarray
     filled: np.ndarray
@@ -55,7 +55,7 @@ class Candidate:
 
     @property
     def share(self) -> float:
-        """Part of all pixels."""
+        """Share of all pixels."""
         return float(self.own.mean())
 
     @cached_property
@@ -66,12 +66,12 @@ class Candidate:
 
     @property
     def tilt_deg(self) -> float:
-        """Angle between its mean plane and the picture's."""
+        """Angle between the mean plane and the image plane."""
         return math.degrees(math.acos(self._facing))
 
     @cached_property
     def extent_m(self) -> tuple[float, float]:
-        """Sides of the smallest rectangle around all but a hundredth of it in its mean plane, longer first."""
+        """Sides, longer first, of the smallest rectangle in the mean plane that holds 99 % of the surface."""
         plan = self._plane[0] @ self._plane[1][:, 1:]
         turn = math.radians(float(cv2.minAreaRect(plan.astype(np.float32))[2]))
         along = plan @ np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
@@ -81,14 +81,14 @@ class Candidate:
 
     @cached_property
     def weight(self) -> float:
-        """Share of pixels weighted by a Gaussian about the picture's centre, less at a grazing angle."""
+        """Share of the pixels, weighted by a Gaussian about the picture's centre and reduced at a grazing angle."""
         row, column = (np.exp(-0.5 * ((np.arange(n) + 0.5) / n - 0.5) ** 2 / CENTRE_SPREAD**2) for n in self.own.shape)
         weighted = float(row @ self.own @ column / (row.sum() * column.sum()))
         return weighted * min(1.0, (self._facing / GRAZING) ** 2)
 
     @cached_property
     def cut_off(self) -> float:
-        """Part of its outline on the picture's edge; without a pixel grid, on the border of the cloud."""
+        """Share of the outline on the picture's edge, or without a pixel grid on the border of the cloud."""
         outline = self.filled & ~(cv2.erode(self.filled.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0)
         if self.grid.organised:
             edge = np.ones(self.filled.shape, dtype=bool)
@@ -98,7 +98,7 @@ class Candidate:
         return int(np.count_nonzero(outline & edge)) / max(int(np.count_nonzero(outline)), 1)
 
     def continues(self, other: Candidate, apart_m: float) -> bool:
-        """Return whether this flat surface and the other lie in one plane, within ``apart_m`` at nine in ten."""
+        """Return whether this flat surface and the other lie in one plane: 90 % of the points within ``apart_m``."""
         normal, middle = self._plane[1][:, 0], self._some.mean(axis=0)
         off_m = [np.quantile(np.abs((each._some - middle) @ normal), 0.9) for each in (self, other)]
         return bool(max(off_m) <= apart_m)
@@ -115,15 +115,15 @@ class Candidate:
 
     @cached_property
     def _plane(self) -> tuple[np.ndarray, np.ndarray]:
-        """The sample about its middle, and its principal axes (3, 3), the normal first."""
+        """The sample minus its mean, and its principal axes (3, 3), the normal first."""
         centred = self._some - self._some.mean(axis=0)
         return centred, np.linalg.eigh(centred.T @ centred)[1]
 
 
 @dataclass(frozen=True)
 class Choice:
-    """``candidates``: the proposal first; ``taken``: number, from 1, of the one that was taken. ``mask`` (h, w) bool:
-    valid pixels inside its outline. ``grid``: the cloud, or its raster. ``warnings``: doubts about the choice."""
+    """``candidates``: the proposal first. ``taken``: number, from 1, of the candidate that was taken. ``mask`` (h, w)
+    bool: valid pixels inside its outline. ``grid``: the cloud, or its raster. ``warnings``: doubts about the choice."""
 
     candidates: tuple[Candidate, ...]
     taken: int
@@ -133,7 +133,7 @@ class Choice:
 
 
 class _Border(NamedTuple):
-    """Border on another surface: its ``part`` of the outline, whether it is a step, and its height in metres."""
+    """Border on another surface: its share of the outline, whether it is a step, and its height in metres."""
 
     part: float
     is_step: bool
@@ -141,7 +141,7 @@ class _Border(NamedTuple):
 
 
 def described_text(candidate: Candidate) -> str:
-    """Return distance, extent, share of the view and tilt in words."""
+    """Return distance, extent, share of the view and tilt as a text."""
     long, short = (f"{side / MM:.0f}" for side in candidate.extent_m)
     near, middle, far = candidate.depths_m
     share = f"{100 * candidate.share:.2g}" if candidate.share < 0.095 else f"{100 * candidate.share:.0f}"
@@ -150,7 +150,7 @@ def described_text(candidate: Candidate) -> str:
 
 
 def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...], list[str]]:
-    """Return the candidates, best odds first, and warnings of taking the first."""
+    """Return the candidates, best odds first, and warnings about taking the first."""
     numbers = range(len(surfaces.own))
     outlines = zip(surfaces.own, surfaces.filled, strict=True)
     described = [Candidate(own, filled, filled, grid) for own, filled in outlines]
@@ -165,22 +165,22 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
         ours = borders[front].get(back)
         if ours is None or not ours.is_step:
             return None
-        it, other = described[front], described[back]
-        covered = f"{100 * it.share:.2g} % of the view"
+        this, other = described[front], described[back]
+        covered = f"{100 * this.share:.2g} % of the view"
         if encloses(front, back):
             opening = surfaces.own[back].sum() / max(surfaces.filled[front].sum(), 1)
             return _probability(0.5 / max(opening, 1e-6)), "a surface is seen through a large opening of another"
-        if ours.part >= SURROUNDED and ours.behind_m <= it.extent_m[1]:
+        if ours.part >= SURROUNDED and ours.behind_m <= this.extent_m[1]:
             why = f"an object that covers {covered} lies on a larger surface or close to it"
-            return _probability(it.weight / LYING_WEIGHT), why
+            return _probability(this.weight / LYING_WEIGHT), why
         if other.cut_off < CUT_OFF:
-            ratio = it.extent_m[0] * it.extent_m[1] / max(other.extent_m[0] * other.extent_m[1], 1e-12)
+            ratio = this.extent_m[0] * this.extent_m[1] / max(other.extent_m[0] * other.extent_m[1], 1e-12)
             why = f"an object that covers {covered} stands in front of a surface whose outline is whole"
             return _probability(ratio / OBSTACLE_AREA), why
-        return _probability(it.weight / STANDING_WEIGHT), f"the nearer surface covers only {covered}"
+        return _probability(this.weight / STANDING_WEIGHT), f"the nearer surface covers only {covered}"
 
     def judged(i: int, j: int) -> tuple[float, str]:
-        """Return the probability that surface i and not j is the target, and the reason for a doubt."""
+        """Return the probability that surface i rather than j is the target, and the reason for a doubt."""
         if i == j:
             return 1.0, ""
         ahead, behind = before(i, j), before(j, i)
@@ -188,11 +188,11 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
             return ahead
         if behind is not None:
             return 1.0 - behind[0], behind[1]
-        # of two that meet, or have nothing to do with one another, weight, a frontal view and nearness count
-        it, other = described[i], described[j]
-        ratio = it.weight / max(other.weight, 1e-9)
-        facing = math.cos(math.radians(it.tilt_deg)) / max(math.cos(math.radians(other.tilt_deg)), 1e-2)
-        near = other.depths_m[1] / max(it.depths_m[1], 1e-6)
+        # if the two only meet or are apart, weight, a frontal view and nearness decide
+        this, other = described[i], described[j]
+        ratio = this.weight / max(other.weight, 1e-9)
+        facing = math.cos(math.radians(this.tilt_deg)) / max(math.cos(math.radians(other.tilt_deg)), 1e-2)
+        near = other.depths_m[1] / max(this.depths_m[1], 1e-6)
         return _probability(ratio**0.5 * facing**2 * near), "two surfaces are about as large and as near"
 
     table = [[judged(i, j) for j in numbers] for i in numbers]
@@ -200,8 +200,8 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
     order = sorted(numbers, key=lambda number: (-odds[number], number))
     candidates = []
     for number in order:
-        # Holes whose rim the edge cuts are taken in. What stands before it as a target of its own, or too far to lie on
-        # it, is left out with all that joins it and is nearer to it (fingers of a hand); a thing that lies on it stays.
+        # The outline includes holes that the edge cuts. A surface in front of it that is a better target, or too far
+        # away to lie on it, is left out with all nearer pixels that join it (fingers of a hand); an object on it stays.
         outline = described[number].outline
         for radius_px in NOTCHES_PX:
             outline = notches_filled(outline, radius_px)
@@ -233,7 +233,7 @@ def _probability(odds_base: float) -> float:
 
 
 def _borders(surfaces: Surfaces, grid: Cloud, number: int) -> dict[int, _Border]:
-    """Return the borders on the surfaces beyond this one's outline, by their numbers."""
+    """Return the borders of this surface's outline on other surfaces, by their numbers."""
     apart, nearest = nearest_pixel(surfaces.own[number])
     ring = np.flatnonzero((apart <= surfaces.reach_px + 3) & ~surfaces.filled[number])
     z, seeds = grid.points_m[..., 2].reshape(-1), nearest.reshape(-1)
@@ -252,24 +252,24 @@ def _borders(surfaces: Surfaces, grid: Cloud, number: int) -> dict[int, _Border]
 
 
 RIM_PX = 3
-"""Width of the rim where target and background mix: a 5 x 5 window reaches 2 pixels, and the edge passes a third."""
+"""Width of the rim where target and background mix: a 5 x 5 window reaches 2 pixels, and the edge crosses a third."""
 
 
 class _Crop(Config):
-    """``inset_px``: take so many pixels off the target's outer rim, where pixels mix target and background. Holes
-    inside the target do not grow; the edge of the image is no rim."""
+    """``inset_px``: number of pixels to remove along the target's outer rim, where pixels mix target and background.
+    Holes inside the target do not grow; the edge of the image is not a rim."""
 
     inset_px: int = Field(default=0, ge=0, le=200)
 
 
 class NoCrop(_Crop):
-    """Every valid pixel."""
+    """Takes every valid pixel."""
 
     kind: Literal["none"] = "none"
 
 
 class BoxCrop(_Crop):
-    """Points inside an open box in the camera's frame, by the thesis' defaults. ``range_max_m``: of sqrt(x^2 + z^2)."""
+    """Takes points in an open box (default: the thesis') in the camera's frame. ``range_max_m``: of sqrt(x^2 + z^2)."""
 
     kind: Literal["box"] = "box"
     x_mm: tuple[float, float] = (-500.0, 400.0)
@@ -287,19 +287,19 @@ class BoxCrop(_Crop):
 
 
 class PolygonCrop(_Crop):
-    """Pixels whose centre lies inside a polygon of sensor pixel positions [u, v] (even-odd rule)."""
+    """Takes pixels whose centre lies inside a polygon of sensor positions [u, v] (even-odd rule)."""
 
     kind: Literal["polygon"] = "polygon"
     vertices_px: tuple[tuple[float, float], ...] = Field(min_length=3)
 
 
 class AutoCrop(_Crop):
-    """The nearest large smooth surface, or candidate number ``target`` of those that a run lists.
+    """Takes the nearest large smooth surface, or number ``target`` of the candidates that a run lists.
 
-    Neighbours are joined where the step in z is no more than a tilted surface and noise explain and the surface does
-    not bend by more than ``crease_deg`` over ``smooth_px``; then its holes are filled, and ``inset_px`` comes off its
-    rim. A background so near that blur leaves no crease is taken for the target (13 mm behind the face, at 0.7 m with a
-    5 x 5 window). Without a pixel grid: the same on a raster of the nearest points."""
+    Neighbours are joined if tilt and noise explain their step in z and the surface bends by at most ``crease_deg`` over
+    ``smooth_px``; then holes are filled, and ``inset_px`` is removed at the rim. A background so near that blur leaves
+    no crease counts as target (13 mm behind the face, at 0.7 m with a 5 x 5 window). A cloud without a grid is treated
+    as a raster of its nearest points."""
 
     kind: Literal["auto"] = "auto"
     inset_px: int = Field(default=RIM_PX, ge=0, le=200)
@@ -310,11 +310,11 @@ class AutoCrop(_Crop):
 
 AnyCrop = NoCrop | BoxCrop | PolygonCrop | AutoCrop
 CropConfig = Annotated[AnyCrop, Field(discriminator="kind")]
-"""A crop as the user writes it: ``kind: none | box | polygon | auto`` and that kind's fields."""
+"""A crop as the user writes it: ``kind: none | box | polygon | auto`` and the fields of that kind."""
 
 
 def crop(cloud: Cloud, config: AnyCrop) -> np.ndarray:
-    """Return (h, w) bool: the valid pixels that belong to the target. Raises UserError where nothing is left, with the
+    """Return (h, w) bool: the valid pixels that belong to the target. Raises UserError if no pixel is left, with the
     cloud's extent, and for a polygon on a cloud without a grid."""
     valid = cloud.valid
     if not valid.any():
@@ -338,7 +338,7 @@ def crop(cloud: Cloud, config: AnyCrop) -> np.ndarray:
         limits = zip("xyz", (config.x_mm, config.y_mm, config.z_mm), strict=True)
         asked = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in limits)
         asked += "" if config.range_max_m is None else f" mm and sqrt(x^2 + z^2) < {1e3 * config.range_max_m:g}"
-        unit = "; the cloud looks as if its unit were not the metre" if z1 > 50_000 or z1 < 5 else ""
+        unit = "; the cloud's unit is probably not the metre" if z1 > 50_000 or z1 < 5 else ""
         what = f"the crop box ({asked} mm) holds none of the cloud's {len(points)} points{unit}"
         fix = "change crop.x_mm, crop.y_mm, crop.z_mm, or use crop.kind: auto"
         raise UserError(what, legal=f"limits that contain points of the cloud: {extent}", fix=fix)
@@ -350,13 +350,12 @@ def crop(cloud: Cloud, config: AnyCrop) -> np.ndarray:
 
 
 def choice_of(cloud: Cloud, config: AutoCrop) -> Choice:
-    """Return the automatic crop of a cloud with a valid point, and all that it chose from. Raises UserError without
-    the candidate ``target``."""
+    """Return the automatic crop of a cloud with a valid point, and all candidates. UserError without ``target``."""
     grid, smooth_px, inset_px, wanted = cloud, config.smooth_px, config.inset_px, config.target
     if not cloud.organised:
         grid, rows, columns, spacings = raster(cloud.points_m[cloud.valid], cloud)
         smooth_px = max(3, 2 * round(smooth_px / spacings / 2) - 1)
-        # the cell that holds the rim, and every cell that a point inset_px - 1 spacings farther in may lie in
+        # the cell of the rim, and all cells that may hold a point inset_px - 1 spacings farther inside
         inset_px = math.ceil((inset_px - 1) / spacings) + 1 if inset_px else 0
     candidates, doubts = _candidates(smooth_surfaces(grid, config.crease_deg, smooth_px), grid)
     if wanted is not None and wanted > len(candidates):

@@ -32,8 +32,8 @@ remain. Where the surface's shape is solved for, it takes up to half of such a c
 SURE = 1.1
 """Ratio to its noise from which a difference counts: noise that 30,000 pixels share makes 3 % of it."""
 SAME_PLACE_M, SAME_TURN = 2 * MM, 0.003
-"""Change of distance and of the plane's normal (rad) below which nothing shows that somebody moved the camera: ten
-times the wander of a static Azure Kinect, and what that wander makes over an image."""
+"""Changes of distance and of the plane's normal (rad) below which no movement of the camera shows: ten times the wander
+of a static Azure Kinect, and the effect of that wander over an image."""
 LEAST_SHIFT_M = 30 * MM
 MOST_STEPS, SOLVED = 200, 1e-5  # of the least squares
 BELIEF_STEPS = 5
@@ -41,9 +41,9 @@ BELIEF_STEPS = 5
 
 @dataclass(frozen=True)
 class FlatCapture:
-    """One capture of a flat surface. ``residual_m`` (h, w): range along the ray less the smooth fit, NaN where it does
+    """One capture of a flat surface. ``residual_m`` (h, w): range along the ray minus the smooth fit, NaN where it does
     not count; ``variance_m2`` (h, w): of it, by the frames' noise. ``normal`` (3,): of the plane, towards the camera.
-    ``places_m`` (h, w, 2): where each pixel sees the surface, in its co-ordinates; None where poses are unknown."""
+    ``places_m`` (h, w, 2): where each pixel sees the surface, in its co-ordinates; None if poses are unknown."""
 
     name: str
     frames: int
@@ -88,7 +88,7 @@ class PatternChange:
 class Separated:
     """A flat field with its diagnostics. ``surface_m``: standard deviation of the part that captures do not share,
     beyond their noise, or NaN; ``separated``: whether the shape was solved for. ``in_time``: first captures beside last
-    ones, at equal distances; ``in_range``: near beside far ones; None where there are not enough."""
+    ones, at equal distances; ``in_range``: near beside far ones; None if there are not enough."""
 
     field: FlatField
     captures: tuple[FlatCapture, ...]
@@ -104,9 +104,10 @@ class Separated:
 
 
 def flattened(cloud: Cloud, mask: np.ndarray, name: str, T_first_camera: np.ndarray | None = None) -> FlatCapture:
-    """Return an averaged cloud of a flat surface, of the pixels in ``mask`` (h, w), less its smooth fit. With a pose
-    the places are x and y in the first capture's camera frame, until `on_surface` turns them. Raises UserError without
-    a pixel grid, and where the frames are too few to tell their noise or the pixels to fit a surface."""
+    """Return an averaged cloud of a flat surface, of the pixels in ``mask`` (h, w), minus its smooth fit. With a pose,
+    the places are x and y in the first capture's camera frame, until `_on_one_plane` rotates them. Raises UserError
+    without a pixel grid, if the frames are too few to estimate their noise, or if the pixels are too few to fit a
+    surface."""
     noise_m2 = average_variance_m2(cloud, mask)
     if not cloud.organised or noise_m2 is None:
         what = f"{name}: {cloud.n_frames} frame{'s' * (cloud.n_frames != 1)}: too few to estimate the noise"
@@ -206,7 +207,7 @@ def _solved(
 
 
 def _on_one_plane(captures: Sequence[FlatCapture]) -> tuple[FlatCapture, ...]:
-    """Return the captures with places (h, w, 2) along the first one's plane, where all have a pose; without, else."""
+    """Return the captures with places (h, w, 2) along the first one's plane if all have a pose, else without places."""
     if any(capture.places_m is None for capture in captures):
         return tuple(replace(capture, places_m=None) for capture in captures)
     normal = captures[0].normal

@@ -52,14 +52,14 @@ class FlatField:
 
     @property
     def rms_m(self) -> float:
-        """Root mean square of the pattern, less the map's own noise."""
+        """Root mean square of the pattern without the map's own noise."""
         return float(np.sqrt(max(np.nanmean(self.error_m.astype(float) ** 2 - self.variance_m2), 0.0)))
 
 
 def corrected(cloud: Cloud, field: FlatField) -> Cloud:
-    """Return the cloud with its points moved along their rays to where they would be without the pattern; where it is
-    unknown they stay. ``mean_variance_m2`` is the frames' noise (None of a single frame) and the map's variance, or the
-    pattern's mean square. Raises UserError where the cloud has no pixel grid or is of another camera, size or lens."""
+    """Return the cloud with its points moved along their rays to remove the pattern; points where it is unknown stay.
+    ``mean_variance_m2`` is the frames' noise (None for a single frame) and the map's variance, or the pattern's mean
+    square. Raises UserError if the cloud has no pixel grid or is of another camera, size or lens."""
     _refuse_other(cloud, field)
     at = cloud.region.within(field.lens.whole)
     error_m, variance_m2 = field.error_m[at].astype(float), field.variance_m2[at].astype(float)
@@ -89,7 +89,7 @@ def doubts(cloud: Cloud, field: FlatField, name: str | Path) -> tuple[str, ...]:
 
 
 def _refuse_other(cloud: Cloud, field: FlatField) -> None:
-    """Raise UserError where the cloud cannot be of the camera and mode of the flat field."""
+    """Raise UserError if the cloud cannot be of the camera and mode of the flat field."""
     if not cloud.organised or cloud.projection != "central":
         what = "a flat field corrects a camera's own pixels, and this cloud has no pixel grid"
         raise UserError(what, fix="leave out the flat field, or name the capture's depth images")
@@ -107,7 +107,7 @@ def _refuse_other(cloud: Cloud, field: FlatField) -> None:
 
 
 def save_flat_field(path: Path, field: FlatField) -> None:
-    """Write the file, whole or not at all. Raises UserError where it cannot be written."""
+    """Write the file, whole or not at all. Raises UserError if it cannot be written."""
     lens = field.lens
     numbers = [lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion]
     held: dict[str, Any] = {name: getattr(field, name).astype(np.float32) for name in ("error_m", "variance_m2")}
@@ -118,7 +118,7 @@ def save_flat_field(path: Path, field: FlatField) -> None:
 
 
 def load_flat_field(path: Path) -> FlatField:
-    """Read a file of `save_flat_field`. Raises UserError where it is not such a file, is broken, too large or newer."""
+    """Read a file of `save_flat_field`. Raises UserError if it is not such a file, is broken, too large or newer."""
     from detectors.recordings.arrays import load_npz
 
     held = load_npz(path)

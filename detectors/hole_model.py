@@ -1,13 +1,12 @@
 """The model of a blurred hole, and its fit to the residuals around one detection.
 
-A round tube that starts with the surface's mouth, and behind it a floor of one depth, seen and lit obliquely, averaged
-over ``blur_px`` x ``blur_px`` pixels. Light that has come as deep as t has passed the mouth and the circle at depth t
-on its way in and out; in the image each is an ellipse, shifted by parallax. The tube's length is fitted too.
+The model is a round tube between a mouth in the surface and a flat floor, seen and lit obliquely, and averaged over
+``blur_px`` x ``blur_px`` pixels. Light that reaches depth t passes the mouth and the circle at depth t on its way in
+and out; in the image each is an ellipse that parallax shifts. The tube's length is fitted too.
 
 Not modelled: light between wall and floor, which makes a wall look deeper than it is; walls darker than the floor; a
-floor that is not flat; the loss of weight of deep neighbours in a bilateral filter (holes of 2 to 3 times the blur come
-out up to 16 % too deep at 33 mm).
-"""
+floor that is not flat; the lower weight of deep neighbours in a bilateral filter (holes of 2 to 3 times the blur are
+measured up to 16 % too deep at 33 mm)."""
 
 from __future__ import annotations
 
@@ -21,23 +20,23 @@ from detectors.clusters import PLAIN
 from detectors.whitening import correlated_products, whitener
 
 STRIPS = 64
-"""Strips that stand for the disc: the coverage is exact in total, and in each pixel within 0.001 for a blur of 3."""
+"""Strips that approximate the disc: the total coverage is exact, that of a pixel right to 0.001 for a blur of 3."""
 NODES, WEIGHTS = np.array([0.5 - 0.15**0.5, 0.5, 0.5 + 0.15**0.5, 1.0]), np.array([5.0, 8.0, 5.0, 0.0]) / 18.0
-"""Gauss and Legendre's rule of three points on (0, 1), for the integral over the depth of the wall; and its end."""
+"""Gauss-Legendre rule with three points on (0, 1) for the integral over the wall's depth, and the wall's end."""
 STEP = 1e-3
-"""Size of differences that stand for derivatives: in pixels, relative for radius and depth, absolute for the wall."""
-MOST_STEPS, TOLERANCE = 40, 1e-5  # limits of a descent: its steps, and the relative gain below which it ends
+"""Step of the finite differences: in pixels for the place, relative for radius and depth, absolute for the wall."""
+MOST_STEPS, TOLERANCE = 40, 1e-5  # limits of a descent: the number of steps, and the relative gain below which it ends
 DAMPING, LEAST_M, SMALLEST = 1e-3, 1e-9, 1e-18
-"""Damping of the first step; deviation that is rounding of the arithmetic, and its square."""
+"""Damping of the first step; size of a deviation that is only rounding error, and its square."""
 MODEL_ERROR, RADIUS_ERROR_PX, DEPTH_ERROR = 0.02, 0.05, 0.05
-"""Errors by light between wall and floor on simulated clouds: shares of a pixel's depth, and of the fitted sizes."""
+"""Errors by light between wall and floor on simulated clouds: shares of a pixel's depth and of the fitted sizes."""
 MOST_MISFIT = 1.5
-"""Deviation of what the fit leaves beyond which the model fails: .3 to 1.05 on its own optics, 1.1 to 3 on others."""
+"""Largest misfit of a valid fit: simulations with the model's optics give 0.3 to 1.05, with others 1.1 to 3."""
 WALL_PRIOR = (0.5, 12.0**-0.5)
-"""Mean and standard deviation of the tube's length over the depth before the image is seen: uniform from 0 to 1."""
+"""Prior mean and standard deviation of the tube's length over the depth, which is uniform from 0 to 1."""
 
 _THETA = np.linspace(-np.pi / 2, np.pi / 2, STRIPS + 1)
-EDGES = np.sin(_THETA)  # edges (s + 1,) of strips across a unit disc, narrow where the chord changes fast
+EDGES = np.sin(_THETA)  # edges (s + 1,) of strips across a unit disc: narrow where the chord changes fast
 HALF_CHORDS = np.diff(_THETA / 2 + np.sin(2 * _THETA) / 4) / np.diff(EDGES)  # mean half-chords (s,) of these strips
 MIDDLES = 0.5 * (EDGES[:-1] + EDGES[1:])
 
@@ -49,14 +48,12 @@ def normal_of(per_px_m: np.ndarray) -> np.ndarray:
 
 
 def sight(centre_m: np.ndarray, per_px_m: np.ndarray, emitter_m: np.ndarray, share: float = 1.0) -> np.ndarray:
-    """Return the place (8,) from where a hole is seen and lit, reduced to what moves in the image: the cosine between
-    ray and normal, times the ray's length per z; the drift along u and v; the shrinking; the beam along u and v; the
-    emitter's height; the share of the image that is seen from here. ``centre_m`` (3,) camera frame, ``per_px_m`` (2,
-    3).
+    """Return the viewpoint (8,) of a hole, reduced to what moves in the image: the cosine between ray and normal, times
+    the ray's length per z; the drift along u and v; the shrinking; the beam along u and v; the emitter's height; the
+    share of the image that this viewpoint contributes. ``centre_m`` (3,): camera frame. ``per_px_m``: (2, 3).
 
-    A circle at depth h along the normal looks like the same circle on the surface, moved by h * drift / (1 + h *
-    shrinking), and smaller by that divisor. Light from depth h came in at beam * h / (h + height) from it.
-    """
+    A circle at depth h along the normal has the image of the same circle on the surface, moved by h * drift / (1 + h *
+    shrinking) and divided by that divisor. Light from depth h entered beam * h / (h + height) away from it."""
     normal = normal_of(per_px_m)
     normal = normal / np.copysign(np.linalg.norm(normal), normal @ centre_m)
     ray, z = centre_m / centre_m[2], centre_m[2]
@@ -69,7 +66,7 @@ def sight(centre_m: np.ndarray, per_px_m: np.ndarray, emitter_m: np.ndarray, sha
 
 
 def straight_sight(per_px_m: np.ndarray) -> np.ndarray:
-    """Return the sight along z for a parallel projection of unknown origin, with light along the same direction."""
+    """Return the viewpoint (8,) of a parallel projection of unknown origin: view and light are along z."""
     normal = normal_of(per_px_m)
     normal = normal / np.copysign(np.linalg.norm(normal), normal[2])
     drift = np.linalg.solve(per_px_m[:, :2].T, normal[:2])
@@ -78,9 +75,9 @@ def straight_sight(per_px_m: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class HolePatch:
-    """Residuals around one detection. ``metric_m2`` (2, 2): squared length of a pixel offset (du, dv) is its quadratic
-    form. ``noise_m``: deviation beside the hole. ``blur_px`` (along u, along v): sides of the rectangle over which the
-    image is averaged. ``sights`` (s, 8). ``whitener`` (n, n): of the used pixels' errors, where it is known."""
+    """Residuals around one detection. ``metric_m2`` (2, 2): its quadratic form is the squared length of a pixel offset
+    (du, dv). ``blur_px`` (along u, along v): sides of the rectangle over which the image is averaged. ``noise_m``:
+    standard deviation beside the hole. ``sights``: (s, 8). ``whitener`` (n, n): of the used pixels' errors."""
 
     residual_m: np.ndarray
     used: np.ndarray
@@ -92,14 +89,14 @@ class HolePatch:
 
     @property
     def prior_weight(self) -> float:
-        """Misfit in metres that a deviation of the wall by 1 is worth."""
+        """Misfit in metres that corresponds to a deviation of the wall by 1."""
         return self.noise_m * math.sqrt(self.blur_px[0] * self.blur_px[1]) / WALL_PRIOR[1]
 
 
 def pictures(patch: HolePatch, holes: np.ndarray) -> np.ndarray:
-    """Return the residuals (m, h, w) of holes (m, 5), each (u, v, radius, depth, wall), without offset: depth along the
-    optical axis, wall in 0..1; a disc where the depth is negative. The mouth is cut into strips along u, and each hole
-    into layers: of each sight three of wall, and what is deeper."""
+    """Return the residuals (m, h, w), without offset, of holes (m, 5): u, v, radius, depth along the optical axis, and
+    wall in 0..1; a disc if the depth is negative. The mouth is cut into strips along u. Each viewpoint gives a hole
+    three layers of wall and one of all that is deeper."""
     return _painted(holes, patch.sights, patch.metric_m2, *patch.blur_px, *patch.used.shape)
 
 
@@ -112,7 +109,7 @@ def _painted(
     area = math.sqrt(metric[0, 0] * metric[1, 1] - metric[0, 1] ** 2)
     half_width, half_height = math.sqrt(metric[1, 1]) / area, math.sqrt(metric[0, 0]) / area
     images, weights, chords = np.zeros((len(holes), h, w)), np.empty(layers), np.empty((2, layers, STRIPS))
-    # in each column from ``left`` on, by strip: the sum of the layers, and its integral over the strips above
+    # for each column from ``left`` on and each strip: the sum of the layers, and its integral over the strips above
     across, above = np.empty((w, STRIPS)), np.zeros((w, STRIPS + 1))
     for n in range(len(holes)):
         u, v, radius, depth, wall = holes[n, 0], holes[n, 1], holes[n, 2], holes[n, 3], holes[n, 4]
@@ -147,13 +144,13 @@ def _painted(
 def _cut(  # type: ignore[no-untyped-def]
     radius, depth, wall, sights, metric, weights, chords
 ):
-    """Fill in the ``weights`` (k,) of a hole's layers, and ``chords`` (2, k, s): start and end of each in each strip,
-    in pixels along u from the centre."""
+    """Write the ``weights`` (k,) of a hole's layers and their ``chords`` (2, k, s): each layer's start and end in each
+    strip, in pixels along u from the centre."""
     g11, g12, g22 = metric[0, 0], metric[0, 1], metric[1, 1]
     # the mouth's height and half-width in px per metre of radius, and the drift of its chords along u by v
     height, width, slant = math.sqrt(g11 / (g11 * g22 - g12 * g12)), 1.0 / math.sqrt(g11), -g12 / g11
-    per_height = 1.0 / height  # a division, which may fail, is no vector operation
-    # three circles that a layer's light has passed: shift along u and v, and radius
+    per_height = 1.0 / height  # computed here: a division in the loop, which may fail, would prevent vectorisation
+    # the three circles that a layer's light passes: shift along u and v, and radius
     shift_u, shift_v, size = np.empty(3), np.empty(3), np.empty(3)
     for k in range(len(weights)):
         place, node = sights[k // len(NODES)], k % len(NODES)
@@ -183,8 +180,8 @@ def _cut(  # type: ignore[no-untyped-def]
 
 @dataclass(frozen=True)
 class HoleFit:
-    """``u_px``, ``v_px`` in the patch; ``covariance`` (6, 6) of (u, v, radius, depth, offset, wall), px and metres.
-    ``misfit``: deviation of what is left in units of the noise and the model's own error; 0 where neither is known."""
+    """A fitted hole: ``u_px`` and ``v_px`` in the patch. ``covariance`` (6, 6): of u, v, radius, depth, offset and
+    wall, in px and metres. ``misfit``: deviation of the residuals over that of noise and model error; 0 if unknown."""
 
     u_px: float
     v_px: float
@@ -198,19 +195,18 @@ class HoleFit:
 
 
 def whitened(patch: HolePatch, by_lag: np.ndarray | None, offset_m: float) -> HolePatch:
-    """Return the patch with the whitener of noise with this correlation ``by_lag`` (odd, odd), and of the model's own
-    errors, which are shares of the depth beyond ``offset_m``."""
+    """Return the patch with the whitener of its errors: noise with the correlation ``by_lag`` (odd, odd), and errors of
+    the model, which are shares of the depth beyond ``offset_m``."""
     error_m = MODEL_ERROR * np.abs(patch.residual_m - offset_m)
     return replace(patch, whitener=whitener(patch.used, by_lag, max(patch.noise_m, LEAST_M), error_m))
 
 
 def fit_hole(patch: HolePatch, u: float, v: float, radius_m: float, depth_m: float, offset_m: float) -> HoleFit:
-    """Fit by least squares (Levenberg and Marquardt) from a start, to six used pixels and more: the likelihood's
-    maximum where the patch has a whitener, else with `sandwich_covariance`.
+    """Fit a hole to at least six used pixels by least squares (Levenberg and Marquardt) from start values. With a
+    whitener in the patch, the fit has maximum likelihood; else the covariance is that of `sandwich_covariance`.
 
     Fitted are (u, v, ln radius, depth * radius^2, offset, x) with the wall sin^2(pi x / 2), which has `WALL_PRIOR`. The
-    fourth is the hole's volume, which the blur keeps, so that of a small hole only the radius is ill determined.
-    """
+    fourth is the hole's volume. The blur preserves it, so that only the radius of a small hole is ill-determined."""
     used, data, known = patch.used, patch.residual_m[patch.used], patch.whitener is not None
     weight = 1.0 / WALL_PRIOR[1] if known else patch.prior_weight
     start = np.array([u, v, math.log(radius_m), depth_m * radius_m**2, offset_m, WALL_PRIOR[0]])
@@ -222,7 +218,7 @@ def fit_hole(patch: HolePatch, u: float, v: float, radius_m: float, depth_m: flo
     square = float(left @ left)
     if not known:
         return HoleFit(u, v, radius, depth, offset, wall, sandwich_covariance(patch, by, square), converged, 0.0)
-    # the information's inverse times the variance of what is left, and the model's own errors
+    # the inverse of the information, times the residual variance, plus the model's errors
     variance, information = square / max(len(data) - 6, 1), by @ by.T
     information[5, 5] += WALL_PRIOR[1] ** -2
     covariance = np.linalg.pinv(information, hermitian=True) * variance
@@ -237,13 +233,12 @@ def _descent(  # type: ignore[no-untyped-def]
 ):
     """Return the best hole (5,), its offset, rows (8, n) and whether the descent from ``start`` (6,) has converged. The
     first rows are derivatives of the used pixels, at flat ``places`` (n,), by (u, v, radius, depth, offset, wall); the
-    seventh is what the hole leaves of their ``data`` (n,). They are multiplied by ``whitening`` (n, n) where
-    it is not empty. ``weight``: of the prior."""
+    seventh is ``data`` (n,) minus the hole. A ``whitening`` (n, n) that is not empty multiplies them."""
     n, q, step, damping, converged = len(data), start, np.zeros(6), 10.0 * DAMPING, False
     square = promised = np.inf
     rows, products, best, holes, sizes = np.zeros((8, n)), np.zeros((7, 7)), np.zeros(5), np.zeros((6, 5)), np.zeros(5)
     left, slope = rows[7:], np.zeros(7)
-    # keeps a wild trial step finite: no disc is larger than ten patches
+    # no disc is larger than ten patches, so that a far trial step stays finite
     widest = math.log(10.0 * (h + w) * math.sqrt(max(metric[0, 0], metric[1, 1])))
     for trial in range(MOST_STEPS + 1):
         at = q + step
@@ -283,7 +278,7 @@ def _descent(  # type: ignore[no-untyped-def]
             for i in range(n):
                 for j in range(7):
                     slope[j] = rows[j, i]
-                # derivatives by q from those by the hole's numbers
+                # derivatives by q from those by the hole's parameters
                 slope[2] = radius * slope[2] - 2.0 * depth * slope[3]
                 slope[3] *= radius**-2.0
                 slope[5] *= bend
@@ -312,7 +307,7 @@ def _whiten(rows: np.ndarray, whitening: np.ndarray) -> None:
 
 @numba.njit(**PLAIN)
 def _damped(products, damping):  # type: ignore[no-untyped-def]
-    """Return the step (6,) of normal equations ``products`` (7, 7), right side last, and the gain that it promises."""
+    """Return the step (6,) of damped normal equations ``products`` (7, 7), right side last, and its predicted gain."""
     lower, step, promised = np.zeros((7, 6)), np.zeros(6), 0.0
     for j in range(6):
         for i in range(j, 7):
@@ -331,13 +326,13 @@ def _damped(products, damping):  # type: ignore[no-untyped-def]
 
 
 def sandwich_covariance(patch: HolePatch, by: np.ndarray, square_m2: float) -> np.ndarray:
-    """Return the covariance (6, 6) of (u, v, radius, depth, offset, wall) from derivatives (6, n) by them and the sum
-    of squares that is left, under noise that the square filter correlates, or NaN: A^-1 (s^2 J' C J + p^2 W) A^-1 with
-    A = J' J + W, W the prior's square weight on the wall, p^2 its variance; E[misfit' misfit] = s^2 (n - trace(A^-1 J'
-    C J))."""
+    """Return the covariance (6, 6) of (u, v, radius, depth, offset, wall), or NaN, if the square filter correlates the
+    noise. ``by`` (6, n): derivatives. ``square_m2``: sum of squared residuals. With A = J' J + W it is A^-1 (s^2 J' C J
+    + p^2 W) A^-1. W is the prior's square weight on the wall, p^2 its variance; E[misfit' misfit] = s^2 (n - trace(A^-1
+    J' C J))."""
     columns = np.zeros((6, *patch.used.shape))
     columns[:, patch.used] = by
-    # the odd numbers of pixels nearest to the blur: pixels so far apart have no noise in common
+    # the odd numbers of pixels nearest to the blur: pixels this far apart share no noise
     across, down = (2 * max(round((blur - 1) / 2), 0) + 1 for blur in patch.blur_px)
     prior = np.zeros((6, 6))
     prior[5, 5] = patch.prior_weight**2

@@ -117,10 +117,10 @@ class TrueDamage:
 
 
 @runtime_checkable
-class ToldTheTruth(Protocol):
+class NeedsTruth(Protocol):
     """A detector that receives the truth in order to test the harness; no real detector implements this."""
 
-    def told(self, truth: tuple[TrueDamage, ...]) -> Detector:
+    def with_truth(self, truth: tuple[TrueDamage, ...]) -> Detector:
         """Return the detector for one cloud with this truth; empty on a hole-free board."""
         ...
 

@@ -34,7 +34,8 @@ HALF_WIDTHS = (1, 2, 3, 5, 8, 12, 18, 27, 40, 60, 90)
 """Half-widths of the filters in pixels: a tent of half-width h is as wide at half of its height as a hole of 2 h + 1
 pixels. The ratio of 1.5 keeps nine tenths of the signal of a width between two of them."""
 SURROUNDINGS, WIDEST_SHARE = 3, 6.0
-"""A filter's surroundings are the filter so many steps wider; and the target's least width in widest filters."""
+"""Number of steps by which a filter's surroundings are wider; the target's least width in widths of the widest
+filter."""
 FAINT = 0.02
 """Weight of the value 0 in every mean."""
 CLIP_SIGMAS, LEVEL_SIGMAS = 6.0, 2.0
@@ -63,7 +64,7 @@ class FilterConfig(Config):
 
 
 class LocalConfig(FilterConfig):
-    """``surface``: ``shape: auto`` unless shape or degree is given. ``hole_model``: measures sizes."""
+    """``surface``: ``shape: auto`` unless a shape or degree is given. ``hole_model``: measures sizes."""
 
     @model_validator(mode="before")
     @classmethod
@@ -291,8 +292,7 @@ def local_sigma(
     window's middle to its edge, interpolated between nodes ``half`` apart."""
 
     def nodes_of(length: int) -> np.ndarray:
-        """Return the centres of equal parts, where `cv2.resize` assumes its samples, moved to pixels so that they are
-        symmetric about both ends."""
+        """Return the centres of equal parts, as `cv2.resize` assumes, moved to pixels symmetrically about both ends."""
         count = max(1, round(length / half))
         count += (length - count) % 2 if length % 2 == 0 else 0
         half_pixel = 0.5 if length % 2 == 0 else 0.0

@@ -15,10 +15,10 @@ shoulder of a neighbouring hole. What pixels along the target's outline share be
 Upsampled depth is judged on squares of pixels in which its noise reaches no farther than a camera's window.
 
 Not modelled: slots that no template fits; slots within `RIM_PX` of outlines and of removed findings; distortion of
-templates on steep surfaces; missing returns, except the few that are no findings by themselves (`detectors.missing`).
+templates on steep surfaces; missing returns, except the few that are not findings by themselves (`detectors.missing`).
 The denominator takes the share of a template's whitened energy on known pixels for t' C^-1 t, by a rectangle that
-spreads as widely; a template does not judge places where less than `LEAST_SEEN` of it is visible. Scores of slots are
-taken on every second pixel."""
+spreads as widely; a template does not judge places where less than `LEAST_SEEN` of it is visible. Slots are scored on
+every second pixel."""
 
 from __future__ import annotations
 
@@ -55,9 +55,9 @@ LEAST_SEEN = 0.6
 SHORT_PX = 13
 """Width over which noise is compared between places: wider filters count there as much as elsewhere."""
 QUIET_SIGMAS = 4.0
-"""Residuals beyond it, and their neighbours, do not count for the covariance."""
+"""Larger residuals and their neighbours do not count for the covariance."""
 CLIP_SIGMAS = 5.0
-"""Deviations to which a pixel is clipped if its neighbours are smaller: a flying pixel alone is no finding."""
+"""Limit to which a pixel is clipped if its neighbours are smaller: a single flying pixel is not a finding."""
 STRONG, LOUD_SIGMAS, MARGIN_PX = 6.0, 3.0, 2
 """A peak with this score, the loud pixels connected to it, and those around are removed; the rest is judged again."""
 LOUD_SHARE = 0.5
@@ -67,7 +67,7 @@ ALONE_PX = 7
 RIM_PX = 6
 """Depth of the target's rim, to which the camera's window and lens reach over its edge."""
 RIM_ENDS_PX = (1, 2, 3, 5, 8, 12)
-"""Distances from the outline up to which scores have their own scatter; beyond, all are alike."""
+"""Distances from the outline up to which scores have their own scatter; farther inside, all scores share one."""
 N_ZONES = len(RIM_ENDS_PX) + 1
 ZONES = np.searchsorted(RIM_ENDS_PX, np.arange(RIM_ENDS_PX[-1] + 2)).astype(np.uint8)
 WINDOW_RADII, PART_PX, UNEVEN = 6, 8, 1.25
@@ -81,11 +81,11 @@ CAPPED = DEVIATIONS * np.sqrt(2.0 / np.pi) * (1.0 - np.exp(-0.5 * (CAP / DEVIATI
 CAPPED_UNEVEN = float(np.interp(UNEVEN, DEVIATIONS, CAPPED))
 """Deviations of a Gaussian, and the mean of its size if more than `CAP` counts as `CAP`."""
 FAINT = 3.5
-"""Scores below are all raised by the same factor, because Worth counts maxima."""
+"""Scores below this are all raised by the same factor, because `Worth` counts maxima."""
 LOBE_SHARE = 0.5
-"""A score that is so much smaller than one of the other sign within `RIM_PX` is a lobe left by whitening."""
+"""A score below this share of a score of the other sign within `RIM_PX` is a side lobe of the whitening."""
 WIDE_PX = 5.0
-"""Radius from which on noise may split a template's finding into several peaks."""
+"""Radius from which noise may split a template's finding into several peaks."""
 TAIL_PX, TAIL_SHARE, TAIL_SIGMAS = 1.5, 0.0005, 3.29
 """Largest radius at which a template's own scores show their tail; the share of pixels beyond it on either side; and
 where a Gaussian has it. Wider means are near Gaussian, and too few of them are independent."""
@@ -119,7 +119,7 @@ class MatchedDetector(LocalDetector):
         return replace(evidence, score=score, signed=signed)
 
     def picture(self, cloud: Cloud, pixels: int = 1) -> LocalPicture:
-        """Return the residuals on a grid in which noise reaches no farther than through a camera's own window."""
+        """Return the residuals on a grid in which noise reaches no farther than a camera's own window."""
         return super().picture(cloud, max(pixels, round(cloud.noise_reach_px / max(whitening.WINDOWS_PX))))
 
     def scored(
@@ -143,7 +143,7 @@ class MatchedDetector(LocalDetector):
     def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
         """Return the mean covariance of the clouds' residuals by lag, in squared deviations of the local noise."""
         pictures = (self.picture(cloud) for cloud in hole_free)
-        seen = [_covariance(*_in_deviations(*one.residuals)[::2]) for one in pictures]
+        seen = [_covariance(*_in_deviations(*picture.residuals)[::2]) for picture in pictures]
         return {"covariance": np.mean(seen, axis=0)} if seen else {}
 
     def calibrated(self, learned: Mapping[str, np.ndarray]) -> MatchedDetector:
@@ -357,8 +357,7 @@ def _keep_stronger(  # type: ignore[no-untyped-def]
 ):
     """Keep the larger of each pixel's scores (r, c) by size, and that template's ``number``. Scores are scaled to
     deviations of their ``zone`` (r, c) by the factors ``per_deviation`` (z,), and raised: their squares grow by
-    ``raised``, in proportion below `FAINT`. Scores of a template between pixels, ``down`` or to the ``right``, belong
-    to all pixels around."""
+    ``raised``, in proportion below `FAINT`. Scores between pixels, ``down`` or ``right``, belong to all around."""
     faint = per_deviation * np.float32(np.sqrt(1.0 + raised / FAINT**2))
     height, width = score.shape
     for y in range(down + 1):

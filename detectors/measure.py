@@ -1,5 +1,6 @@
-"""Size and place of a detection: the thesis' extents, and beside them the model of a blurred hole, or where that does
-not hold the contour at half depth. Depths are along the optical axis, positive behind the surface, sizes on it."""
+"""Measures the size and the place of a detection: the thesis' extents, and a fitted model of a blurred hole. Where the
+model does not hold, the contour at half depth is measured instead. Depths are measured along the optical axis, positive
+behind the surface; sizes are measured on the surface."""
 
 from __future__ import annotations
 
@@ -30,22 +31,22 @@ from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import MM, Cloud, Region, rotate_vectors
 
 OTHER_DAMAGE_SIGMAS = 5.0
-"""Pixels of the patch that stand out by so much and do not touch the detection belong to something else."""
+"""Pixels of the patch with a larger residual that do not touch the detection belong to other damage."""
 OPEN_M = 20.0 * MM
-"""Greater depths count as this one in the contour, which follows an oblique hole's mouth, not what shows through."""
+"""The contour clips deeper residuals to this depth, to follow an oblique hole's mouth, not what shows through."""
 CONTOUR_ZOOM = 4  # sub-pixels of the half-depth contour along each axis
 EXPLAINED = 0.5
-"""Share of a detection's mean residual that its fit must show: waves of the noise may take up a smooth dent."""
+"""Least share of a detection's mean residual that its fit must explain: correlated noise may absorb a smooth dent."""
 SHARPER_PX, SHARPER_GAIN = (1.0, 2.0, 3.0, 5.0), 9.0
-"""Blurs below that of the noise that are tried for a recording, and the gain in chi square that accepts one."""
+"""Blurs, smaller than the noise's, that are tried for a recording, and the gain in chi square that accepts them."""
 
 
 class HoleModelConfig(Config):
     """Assumptions of the model of a blurred hole. ``blur_px``: side of the square over which the camera averages: 5 for
-    the Azure Kinect's depth engine (OpenK4A), 3 for the Kinect v2 (libfreenect2), 1 for none. ``emitter_mm``: where the
-    light stands in the camera's frame. ``linear_depth_mm``: beyond it a neighbour at depth counts for less than half in
-    the filter, and the contour at half depth is the safer measure. ``largest_invalid``: the part of the disc that may
-    lack a range. ``largest_relative_error``: of the diameter; beyond it diameter and depth cannot be told apart."""
+    the Azure Kinect's depth engine (OpenK4A), 3 for the Kinect v2 (libfreenect2), 1 for none. ``emitter_mm``: position
+    of the light source in the camera's frame. ``linear_depth_mm``: at greater depths, the filter weights a deep
+    neighbour by less than half, and the contour at half depth is more reliable. ``largest_invalid``: share of the disc
+    that may lack a range. ``largest_relative_error``: of the diameter; beyond it, diameter and depth are ambiguous."""
 
     blur_px: int = Field(default=5, ge=1, le=31)
     emitter_mm: tuple[float, float, float] = (-14.0, 0.0, 1.0)
@@ -63,8 +64,8 @@ class HoleModelConfig(Config):
 
 def blur_in_cells(cloud: Cloud, config: HoleModelConfig) -> tuple[float, float]:
     """Return the sides, along columns and rows, of the rectangle over which the cloud is averaged, in its own pixels or
-    cells: what a recording's noise shares, else ``config.blur_px``. A map adds the interpolation of its views' pixels:
-    sqrt(blur^2 + 2) pixels. Cells of more than a pixel take a mean of their own."""
+    cells: the reach of a recording's noise, else ``config.blur_px``. A map's interpolation between its views' pixels
+    widens it to sqrt(blur^2 + 2) pixels. Cells larger than a pixel are means themselves."""
     if cloud.map_views is None or not cloud.organised:
         blur_px = cloud.noise_reach_px or float(config.blur_px)
         return blur_px, blur_px
@@ -78,22 +79,22 @@ def blur_in_cells(cloud: Cloud, config: HoleModelConfig) -> tuple[float, float]:
 
 
 def extents(points_m: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the thesis' size and centre (3,) of a cluster (n, 3), metres: mean of the distances between the extreme
-    points in x and between those in y; mean of these four. Of equal extremes the first counts."""
+    """Return the thesis' size and centre (3,) of a cluster (n, 3), metres. The size is the mean of the distances
+    between the two extreme points in x and between those in y; the centre is the mean of these four. Of equals, the
+    first counts."""
     west, east, north, south = points_m[_extremes(points_m, np.zeros(len(points_m), np.int64), 1)[0]]
     diameter = 0.5 * float(np.linalg.norm(east - west) + np.linalg.norm(south - north))
     return diameter, (west + east + north + south) / 4.0
 
 
 def centres_of(points_m: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
-    """Return the centres (count, 3) by `extents` of the clusters of points (n, 3) that ``labels`` (n,) make; -1: of
-    none."""
+    """Return the centres (count, 3) by `extents` of clusters of points (n, 3). ``labels`` (n,): -1 for no cluster."""
     return np.asarray(points_m[_extremes(points_m, labels, count)].mean(axis=1))
 
 
 @numba.njit(**PLAIN)
 def _extremes(points: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
-    """Return the numbers (count, 4) of the points with the least and greatest x, and the least and greatest y."""
+    """Return the indices (count, 4) of the points with the least and greatest x, and with the least and greatest y."""
     found = np.full((count, 4), -1)
     for i in range(len(labels)):
         for end in range(4 if labels[i] >= 0 else 0):
@@ -104,7 +105,7 @@ def _extremes(points: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
 
 
 def measure_extents(cloud: Cloud, detection: Detection, note: str) -> Measurement:
-    """Measure the thesis' extents and the place on the sensor, if any; ``note`` says why there are no other numbers."""
+    """Measure the thesis' extents and the place on the sensor, if any. ``note`` says why nothing else is measured."""
     points = cloud.points_m.reshape(-1, 3)[detection.pixels]
     diameter, centre = extents(points)
     u = v = np.nan
@@ -117,17 +118,17 @@ def measure_extents(cloud: Cloud, detection: Detection, note: str) -> Measuremen
 def measure_detection(
     cloud: Cloud, evidence: Evidence, detection: Detection, config: HoleModelConfig, by_lag: np.ndarray | None = None
 ) -> Measurement:
-    """Measure a detection both ways; NaN and a note where a measurement fails. ``by_lag``: the noise's correlation."""
+    """Measure a detection both ways; failed measurements are NaN, with a note. ``by_lag``: the noise's correlation."""
     if not cloud.organised:
         return measure_extents(cloud, detection, "no pixel grid: extents only")
-    placed = measure_extents(cloud, detection, "too few valid pixels around for a model")
+    placed = measure_extents(cloud, detection, "too few valid pixels around it for a model")
     rows, columns = np.unravel_index(detection.pixels, cloud.points_m.shape[:2])
     around = _surroundings(cloud, evidence, rows, columns, config)
     if around is None:
         return placed
     near = grown(around.own, around.reach_px + 1) & around.patch.used
     (ax, ay, _), (bx, by, _) = around.per_px_m
-    # a pixel's area across the optical axis
+    # the area of a pixel perpendicular to the optical axis
     volume = float((around.patch.residual_m[near] - around.offset_m).sum()) * float(abs(ax * by - ay * bx))
     length_m, width_m, along = _sides(around, near)
     placed = replace(placed, volume_m3=volume, length_m=length_m, width_m=width_m, along=along)
@@ -142,15 +143,15 @@ def measure_detection(
         model_diameter_se_m=2.0 * float(errors[2]),
         model_depth_m=fit.depth_m,
         model_depth_se_m=float(errors[3]),
-        # per axis: the two axes on the surface share the trace
+        # standard error along one axis: the two axes on the surface share the trace
         model_centre_se_m=float(np.sqrt(np.trace(spread) / 2.0)),
         model_note="",
     )
 
 
 def _sides(around: _Surroundings, near: np.ndarray) -> tuple[float, float, np.ndarray]:
-    """Return length and width of the rectangle on the surface that has the second moments of the residual within
-    ``near`` (h, w) bool, those of the blur taken off, and the direction (3,) of its length."""
+    """Return length, width and direction (3,) of the length of the rectangle on the surface that has the second moments
+    of the residual within ``near`` (h, w) bool, minus those of the blur."""
     residual = around.patch.residual_m[near] - around.offset_m
     weight = np.maximum(around.sign * residual, 0.0)
     v, u = np.nonzero(near)
@@ -160,16 +161,16 @@ def _sides(around: _Surroundings, near: np.ndarray) -> tuple[float, float, np.nd
     places = places - (places @ weight)[:, None]
     moments = (places * weight) @ places.T - np.diag(np.square(around.patch.blur_px)) / 12
     variances, axes = np.linalg.eigh(around.per_px_m.T @ moments @ around.per_px_m)
-    # of the three the one nearest to 0 is that across the surface
+    # the variance along the surface's normal is the one nearest to 0
     width_m, length_m = (float(np.sqrt(12.0 * max(each, 0.0))) for each in (sorted(variances)[-2], variances[-1]))
     return length_m, width_m, axes[:, -1]
 
 
 @dataclass(frozen=True)
 class _Surroundings:
-    """A detection and its neighbourhood. ``offset_m`` of the residual round about; ``sign`` and ``peak_m`` of the
-    detection's own less that; ``reach_px``: half of the blur. ``origin_m``: the surface's point at (``u0``, ``v0``).
-    ``sharper_px``: smaller blurs to try, as noise may be blurred more than the scene."""
+    """A detection and its neighbourhood. ``offset_m``: residual around it. ``sign``, ``peak_m``: of its own residual,
+    less the offset. ``reach_px``: half of the blur. ``origin_m``: the surface's point at (``u0``, ``v0``), the
+    detection's centroid. ``sharper_px``: smaller blurs to try, as noise may be blurred more than the scene."""
 
     patch: HolePatch
     own: np.ndarray
@@ -190,7 +191,7 @@ class _Surroundings:
         return float(np.linalg.norm(normal_of(self.per_px_m)))
 
     def placed(self, measured: Measurement, u: float, v: float) -> Measurement:
-        """Return the measurement, placed at a patch position."""
+        """Return the measurement with the position (u, v) of the patch as its place."""
         du, dv = u - self.u0, v - self.v0
         centre_m = self.origin_m + du * self.per_px_m[0] + dv * self.per_px_m[1]
         return replace(measured, u_px=du + measured.u_px, v_px=dv + measured.v_px, model_centre_m=centre_m)
@@ -199,7 +200,7 @@ class _Surroundings:
 def _surroundings(
     cloud: Cloud, evidence: Evidence, rows: np.ndarray, columns: np.ndarray, config: HoleModelConfig
 ) -> _Surroundings | None:
-    """Cut out the detection with twice the blur of margin on each side."""
+    """Cut out the detection with a margin of twice the blur on each side; None with too few valid pixels around."""
     h, w = cloud.points_m.shape[:2]
     sides = blur_in_cells(cloud, config)
     blur = max(sides)
@@ -219,14 +220,14 @@ def _surroundings(
     if plane is None:
         return None
     centre, per_px = plane
-    # what stands out without touching the detection is other damage, with the blur around it
+    # large residuals that do not touch the detection are other damage; the blur spreads it
     stands_out = (np.abs(residual - offset) > OTHER_DAMAGE_SIGMAS * max(noise, 1e-9)) | own
     others = stands_out & ~parts_with(stands_out, own)
     used = finite & (own | ~grown(others, int(blur / 2)))
     deviations = residual[own] - offset
     sign = 1.0 if deviations.sum() >= 0 else -1.0
     peak = max(quantile_of(sign * deviations, 0.9), 1e-9)
-    # from where the surface's point is seen: the camera, or all those that a map was made from
+    # the camera that sees the surface's point, or all the cameras of a map
     emitter, views = np.array(config.emitter_mm) * MM, cloud.map_views
     if cloud.projection == "central":
         sights = [sight(centre, per_px, emitter)]
@@ -247,8 +248,8 @@ def _surroundings(
 def local_plane(
     points: np.ndarray, surface_z: np.ndarray, finite: np.ndarray, own: np.ndarray, projection: str
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the surface's point at the detection's centroid (3,) and its derivatives by u and v (2, 3), by regression
-    of directions (in a parallel projection of x and y) and of the surface's z."""
+    """Return the surface's point at the detection's centroid (3,) and its derivatives by u and v (2, 3), by linear
+    regression of directions (in a parallel projection of x and y) and of the surface's z; None if singular."""
     v0, u0 = (float(axis.mean()) for axis in np.nonzero(own))
     v, u = np.nonzero(finite)
     design, (x, y, z) = np.stack([np.ones(len(u)), u - u0, v - v0]), points[finite].T
@@ -268,7 +269,7 @@ def local_plane(
 
 
 def _modelled(around: _Surroundings, config: HoleModelConfig, by_lag: np.ndarray | None) -> tuple[HoleFit | None, str]:
-    """Return the fitted hole; None with the reason where the model is to be doubted."""
+    """Return the fitted hole, or None and the reason why the model does not hold."""
     own, invalid, patch = around.own, around.invalid, around.patch
     dark = "part of the hole has no range"
     too_deep = f"deeper than {config.linear_depth_mm:g} mm, where the camera's filter no longer averages evenly"
@@ -277,7 +278,7 @@ def _modelled(around: _Surroundings, config: HoleModelConfig, by_lag: np.ndarray
         return None, dark
     if around.peak_m > config.linear_depth_mm * MM:
         return None, too_deep
-    # the start: centroid of the deviation, peak depth, and the radius that gives the volume
+    # start values: centroid of the deviation, peak depth, and the radius that gives the volume
     near = grown(own, around.reach_px) & patch.used
     weight = np.maximum(around.sign * (patch.residual_m[near] - around.offset_m), 0.0)
     v, u = np.nonzero(near)
@@ -304,21 +305,21 @@ def _modelled(around: _Surroundings, config: HoleModelConfig, by_lag: np.ndarray
         return None, "the model of a blurred hole does not fit"
     if abs(fit.depth_m) > config.linear_depth_mm * MM:
         return None, too_deep
-    # the part of each pixel that the disc covers
+    # the share of each pixel that the disc covers
     flat = np.array([[fit.u_px, fit.v_px, fit.radius_m, -1.0, 0.0]])
     disc = -pictures(replace(patch, blur_px=(1.0, 1.0)), flat)[0]
     if float(disc[invalid].sum()) > config.largest_invalid * float(disc.sum()):
         return None, dark
-    # a singular fit can leave a negative variance by rounding
+    # rounding can make the variance of a singular fit negative
     variance = float(fit.covariance[2, 2])
     if not 0 < variance < (config.largest_relative_error * fit.radius_m) ** 2:
-        return None, "diameter and depth cannot be told apart through the blur (the diameter is an upper limit)"
+        return None, "the blur hides the difference between diameter and depth (the diameter is an upper limit)"
     return fit, ""
 
 
 def _by_contour(measured: Measurement, around: _Surroundings, doubt: str) -> Measurement:
-    """Measure the contour at half of the depth, of `OPEN_M` where it is deeper; pixels without a range that touch the
-    detection count as inside."""
+    """Measure the contour at half of the depth, or at half of `OPEN_M` if that is less. Pixels without a range that
+    touch the detection count as inside."""
     residual = np.nan_to_num(around.sign * (around.patch.residual_m - around.offset_m))
     hollow = around.invalid & parts_with(around.own | around.invalid, around.own)
     top_m = min(around.peak_m, OPEN_M)
@@ -334,9 +335,9 @@ def _by_contour(measured: Measurement, around: _Surroundings, doubt: str) -> Mea
     v, u = (float((axis.mean() + 0.5) / CONTOUR_ZOOM - 0.5) for axis in np.nonzero(inside))
     area = inside.sum() / CONTOUR_ZOOM**2 * around.area_m2
     diameter_m = 2.0 * float(np.sqrt(area / np.pi))
-    if not hollow.any():  # a pixel at the rim exceeds half of `OPEN_M` though mostly outside
+    if not hollow.any():  # a rim pixel may exceed half of `OPEN_M` although it lies mostly outside
         diameter_m -= (1.0 - top_m / around.peak_m) * math.sqrt(around.area_m2)
     depth_m = np.nan if hollow.sum() > around.own.sum() else around.sign * around.peak_m
-    note = doubt + "; from the contour at half depth, without standard errors"
+    note = doubt + "; measured at the half-depth contour, without standard errors"
     placed = around.placed(measured, u, v)
     return replace(placed, model_diameter_m=diameter_m, model_depth_m=depth_m, model_note=note)

@@ -23,14 +23,15 @@ from harness.vocabulary.seeds import random_stream
 
 ALPHA = 0.01  # expected number of chance findings in one capture, which determines the smallest size of a finding
 LEAST_POINTS = 9
-"""Fewer connected pixels are never a finding: 3 x 3, the narrowest filter of depth cameras, makes so many of one."""
+"""Fewest connected pixels of a finding: 3 x 3, the narrowest filter of depth cameras, turns one into so many."""
 SELDOM = 0.2
 """A pixel that returned in at most this share of the frames counts as missing: its depth comes from stray light."""
 SQUARES = (1, 2, 3, 4, 5)  # sides in pixels of the square that correlates dropouts
 RATE_WINDOW_PX, RATE_PRIOR_PX = 65, 200.0
-"""The local rate of dropouts is that in a window of this side, drawn towards the target's own by so many pixels."""
+"""The local rate of dropouts is that in a window of this side, with the target's own rate weighted like this many
+pixels."""
 SIMULATED_PX, FEWEST_FIELDS, MOST_FIELDS = 1e6, 10, 100
-"""Simulation continues until its fields hold so many pixels: enough to reach well under one cluster per target."""
+"""Simulation continues until its fields hold this many pixels: enough to reach well under one cluster per target."""
 TAIL_CLUSTERS = 60  # largest simulated clusters, from which the fall of their number with size is estimated
 SLOWEST_FALL = math.log(2.0)  # without simulated clusters, each further pixel halves a cluster's probability
 DISCS_PX, LOUD_SIGMAS = (1.5, 2.5, 3.5), 3.0
@@ -83,10 +84,11 @@ def _gaps(cloud: Cloud, evidence: Evidence) -> _Gaps | None:
 
 
 def missing_evidence(cloud: Cloud, evidence: Evidence) -> np.ndarray | None:
-    """Return (h, w), at least 0, what missing pixels around each place add to the square of a score there: twice the
-    logarithm of the likelihood of so many in a disc (the best of several) over that at the local rate of dropouts,
-    which is estimated where scores are not high. None if nothing is missing. Clusters that may be findings by
-    themselves do not count, and others little: one bad sample of a filter makes `LEAST_POINTS` missing pixels."""
+    """Return (h, w), at least 0, the amount that missing pixels around each place add to the square of a score there:
+    twice the logarithm of a likelihood ratio. It compares the likelihood of their number in a disc (the best of
+    several) with that at the local rate of dropouts, which is estimated where scores are not high. None if nothing is
+    missing. Clusters that may be findings by themselves do not count, and others little: one bad sample of a filter
+    makes `LEAST_POINTS` missing pixels."""
     gaps = _gaps(cloud, evidence)
     if gaps is None:
         return None
@@ -154,7 +156,7 @@ def one_damage_once(
             kept.append(hole)
         else:
             same = [other for other in same if other is not largest]
-        depth = [other for other in depth if all(other is not one for one in same)]
+        depth = [other for other in depth if all(other is not each for each in same)]
     return tuple(sorted((*depth, *kept), key=lambda each: -each.score))
 
 
@@ -223,7 +225,7 @@ class _Chance(NamedTuple):
     fall: float = SLOWEST_FALL
 
     def log_expected(self, points: int) -> float:
-        """Return the logarithm of the expected number of clusters of at least so many pixels on the whole target."""
+        """Return the logarithm of the expected number of clusters of at least this many pixels on the whole target."""
         return self.log_at - self.fall * (points - self.at)
 
     @property
@@ -233,7 +235,7 @@ class _Chance(NamedTuple):
 
 
 def _settled(labels: np.ndarray, sizes: np.ndarray, outline: np.ndarray) -> _Chance:
-    """Return the chance by clusters that are no findings; the smallest size of a finding rises until it is stable."""
+    """Return the chance by clusters that are not findings; the smallest size of a finding rises until it is stable."""
     rows, columns = np.nonzero(outline)
     cut = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
     labels, outline = labels[cut], outline[cut]

@@ -1,4 +1,4 @@
-"""Robust statistics, and the noise of an average: what rounding leaves, and how far neighbours share noise."""
+"""Robust statistics, and the noise of an average: the error that rounding leaves, and the range of shared noise."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import numpy as np
 from harness.vocabulary.geometry import Cloud, Frame
 
 REACH_FRAMES, REACH_WINDOW_PX, REACH_PIXELS, FARTHEST_LAG_PX = 6, 384, 5000, 30
-"""Number of frames used; side of the window at the centre of the valid pixels; and least number of pixels valid in two
-frames: it shows their correlation, with 25 alike, to 0.07."""
+"""Number of frames used; side of the window at the centre of the valid pixels; least number of pixels valid in two
+frames: they show a correlation to 0.07 if 25 pixels are alike."""
 LONE_LEVEL_PX, LONE_SIGMAS, LONE_MOST_PX = 21, 5.0, 7
-"""Side of the square of the local mean in a single frame; deviations that mark an edge; longest lag that counts as
-noise's own, and not as that of a pattern or the surface."""
+"""Side of the square of the local mean in a single frame; deviations that mark an edge; longest lag that is attributed
+to noise and not to a pattern or the surface."""
 LEAST_FRAMES, SCATTER_PX = 4, 7
-"""Fewest frames whose scatter shows noise, averaged over a square: to 12 % from 49 x 3 differences."""
-SHARED = 0.1  # correlation below which pixels share nothing: a box of b pixels falls below it at lag b, up to 9 pixels
+"""Fewest frames whose scatter shows noise; side of the square of its average: to 12 % from 49 x 3 differences."""
+SHARED = 0.1  # correlation below which pixels share no noise: a box of b pixels, up to 9, falls below it at lag b
 
 
 def median_of(values: np.ndarray) -> float:
@@ -31,7 +31,7 @@ def median_of(values: np.ndarray) -> float:
 
 
 def quantile_of(values: np.ndarray, share: float) -> float:
-    """Return the value below which this share of finite values (n,) lies, n >= 1, interpolated linearly."""
+    """Return the linearly interpolated quantile of finite values (n,), n >= 1, at this share."""
     place = share * (len(values) - 1)
     low, high = int(place), min(int(place) + 1, len(values) - 1)
     ordered = np.partition(values, (low, high))
@@ -44,20 +44,20 @@ def sigma_of(values: np.ndarray) -> float:
 
 
 def rounding_left_m2(step_m: float, dither_m2: float) -> float:
-    """Return the variance of the fixed pattern that rounding to a step q leaves in an average of infinitely many frames
-    whose noise before has the variance s^2: (q / pi)^2 / 2 * sum_k exp(-4 pi^2 k^2 s^2 / q^2) / k^2."""
+    """Return the variance of the fixed pattern that rounding to a step q leaves in an average of infinitely many
+    frames. With noise of variance s^2 before it is (q / pi)^2 / 2 * sum_k exp(-4 pi^2 k^2 s^2 / q^2) / k^2."""
     k = np.arange(1, 200)
     left = (step_m / np.pi) ** 2 / 2.0 * float((np.exp(-((2.0 * np.pi * k) ** 2) * dither_m2 / step_m**2) / k**2).sum())
     return min(left, step_m**2 / 12.0)
 
 
 def rounding_variances(cloud: Cloud, mask: np.ndarray) -> tuple[float, float]:
-    """Return the variances that the rounding of z leaves in the average where ``mask`` (h, w) is true, square metres:
-    of a fixed pattern, which neighbours may share, and of what differs from pixel to pixel.
+    """Return the variances that rounding of z leaves in the average where ``mask`` (h, w) is true, square metres: of a
+    fixed pattern, which neighbours may share, and of the part that differs from pixel to pixel.
 
     Rounding to a step q errs by q / sqrt(12). Noise before the rounding turns part of that into noise, which averages
-    out, and leaves a fixed pattern b^2 (`rounding_left_m2`): after n frames b^2 + (q^2 / 12 - b^2) / n. All stays where
-    the averaged z still lies on the steps, as a median does. Without a step, z is taken to be stored as float32."""
+    out, and leaves a fixed pattern b^2 (`rounding_left_m2`): b^2 + (q^2 / 12 - b^2) / n after n frames. The whole error
+    remains if the averaged z still lies on the steps, as a median does. Without a step, z counts as float32."""
     z = cloud.points_m[..., 2][mask]
     step = cloud.z_step_m if cloud.z_step_m > 0 else float(np.finfo(np.float32).eps) * float(np.abs(z).max())
     whole = step**2 / 12.0
@@ -73,9 +73,9 @@ def rounding_variances(cloud: Cloud, mask: np.ndarray) -> tuple[float, float]:
 
 
 def average_variance_m2(cloud: Cloud, where: np.ndarray) -> np.ndarray | None:
-    """Return the variance (h, w) of the average's z from the scatter of its frames nearby, where ``where`` (h, w) is
-    true, or the typical variance where nothing nearby is known. None without a pixel grid, with fewer than
-    `LEAST_FRAMES` frames, or if fewer than half of the pixels have a scatter."""
+    """Return the variance (h, w) of the average's z where ``where`` (h, w) is true, from the scatter of its frames
+    nearby, or the typical variance if that is unknown. None without a pixel grid, with fewer than `LEAST_FRAMES`
+    frames, or if fewer than half of the pixels have a scatter."""
     seen = where & np.isfinite(cloud.variance_m2)
     if not cloud.organised or cloud.n_frames < LEAST_FRAMES or seen.sum() < 0.5 * where.sum():
         return None
@@ -108,7 +108,7 @@ def noise_reach_px(frames: Sequence[Frame], z_step_m: float) -> float:
         known = np.isfinite(difference)
         if lone:
             noise = _levelled(difference, known, LONE_LEVEL_PX)
-            if (sigma := sigma_of(noise[known])) < 0.5 * z_step_m:  # steps correlate the rounding of smaller noise
+            if (sigma := sigma_of(noise[known])) < 0.5 * z_step_m:  # with smaller noise, rounding errors are correlated
                 continue
             known &= np.abs(noise) < LONE_SIGMAS * sigma
             noise = _levelled(difference, known, LONE_LEVEL_PX)
@@ -128,7 +128,7 @@ def _levelled(values: np.ndarray, known: np.ndarray, side: int) -> np.ndarray:
 
 
 def _first_unlike_lag(noise: np.ndarray, known: np.ndarray) -> int:
-    """Return the first lag along rows at which the mean product of noise falls below `SHARED`; 0 for none."""
+    """Return the first lag along rows at which the mean product of noise falls below `SHARED`; 0 if there is none."""
 
     def product(lag: int) -> float:
         width = noise.shape[1] - lag

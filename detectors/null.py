@@ -29,26 +29,26 @@ PRIOR = np.array([0.40, 0.45, 0.07, 0.04, 0.02, 0.02])
 WANTED_PEAKS, FEWEST_PEAKS = 60, 8
 """Numbers of peaks above the floor: the mean excess of 60 is known to 13 %, that of the fewest to 35 %."""
 NORMAL_PEAKS = 10.0
-"""Number of peaks for which the theory counts: maxima of normal noise with the deviation that a unit of score is meant
-to be. Ten show that deviation to 16 %; robust scales of heavy-tailed noise are wrong by as much."""
+"""Weight of the theory, in peaks: maxima of normal noise with the deviation that a unit of score is meant to be. Ten
+peaks show that deviation to 16 %; robust scales of heavy-tailed noise err by as much."""
 CROWDED, LADDER = 0.6, 1.06
 """Share of the largest number of findings at any threshold, and the ratio of thresholds tried for the floor."""
 LEAST = 3.0
-"""Lowest threshold in units of score: bounded errors end so close that one side says nothing about the other."""
+"""Lowest threshold in units of score: bounded errors end so near that peaks in front predict nothing behind."""
 MOST = 10.0  # thresholds above this are not due to noise alone, which needs 4 to 7 on all recordings
 OBJECT_MARGIN_PX = 6  # margin around an object: its edge is mixed over 3 pixels, and its shadow lies beside it
 PATCH_PX, LEAST_OBJECT_PX = 5, 100
 """Side of the square that smooths residual and picture, and least pixels of an object: four such squares."""
 PROUD, PROUD_FOOT = 6.0, 3.0
-"""An object is so many deviations of the smoothed residual before the surface somewhere, and so many everywhere."""
+"""Smoothed residual of an object in front of the surface, in deviations: at its highest point, and everywhere on it."""
 MARKED = 8.0
-"""An edge in the picture is so many times as steep as the median: a tag, print, another material."""
-MOST_MASKED = 0.5  # largest share of the judged area under objects: what is left must represent the whole
+"""Slope of an edge in the picture, in multiples of the median slope: a tag, print, another material."""
+MOST_MASKED = 0.5  # largest share of the judged area under objects: the rest must represent the whole
 RIM_PX, RIM_CALLS = 10, 2
 """Depth of the target's rim, and number of calls behind the surface along it that chance does not explain."""
-CONTRADICTED = 0.1  # probability of so many peaks above the threshold at which a tail is rejected
+CONTRADICTED = 0.1  # a tail is rejected if the probability of the number of peaks above the threshold is lower
 MOST_SKEW = 0.15
-"""Difference of the quartiles' distances from the median, over their sum: 0.15 means 1.35 times as far to one side."""
+"""Difference of the quartiles' distances from the median, over their sum: 0.15 means 1.35 times as far on one side."""
 DRAWS = 4000
 
 
@@ -85,11 +85,11 @@ def own_threshold(detector: Detector, cloud: Cloud, evidence: Evidence, false_ca
         farther = f"{(1 + abs(skew)) / (1 - abs(skew)):.1f} times as far {'behind' if skew > 0 else 'before'}"
         doubts.append(f"the residual is not symmetric: its quartiles reach {farther} the surface as to the other side")
     if len(peaks) < FEWEST_PEAKS:
-        few = f"only {len(peaks)} peaks of noise stand out towards the camera, too few to set a threshold by"
-        doubts.append(f"{few} ({FEWEST_PEAKS} at least)")
+        few = f"only {len(peaks)} peaks of noise stand out towards the camera, too few to set a threshold"
+        doubts.append(f"{few} (at least {FEWEST_PEAKS} are needed)")
         return OwnThreshold(*(float("nan"),) * 4, len(peaks), floor, objects, 0, evidence, tuple(doubts))
-    # take all peaks, or the higher half, and again while too many lie above the threshold: a few wide waves of a fixed
-    # pattern are then higher than the noise of many pixels, and one tail does not fit both
+    # Take all peaks, then the higher half, and so on while too many exceed the threshold: a few wide waves of a fixed
+    # pattern are then higher than the noise of many pixels, and one tail does not fit both.
     falling, number = np.sort(peaks)[::-1], false_calls / 2.0
     while True:
         tail, half = Tail.of(falling, floor), len(falling) // 2
@@ -130,8 +130,8 @@ def each_object_once(cloud: Cloud, evidence: Evidence, found: tuple[Detection, .
         rest = [each for each in kept if each.score > height or not near[each.pixels].any()]
         if len(kept) - len(rest) >= 2:
             pixels = np.flatnonzero(region & cloud.valid)
-            thing = Detection(height, pixels, extents(cloud.points_m.reshape(-1, 3)[pixels])[1], "object")
-            kept = [*rest, thing]
+            centre_m = extents(cloud.points_m.reshape(-1, 3)[pixels])[1]
+            kept = [*rest, Detection(height, pixels, centre_m, "object")]
     return tuple(sorted(kept, key=lambda each: -each.score))
 
 
@@ -185,7 +185,7 @@ class Tail:
         return float((self.weights * self.peaks * (1.0 + excesses / self.sums) ** -(self.peaks + NORMAL_PEAKS)).sum())
 
     def threshold(self, number: float) -> float:
-        """Return the threshold at which so many peaks are expected; the floor if fewer are expected there."""
+        """Return the threshold at which this number of peaks is expected; the floor if fewer are expected there."""
         if number >= self.peaks:
             return self.floor
 
@@ -216,12 +216,12 @@ def _excess(ratios: np.ndarray, exponent: float, floor: float) -> np.ndarray:
 
 
 def _crowd(floor: float) -> float:
-    """Return the logarithm's part of the excess; low floors, where that law does not hold, get at most half of it."""
+    """Return the logarithmic part of the excess; at most half of it for low floors, where that law does not hold."""
     return min(floor**-2.0, 0.5)
 
 
 def _proud(cloud: Cloud, evidence: Evidence) -> np.ndarray:
-    """Return (h, w) bool: connected regions, wider than noise, that stand before the surface as a whole."""
+    """Return (h, w) bool: connected regions, wider than noise, that are in front of the surface as a whole."""
     known = np.isfinite(evidence.residual_m)
     weights = _boxed(known.astype(np.float64))
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -277,7 +277,7 @@ def _peaks(detector: Detector, cloud: Cloud, before: Evidence, covered: np.ndarr
 
 
 def _mixed_rim(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: float) -> np.ndarray:
-    """Return (h, w) bool: a band along the outline, as deep as frequent calls behind the surface reach."""
+    """Return (h, w) bool: a band along the outline, as wide as the zone of frequent calls behind the surface."""
     known = np.isfinite(evidence.score)
     whole = holes_filled(known)
     depth = _depth_px(whole).reshape(-1)

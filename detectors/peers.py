@@ -1,7 +1,7 @@
-"""Methods of other fields and libraries behind the same interface, to be compared on the same clouds.
+"""Methods of other fields and libraries behind the same interface, for comparison on the same clouds.
 
-`m3c2` asks py4dgeo for the distance to a surface and its level of detection; `plane_ransac` takes Open3D's plane;
-`fpfh_memory` compares features of shape with those of undamaged targets. Each has the settings and the formula of its
+`m3c2` uses py4dgeo's distance to a surface and its level of detection; `plane_ransac` uses Open3D's plane;
+`fpfh_memory` compares shape features with those of undamaged targets. Each has the settings and the formula of its
 source; none knows the camera's noise."""
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ from harness.vocabulary.geometry import MM, Cloud
 from harness.vocabulary.seeds import random_stream
 
 LOD_SIGMAS = 1.96
-"""Standard deviations in py4dgeo's level of detection, which holds 95 % of differences by chance."""
+"""Standard deviations in py4dgeo's level of detection, which holds 95 % of chance differences."""
 LEAST_SAMPLES = 4
-"""Points that a cylinder holds at least in both clouds: the scatter of fewer says too little."""
+"""Fewest points of a cylinder in each cloud: fewer do not show the scatter."""
 MOST_ALONE = 0.01
-"""Share of the target without a counterpart from which on there is a warning."""
+"""Share of the target without a counterpart that gives a warning."""
 
 
 class PlaneRansacConfig(ScoreMapConfig):
     """``inlier_mm``: distance up to which a point supports the plane; the default is about three deviations of a single
-    frame of a continuous-wave camera. ``iterations``: most triples of points that are tried; ``seed`` draws them."""
+    frame of a continuous-wave camera. ``iterations``: largest number of triples of points; ``seed``: draws them."""
 
     crop: CropConfig = Field(default_factory=AutoCrop)
     inlier_mm: float = Field(default=2.0, gt=0)
@@ -62,10 +62,10 @@ class PlaneRansacDetector(ScoreMapDetector[PlaneRansacConfig]):
     version = 1
 
     def analyse(self, cloud: Cloud) -> Evidence:
-        """Score |residual| / deviation in the crop. Raises UserError where its points determine no plane."""
+        """Score |residual| / deviation in the crop. Raises UserError if its points determine no plane."""
         mask = crop(cloud, self.settings.crop)
         points = cloud.points_m[mask]
-        # in the order of z, so that the triples do not depend on how the grid lies
+        # sorted by z, so that the triples do not depend on the orientation of the grid
         ordered = np.ascontiguousarray(points[np.argsort(points[:, 2], kind="stable")])
         a, b, c, d = self._plane(ordered) if len(points) > 2 else (0.0, 0.0, 0.0, 0.0)
         if abs(c) < 1e-3:
@@ -115,7 +115,7 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
     version = 1
 
     def analyse(self, cloud: Cloud) -> Evidence:
-        """Score |distance| / deviation in the crop. Raises UserError where nothing has a counterpart."""
+        """Score |distance| / deviation in the crop. Raises UserError if no point has a counterpart."""
         mask, settings = crop(cloud, self.settings.crop), self.settings
         points = cloud.points_m[mask]
         if settings.reference is None:
@@ -155,7 +155,7 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
         return Evidence(np.abs(signed), residual_m, z_m, scale_m, notes, doubts, behind=signed > 0)
 
     def places(self, points_m: np.ndarray) -> np.ndarray:
-        """Return the places across the view, so that a rim and what lies deep behind it are one finding."""
+        """Return the places across the view, so that a rim and the points deep behind it are one finding."""
         return points_m * [1.0, 1.0, 0.0]
 
     @cached_property
@@ -174,8 +174,8 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
         return np.column_stack([plan * feet_z[:, None] if central else plan, feet_z])
 
     def _distances(self, feet: np.ndarray, before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the distance (n,) of points ``after`` (m, 3) behind those ``before`` (k, 3) at each foot (n, 3), and
-        its deviation; NaN where a cylinder holds too few."""
+        """Return the distance (n,) of points ``after`` (m, 3) behind points ``before`` (k, 3) at each foot (n, 3), and
+        its deviation; NaN if a cylinder holds too few points."""
         py4dgeo = _py4dgeo()
         with threadpoolctl.threadpool_limits(1, user_api="openmp"):
             epochs = tuple(py4dgeo.Epoch(np.ascontiguousarray(points)) for points in (before, after))
@@ -189,8 +189,8 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
 
 
 def _py4dgeo() -> Any:
-    """Return the module, without its log, which it prints and writes into the working folder, and without the number of
-    threads that it sets for all programs started from here."""
+    """Return the module, but without its log, which it prints and writes into the working folder, and without the
+    number of threads that it sets for all programs started from here."""
     threads = os.environ.get("OMP_NUM_THREADS")
     import py4dgeo
 
@@ -205,8 +205,7 @@ def _py4dgeo() -> Any:
 class FpfhMemoryConfig(ScoreMapConfig):
     """``normal_neighbours``, ``feature_neighbours``: typical number of points in the sphere of a normal and of a
     feature. ``pool_px``: side of the square over which features are averaged. The paper's program has 30, 100 and 8.
-    ``memory``: number of features of undamaged targets that are kept. ``surface``: the surface from which sizes are
-    measured."""
+    ``memory``: number of features of undamaged targets that are kept. ``surface``: the reference of sizes."""
 
     crop: CropConfig = Field(default_factory=AutoCrop)
     surface: SurfaceConfig = Field(default_factory=SurfaceConfig)
@@ -234,14 +233,14 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
         self._learned = learned
 
     def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
-        """Return ``memory`` (m, 33) and ``unit`` (): a cloud's median distance. Raises UserError for one cloud."""
+        """Return ``memory`` (m, 33) and ``unit`` (): a cloud's median distance. Raises UserError for a single cloud."""
         if len(hole_free) < 2:
-            raise UserError(f"the detector {self.name!r} learns from two hole-free clouds at least")
+            raise UserError(f"the detector {self.name!r} learns from at least two hole-free clouds")
         of_clouds = []
         for cloud in hole_free:
             mask = crop(cloud, self.settings.crop)
             features, rows, columns = self._features(cloud, mask)
-            # windows that hardly overlap
+            # only windows that hardly overlap
             of_clouds.append(features[(rows % self.settings.pool_px == 0) & (columns % self.settings.pool_px == 0)])
         memory = coreset(np.concatenate(of_clouds[:-1]), self.settings.memory)
         return {"memory": memory, "unit": np.array(np.median(nearest(of_clouds[-1], memory)))}
@@ -262,7 +261,7 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
         ground = background(cloud, mask, self.settings.surface)
         scale_m = max(sigma_of(ground.residual_m[np.isfinite(ground.residual_m)]), rounding_floor(cloud, mask))
         notes = {"surface": ground.description, "points": len(score), "memory": len(self._learned["memory"])}
-        unit = "the median distance of an undamaged target's features from the memory, which is no length"
+        unit = "the median distance of an undamaged target's features from the memory, which is not a length"
         return Evidence(on_grid(score, mask), ground.residual_m, ground.surface_z_m, scale_m, notes, unit=unit)
 
     def _features(self, cloud: Cloud, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -270,8 +269,8 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
         settings, points = self.settings, np.ascontiguousarray(cloud.points_m[mask])
         if len(points) <= settings.feature_neighbours:
             raise UserError(f"{len(points)} points are too few for features of {settings.feature_neighbours}")
-        # one radius everywhere: at a rim two points may have the same nearest ones, and so normals that only rounding
-        # tells apart
+        # one radius everywhere: two points at a rim may share their nearest points, and only rounding would distinguish
+        # their normals
         wanted = [settings.normal_neighbours, settings.feature_neighbours]
         radii_m = np.median(cKDTree(points).query(points, k=wanted)[0], axis=0)
         with open3d_on_one_thread() as o3d:
@@ -291,7 +290,7 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
 
 
 def coreset(features: np.ndarray, size: int) -> np.ndarray:
-    """Return at most ``size`` of the features (n, k): the most central, then always the one farthest from these."""
+    """Return at most ``size`` of the features (n, k): the most central one, then always the one farthest from these."""
     apart = ((features - features.mean(axis=0)) ** 2).sum(axis=1)
     taken, apart = [int(apart.argmin())], np.full(len(features), np.inf)
     while len(taken) < size:
@@ -303,5 +302,5 @@ def coreset(features: np.ndarray, size: int) -> np.ndarray:
 
 
 def nearest(features: np.ndarray, memory: np.ndarray) -> np.ndarray:
-    """Return the distance (n,) of each feature (n, k) from the nearest in the memory (m, k)."""
+    """Return the distance (n,) of each feature (n, k) to the nearest in the memory (m, k)."""
     return np.asarray(cKDTree(memory).query(features)[0])

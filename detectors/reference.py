@@ -1,9 +1,9 @@
-"""A part's own mesh as the undamaged surface: it is laid onto the cloud and tells where each ray should end.
+"""The part's own mesh as the undamaged surface: fitted to the cloud, it gives the point where each ray should end.
 
-The part's front axis is turned to the camera, upright or rolled by quarters. Closest points, then closest planes, move
-it onto the cloud (Besl and McKay 1992; Chen and Medioni 1992); points off the part count less (Tukey). Triangles that
-face away are left out. Not found: a part that is turned by more than about 30 degrees. A direction that the mesh does
-not fix, such as a shift of a plane along itself, stays undetermined, and nothing depends on it."""
+The part's front axis is turned to the camera, upright or rolled by multiples of 90 degrees. Closest points, then
+closest planes, move it onto the cloud (Besl and McKay 1992; Chen and Medioni 1992); points off the part count less
+(Tukey). Triangles that face away are left out. A part turned by more than about 30 degrees is not found. A direction
+that the mesh does not fix, such as a shift of a plane along itself, stays undetermined; no result depends on it."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ SAMPLE, STEPS = 4000, 20
 """Number of points used; steps by closest points (twice as many by distances follow, then as many by planes)."""
 LEAST_SCALE_M, FAR_M = 0.1 * MM, 10.0
 EDGE_PX, BENT = 1.5, 0.5
-"""Distance in pixels from a step or edge of the part that is not judged, and the bend in pixels that makes an edge."""
+"""Pixels within this distance of a step or edge of the part are not judged; bend, in pixels, that makes an edge."""
 LOOSE = 1e-6
-"""Share of the largest information; a direction with less counts as not fixed by the part."""
+"""A direction with a smaller share of the largest information is not fixed by the part."""
 
 
 @lru_cache(maxsize=4)
 def front_of(reference: ReferenceConfig) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners (m, 3, 3) of a part's triangles, x right, y up, z to the camera, in metres, and their unit
-    normals (m, 3). Raises UserError for a file that is not a mesh, and where no triangle faces the front."""
+    normals (m, 3). Raises UserError if the file is not a mesh or no triangle faces the front."""
     mesh = read_mesh(reference.file)
     corners = front_first(mesh, reference.unit, reference.front)[np.asarray(mesh.faces)]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     if not (normals[:, 2] > 0).any():
         fix = "state its front, or turn its faces outwards"
-        raise UserError(f"{reference.file}: no triangle of it faces {reference.front}", fix=fix)
+        raise UserError(f"{reference.file}: none of its triangles faces {reference.front}", fix=fix)
     return corners, normals
 
 
 def laid_on(points: np.ndarray, reference: ReferenceConfig, central: bool) -> tuple[str, Fit]:
-    """Lay the part onto points (n, 3) of the camera's frame. Returns words on how well it lies, and the surface to rays
-    from the lens (``central``) or along z. Raises UserError as `front_of` does."""
+    """Fit the part to points (n, 3) of the camera's frame. Return a text on the quality of the fit, and the surface
+    seen along rays from the lens (``central``) or along z. Raises UserError as `front_of` does."""
     corners, normals = front_of(reference)
     ahead, whole = normals[:, 2] > -LOOSE, _scene(corners)
     front = _scene(corners[ahead])
@@ -76,12 +76,12 @@ def laid_on(points: np.ndarray, reference: ReferenceConfig, central: bool) -> tu
         bends = [met(rays + way) + met(rays - way) - 2 * z for way in (np.array([side, 0]), np.array([0, side]))]
         return np.where(np.abs(bends).max(axis=0) < BENT * pitch * (np.abs(z) if central else 1.0), z, np.nan)
 
-    lies = f"the mesh {Path(reference.file).name}, from which half of the points lie {off_m / MM:.2g} mm or less"
+    lies = f"the mesh {Path(reference.file).name}, with half of the points within {off_m / MM:.2g} mm of it"
     return f"{lies}, placed along its normals within {error_m / MM:.2g} mm (standard error)", z_at
 
 
 def _scene(corners: np.ndarray) -> Any:
-    """Return triangles (m, 3, 3) as a scene for rays and closest points, by their numbers."""
+    """Return triangles (m, 3, 3) as a scene for rays and closest points, identified by their numbers."""
     scene = load_open3d().t.geometry.RaycastingScene(nthreads=1)
     faces = np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3)
     scene.add_triangles(corners.reshape(-1, 3).astype(np.float32), faces)
@@ -91,8 +91,8 @@ def _scene(corners: np.ndarray) -> Any:
 def _fitted(
     scene: Any, corners: np.ndarray, normals: np.ndarray, points: np.ndarray, turn: int
 ) -> tuple[np.ndarray, float, float]:
-    """Return T_part_camera found from one quarter's turn, the median distance of the points (n, 3) from the part's
-    planes, and the standard error of its place along them, by the scatter of points taken as independent."""
+    """Return T_part_camera, found from one rotation by a multiple of 90 degrees; the median distance of the points (n,
+    3) from the part's planes; and the standard error of its place along them, if the points are independent."""
     c, s = np.rint([np.cos(turn * np.pi / 2), np.sin(turn * np.pi / 2)])
     T = np.diag([1.0, -1.0, -1.0, 1.0])
     T[:3, :3] = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ T[:3, :3]
@@ -105,7 +105,7 @@ def _fitted(
         off = np.linalg.norm(apart, axis=1)
         if step >= 3 * STEPS:
             off = np.einsum("ni,ni->n", apart, towards)
-        else:  # a point beyond an edge pulls towards that edge
+        else:  # a point beyond an edge attracts that edge
             towards = np.where(off[:, None] > LEAST_SCALE_M, apart / np.maximum(off, LEAST_SCALE_M)[:, None], towards)
         scale_m = max(float(np.median(np.abs(off))) / 0.6745, LEAST_SCALE_M if step >= 3 * STEPS else pitch_m)
         weight = bisquare_weights(off, BISQUARE_TUNING * scale_m)
@@ -116,7 +116,7 @@ def _fitted(
         middle = moved.mean(axis=0)
         slopes = np.einsum("ni,nij->nj", towards, displacement_jacobian(moved, middle))
         information = (slopes * weight[:, None]).T @ slopes
-        # a direction that the part does not fix is not moved along
+        # no motion along a direction that the part does not fix
         inverse = np.linalg.pinv(information, rcond=LOOSE, hermitian=True)
         T = moved_by(-inverse @ (slopes * weight[:, None]).T @ off, middle) @ T
     spread_m2 = float((weight * off**2).sum() / weight.sum())

@@ -1,4 +1,4 @@
-"""A base for detectors that only score pixels: it adds clusters, the quiet threshold and sizes."""
+"""A base class for detectors that only score pixels: it adds clusters, the quiet threshold and sizes."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from harness.vocabulary.geometry import MM, Cloud
 
 
 class ScoreMapConfig(Config):
-    """Settings that turn a score map into findings. Pixels above the threshold that a chain of steps no longer than
-    ``cluster_distance_mm`` joins are one finding; groups of fewer than ``min_points`` are dropped."""
+    """Settings that turn a score map into detections. Pixels above the threshold form one detection if a chain of steps
+    of at most ``cluster_distance_mm`` joins them; groups of fewer than ``min_points`` are dropped."""
 
     min_points: int = Field(default=1, ge=1)
     cluster_distance_mm: float = Field(default=10.0, gt=0)
@@ -31,7 +31,7 @@ S = TypeVar("S", bound=ScoreMapConfig)
 
 
 class ScoreMapDetector(ABC, Generic[S]):
-    """Implements `detectors.interface.Detector` except `analyse`. A subclass also gives ``name``, ``version`` and, for
+    """Implements `detectors.interface.Detector` except `analyse`. A subclass also sets ``name``, ``version`` and, for
     settings of its own, a ``settings_type`` that derives from `ScoreMapConfig`; the first line of its docstring is its
     description in ``python -m harness.ls``. `on_grid` puts the scores of cropped pixels back on the cloud's grid."""
 
@@ -44,14 +44,14 @@ class ScoreMapDetector(ABC, Generic[S]):
 
     @abstractmethod
     def analyse(self, cloud: Cloud) -> Evidence:
-        """Score every pixel. Raises UserError where the cloud cannot be judged (empty crop, too few points)."""
+        """Score every pixel. Raises UserError if the cloud cannot be judged (empty crop, too few points)."""
 
     def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
         """Return clusters of pixels whose score is above the threshold, strongest first."""
         return self.findings(cloud, evidence, [threshold])[0].detections
 
     def findings(self, cloud: Cloud, evidence: Evidence, thresholds: Sequence[float]) -> list[Findings]:
-        """Return what `find` returns at each of the thresholds, which rise."""
+        """Return the result of `find` at each of several rising thresholds."""
         pixels = above(evidence, thresholds[0])
         pixels = pixels[cloud.valid.reshape(-1)[pixels]]
         points, scores = cloud.points_m.reshape(-1, 3)[pixels], evidence.score.reshape(-1)[pixels]
@@ -62,13 +62,13 @@ class ScoreMapDetector(ABC, Generic[S]):
         return found
 
     def quiet_threshold(self, cloud: Cloud, evidence: Evidence) -> float:
-        """Return the lowest threshold at which `find` returns nothing; exact, 0 where nothing can be found."""
+        """Return the exact lowest threshold at which `find` returns nothing; 0 if it never returns anything."""
         pixels = above(evidence, 0.0)
         pixels = pixels[cloud.valid.reshape(-1)[pixels]]
         scores, least = evidence.score.reshape(-1)[pixels], self.settings.min_points
         if least == 1:
             return float(scores.max(initial=0.0))
-        # the highest scores are looked at first: they mostly hold a cluster
+        # try the highest scores first: they usually contain a cluster
         for count in (64 * least, len(pixels)):
             highest = np.argsort(-scores, kind="stable")[:count]
             places = self.places(cloud.points_m.reshape(-1, 3)[pixels[highest]])
@@ -78,7 +78,7 @@ class ScoreMapDetector(ABC, Generic[S]):
         return 0.0
 
     def places(self, points_m: np.ndarray) -> np.ndarray:
-        """Return the places (n, 3) by whose distances points (n, 3) are joined."""
+        """Return the places (n, 3) of points (n, 3); the distances between places decide which points are joined."""
         return points_m
 
     def _clusters(
@@ -88,14 +88,14 @@ class ScoreMapDetector(ABC, Generic[S]):
         return nested_clusters(places_m, scores, distance_m, self.settings.min_points, np.array(thresholds))
 
     def measure(self, cloud: Cloud, evidence: Evidence, detection: Detection) -> Measurement:
-        """Measure the thesis' extents, and the model of a blurred hole."""
+        """Measure the thesis' extents and fit the model of a blurred hole."""
         return measure_detection(cloud, evidence, detection, self.settings.hole_model)
 
 
 @dataclass(frozen=True)
 class Findings:
-    """Findings at one threshold: ``scores`` (k,), ``centres_m`` (k, 3), and the flat ``pixels`` (n,), ascending, with
-    the number (n,) of the finding of each, -1 for none."""
+    """Detections at one threshold: ``scores`` (k,). ``pixels`` (n,): flat, ascending. ``labels`` (n,): the number of
+    the detection that has each pixel, -1 for none. ``centres_m`` (k, 3)."""
 
     scores: np.ndarray
     pixels: np.ndarray
@@ -104,15 +104,15 @@ class Findings:
 
     @classmethod
     def of(cls, detections: Sequence[Detection]) -> Findings:
-        """Return detections as arrays."""
-        numbers = np.repeat(np.arange(len(detections)), [len(one.pixels) for one in detections])
-        pixels = np.concatenate([np.zeros(0, np.int64), *(one.pixels for one in detections)])
-        centres = np.array([one.centre_m for one in detections]).reshape(-1, 3)
-        return cls(np.array([one.score for one in detections]), pixels, numbers, centres)
+        """Convert detections to arrays."""
+        numbers = np.repeat(np.arange(len(detections)), [len(detection.pixels) for detection in detections])
+        pixels = np.concatenate([np.zeros(0, np.int64), *(detection.pixels for detection in detections)])
+        centres = np.array([detection.centre_m for detection in detections]).reshape(-1, 3)
+        return cls(np.array([detection.score for detection in detections]), pixels, numbers, centres)
 
     @property
     def detections(self) -> tuple[Detection, ...]:
-        """The findings as single detections, strongest first."""
+        """The arrays as single detections, strongest first."""
         by_label = np.argsort(self.labels, kind="stable")
         _, *groups = np.split(
             self.pixels[by_label], np.cumsum(np.bincount(self.labels + 1, minlength=len(self.scores) + 1))[:-1]
@@ -123,7 +123,7 @@ class Findings:
 
 
 def findings_at(detector: Detector, cloud: Cloud, evidence: Evidence, thresholds: Sequence[float]) -> list[Findings]:
-    """Return a detector's findings at thresholds, which rise."""
+    """Return a detector's detections at each of several rising thresholds."""
     own = next(vars(each) for each in type(detector).__mro__ if "find" in vars(each))
     if "findings" in own:
         return list(own["findings"](detector, cloud, evidence, thresholds))

@@ -1,4 +1,4 @@
-"""The large connected smooth surfaces of a cloud; a pipe seen to its limb is one, and two faces of a box are two."""
+"""Finds the large connected smooth surfaces of a cloud. A pipe up to its limb is one; two faces of a box are two."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from detectors.noise import quantile_of
 from harness.vocabulary.geometry import MM, Cloud, Region
 
 MAX_SURFACE_TILT, STEP_SIGMAS = 6.0, 6.0
-"""tan(80.5 degrees): a steeper step is an edge; one below so many deviations of a difference may be noise."""
-BRIDGED_PX = 2  # pixels without a return take the point of the nearest pixel that has one, so near
+"""tan(80.5 degrees): a steeper step is an edge. A step of fewer standard deviations of a difference may be noise."""
+BRIDGED_PX = 2  # largest distance from which a pixel without a return takes its point
 SMOOTH_MM, MIXED_PX = 16.0, 3
-"""Width of the window on a coarse grid, and half the pixels across which bends are judged at least."""
+"""Width of the window on a coarse grid, and half of the least number of pixels over which a bend is judged."""
 NORMAL_NOISE, WIDEST_SMOOTH_PX = 0.06, 41
-"""Radians: so noisy may the slope of the smoothed surface be at most; a noisier cloud takes a wider window."""
-LEAST_SHARE, LEAST_PX = 0.004, 100  # A surface with a smaller share of all pixels, or fewer pixels, is no candidate
-LEAST_SHARED_PX = 10  # pixels that the rims of two surfaces must share to be judged as one
+"""Largest noise of the smoothed surface's slope, radians; noisier clouds use a wider window, up to this one."""
+LEAST_SHARE, LEAST_PX = 0.004, 100  # a surface with a smaller share of all pixels or fewer pixels is not a candidate
+LEAST_SHARED_PX = 10  # pixels that the rims of two surfaces must share to be merged
 CONTACT_MM, CONTACT_SIGMAS = 5.0, 3.0
-"""Surfaces nearer to one another at a common border meet there; noise of a difference widens that."""
-RIM_TURN_DEG = 10.0  # greatest turn of a rim from the surface inside it, beside what that surface bends by
+"""Two surfaces touch at a common border if their step there is smaller; the noise of a difference raises this limit."""
+RIM_TURN_DEG = 10.0  # largest turn of a rim from the surface inside it, beyond the bend of that surface
 MOST_SURFACES, WIDE_PART = 8, 0.1
-"""Most surfaces; and least share of one's pixels that are the middle of a full window: a smoothed step has none."""
+"""Most surfaces; least share of pixels at the middle of a full window: a smoothed step has no such pixel."""
 WIDEST_SLOPE = 5.7
-"""tan(80 degrees): no camera sees so far off its axis; a cloud that does was not recorded from its origin."""
+"""tan(80 degrees): no camera sees so far off its axis; a cloud with a larger slope was not recorded from its origin."""
 CELL_SPACINGS, CELL_GROWTH, CELLS_FILLED, MAX_RASTER = 1.5, 1.25, 0.99, 4096
-"""Least side of a raster's cell in spacings, its growth until so many cells hold a point, and most cells a side."""
+"""Least side of a raster's cell in spacings; its growth until this share of cells hold a point; most cells a side."""
 
 
 @dataclass(frozen=True)
 class Surfaces:
-    """``own`` (n, h, w) bool: each surface's pixels, largest core first; ``filled`` (n, h, w) bool: with all that they
-    enclose. ``contact_m``: a smaller step is none; ``reach_px``: how far from an edge the smoothing is felt."""
+    """``own`` (n, h, w) bool: each surface's pixels, largest core first. ``filled`` (n, h, w) bool: the same with all
+    that they enclose. ``contact_m``: smaller steps do not count. ``reach_px``: smoothing's reach from an edge."""
 
     own: np.ndarray
     filled: np.ndarray
@@ -47,7 +47,7 @@ class Surfaces:
 
 
 def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces:
-    """Find the smooth surfaces of an organised cloud by windows of about ``smooth_px``, wider in noise."""
+    """Find the smooth surfaces of an organised cloud with windows of about ``smooth_px``, wider in noisy clouds."""
     points, seen = np.array(cloud.points_m, np.float64), cloud.valid
     valid = seen
     if seen.any() and not seen.all():
@@ -55,14 +55,14 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
         valid = apart <= BRIDGED_PX
         gaps = valid & ~seen
         points[gaps] = points.reshape(-1, 3)[nearest[gaps]]
-    # the noise of a difference between neighbours, from the quieter quarter of the second differences of z along rows
-    # (three quarters of the picture may be rubble), which have sqrt(6) of white noise's sigma; the first have sqrt(2)
+    # noise of a difference between neighbours, from the lowest quarter of the second differences of z along rows
+    # (three quarters of the picture may be rubble): they have sqrt(6) of white noise's sigma, first differences sqrt(2)
     z = np.ascontiguousarray(cloud.points_m[..., 2])
     bends = np.abs(z[:, 2:] - 2.0 * z[:, 1:-1] + z[:, :-2])
     bends = bends[np.isfinite(bends)]
     noise_m = quantile_of(bends, 0.25) / 0.3186 * np.sqrt(2.0 / 6.0) if len(bends) else 0.0
     noise_m = max(noise_m, cloud.z_step_m * np.sqrt(2.0 / 12.0))
-    # the distance of neighbours across the view at the nearest tenth of it
+    # the lateral distance of neighbours in the nearest tenth of the view
     steps = np.hypot(np.diff(points[::4, :, 0], axis=1), np.diff(points[::4, :, 1], axis=1))
     steps = steps[np.isfinite(steps) & (steps > 0)]
     pitch_m = quantile_of(steps, 0.1) if len(steps) else 0.0
@@ -72,7 +72,7 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
         by_noise = (noise_m / (math.sqrt(2.0) * NORMAL_NOISE * pitch_m)) ** (2.0 / 3.0)
         wanted = max(min(smooth_px, SMOOTH_MM * MM / pitch_m), by_noise, 3.0)
         window = min(2 * int(wanted / 2.0) + 1, max(WIDEST_SMOOTH_PX, smooth_px))
-        # a camera that interpolates spreads a step over some pixels: on a coarse grid, more than the window
+        # a camera that interpolates spreads a step over several pixels: on a coarse grid, over more than the window
         half = max(window // 2, min(MIXED_PX, int(0.75 * SMOOTH_MM * MM / pitch_m)), 1)
 
     size = (window, window)
@@ -84,7 +84,7 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
     if noise_m <= pitch_m:
         right, down = links(points, MAX_SURFACE_TILT, STEP_SIGMAS * noise_m, central)
     else:
-        # single points would need so wide a tolerance that it joins what stands apart
+        # single points would need a tolerance so wide that it joins separate surfaces
         known = np.where(valid[..., None], smooth, np.nan)
         right, down = links(known, MAX_SURFACE_TILT, STEP_SIGMAS * noise_m / window, central)
     normals = unit_normals(smooth)
@@ -92,8 +92,8 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
     cores, sizes = components(valid & ~bent, right, down)
     count = _keep_large(cores, sizes, window)
 
-    # smoothing, slope and comparison flag so many pixels on each side of a crease or edge: given back where no step
-    # parts them from the core and no other surface's core lies
+    # smoothing, slope and comparison flag ``reach`` pixels beside a crease or edge: they are given back if no step
+    # and no other surface's core separates them from the core
     reach = window // 2 + 1 + half
     own = np.zeros((count, *valid.shape), dtype=bool)
     for number, mask in enumerate(own, start=1):
@@ -110,7 +110,7 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
 
 
 def _before_lens(points: np.ndarray) -> bool:
-    """Return whether there are finite points (..., 3), and a camera in the origin may see all of them."""
+    """Return whether a camera at the origin may see all finite points (..., 3), and there are any."""
     x, y, z = np.moveaxis(points, -1, 0)
     beyond = (z <= 0) | (np.maximum(np.abs(x), np.abs(y)) >= WIDEST_SLOPE * z)
     return bool(np.isfinite(z).any() and not beyond.any())
@@ -119,7 +119,7 @@ def _before_lens(points: np.ndarray) -> bool:
 @numba.njit(**PLAIN)
 def links(points_m: np.ndarray, tilt: float, noise_m: float, central: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return whether each of the pixels (h, w, 3) lies on one surface with its right (h, w) and its lower neighbour (h,
-    w). ``central``: the way across is measured between the two rays at the nearer depth."""
+    w). ``central``: distances across are measured between the two rays at the nearer depth."""
     h, w, _ = points_m.shape
     linked = np.zeros((2, h, w), np.bool_)
     for v in range(h):
@@ -137,7 +137,7 @@ def links(points_m: np.ndarray, tilt: float, noise_m: float, central: bool) -> t
 
 @numba.njit(**PLAIN)
 def unit_normals(surface_m: np.ndarray) -> np.ndarray:
-    """Return the normals (h, w, 3) of a surface's points (h, w, 3), by central differences; 0 where it has no area."""
+    """Return the normals (h, w, 3) of a surface's points (h, w, 3), from central differences; 0 if the area is 0."""
     h, w, _ = surface_m.shape
     normals, along, down = np.zeros((h, w, 3)), np.empty(3), np.empty(3)
     for v in range(h):
@@ -155,7 +155,7 @@ def unit_normals(surface_m: np.ndarray) -> np.ndarray:
 
 
 def turns(normals: np.ndarray, half: int, least_cosine: float) -> np.ndarray:
-    """Return (h, w) bool: unit normals ``half`` pixels to either side enclose a wider angle."""
+    """Return (h, w) bool: whether the unit normals ``half`` pixels to either side enclose a wider angle."""
     turned = np.zeros(normals.shape[:2], dtype=bool)
     for ahead, middle, back in (
         (np.s_[2 * half :], np.s_[half:-half], np.s_[: -2 * half]),
@@ -166,7 +166,7 @@ def turns(normals: np.ndarray, half: int, least_cosine: float) -> np.ndarray:
 
 
 class _Smooth(NamedTuple):
-    """Points (n, 3), their local means and the unit normals of these; and whether rays meet in the origin."""
+    """Points (n, 3), their local means, the unit normals of the means, and whether rays meet in the origin."""
 
     points_m: np.ndarray
     means_m: np.ndarray
@@ -182,7 +182,7 @@ class _Smooth(NamedTuple):
 
 
 def _keep_large(cores: np.ndarray, sizes: np.ndarray, window: int) -> int:
-    """Return the number of candidates: cores that are large enough and wider than the smoothing's ramp at an edge."""
+    """Return the number of candidates: cores that are large enough, and wider than the ramp of a smoothed edge."""
     large = int((sizes >= max(LEAST_PX, int(LEAST_SHARE * cores.size))).sum())
     kept = []
     for number in range(1, min(large, 4 * MOST_SURFACES) + 1):
@@ -201,7 +201,7 @@ def _keep_large(cores: np.ndarray, sizes: np.ndarray, window: int) -> int:
 
 
 def _joined(own: np.ndarray, cores: np.ndarray, smooth: _Smooth, apart_m: float, turn: float) -> np.ndarray:
-    """Return ``own`` with surfaces made one, in ``cores`` too, where their rims share pixels and planes agree."""
+    """Return ``own`` with surfaces merged, also in ``cores``, if their rims share pixels and their planes agree."""
     stays = np.arange(len(own))
     for i in range(len(own)):
         for j in range(i + 1, len(own)):
@@ -221,7 +221,7 @@ def _joined(own: np.ndarray, cores: np.ndarray, smooth: _Smooth, apart_m: float,
 
 
 def _share_contested(own: np.ndarray, cores: np.ndarray, smooth: _Smooth) -> None:
-    """Give each pixel of several rims to the surface whose plane, drawn on from its core, passes nearest."""
+    """Give each pixel of several rims to the surface whose plane, extended from its core, is nearest."""
     pixels = np.flatnonzero(own.sum(axis=0) > 1)
     if not len(pixels):
         return
@@ -239,10 +239,10 @@ def _share_contested(own: np.ndarray, cores: np.ndarray, smooth: _Smooth) -> Non
 def _trim_rims(
     own: np.ndarray, cores: np.ndarray, valid: np.ndarray, smooth: _Smooth, window: int, reach: int, apart_m: float
 ) -> None:
-    """Take off each surface's rim what leaves the surface inside it, and what hangs on that alone."""
+    """Remove the parts of each surface's rim that depart from the surface inside, and pixels connected only by them."""
     points, means, normals, _ = smooth
     for number in range(len(own)):
-        # the picture's edge is a rim too: what is cut off there may be a strip of background
+        # the picture's edge is a rim too: a strip of background may lie there
         whole = holes_filled(own[number] & valid, rim_px=1)
         rim = own[number] & ~shrunk(whole, 2 * reach + 1)[1:-1, 1:-1]
         inner = shrunk(whole, 2 * reach + window)[1:-1, 1:-1] & shrunk(cores == number + 1, window)
@@ -257,14 +257,14 @@ def _trim_rims(
 
 @numba.njit(**PLAIN)
 def _leaves(pixels, seeds, points, means, normals, h, w, reach, apart_m):  # type: ignore[no-untyped-def]
-    """Return whether each of the pixels (n,) leaves the surface at its seed (n,) farther inside."""
+    """Return whether each of the pixels (n,) departs from the surface at its seed (n,) farther inside."""
     found = np.zeros(len(pixels), np.bool_)
     for i in range(len(pixels)):
         pixel, seed = pixels[i], seeds[i]
         row, column = seed // w, seed % w
         down, across = row - pixel // w, column - pixel % w
         step = reach / max(math.sqrt(down**2 + across**2), 1.0)
-        # the bend of the surface over as many pixels inwards, radians per metre
+        # the bend of the surface over the same distance inwards, radians per metre
         end = min(max(round(row + down * step), 0), h - 1) * w + min(max(round(column + across * step), 0), w - 1)
         off = distance = cosine = span = 0.0
         for k in range(3):
@@ -279,22 +279,22 @@ def _leaves(pixels, seeds, points, means, normals, h, w, reach, apart_m):  # typ
 
 
 def raster(points: np.ndarray, cloud: Cloud) -> tuple[Cloud, np.ndarray, np.ndarray, float]:
-    """Return a grid that holds the nearest of points (n, 3) in each cell, with an empty border; each point's row and
-    column; and the side of a cell in distances between neighbours."""
+    """Return a grid with an empty border that holds, in each cell, the nearest of the points (n, 3); each point's row
+    and column; and the side of a cell in distances between neighbours."""
     from scipy.spatial import cKDTree
 
     plan, z = points[:, :2], points[:, 2:]
     if _before_lens(points):
         plan = plan / z
-    # what nine in ten of the distances to the nearest neighbour do not exceed, of some 2000 places
+    # the 90th percentile of the distances to the nearest neighbour, from about 2000 places
     some = plan[:: max(1, len(plan) // 2000)]
     to_nearest = cKDTree(plan).query(some, k=min(2, len(plan)))[0].reshape(len(some), -1)[:, -1]
     spacing = max(float(np.quantile(to_nearest, 0.9)), 1e-9)
     side = max(CELL_SPACINGS * spacing, float(np.ptp(plan, axis=0).max()) / MAX_RASTER)
     while True:
         columns, rows = np.floor((plan - plan.min(axis=0)) / side).astype(int).T
-        # share of the cells that hold a place, of those in blocks of 2 x 2 that do, as do all eight blocks around
-        # them: a gap wider than a block is no lack of points
+        # share of filled cells in blocks of 2 x 2 that hold a place and whose eight neighbours do: a gap that is
+        # wider than a block does not come from a lack of points
         held = np.zeros((2 * (rows.max() // 2 + 1), 2 * (columns.max() // 2 + 1)), dtype=bool)
         held[rows, columns] = True
         in_block = held.reshape(held.shape[0] // 2, 2, held.shape[1] // 2, 2).sum(axis=(1, 3))
@@ -305,7 +305,7 @@ def raster(points: np.ndarray, cloud: Cloud) -> tuple[Cloud, np.ndarray, np.ndar
     rows, columns = rows + 1, columns + 1
     shape = (int(rows.max()) + 2, int(columns.max()) + 2)
     image = np.full((*shape, 3), np.nan)
-    # of repeated indices numpy keeps the last
+    # numpy keeps the last value of a repeated index
     far_first = np.argsort(-points[:, 2], kind="stable")
     image[rows[far_first], columns[far_first]] = points[far_first]
     none, zeros = np.full(shape, np.nan), np.zeros(shape, dtype=np.uint8)

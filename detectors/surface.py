@@ -1,10 +1,9 @@
-"""Shapes of a target, fitted to points that include damage: polynomials z(x, y) (the thesis' "robust cubic" and
-others), quadrics (sphere, cylinder, cone, ...).
+"""Shapes of a target, fitted to points that include damage: polynomials z(x, y) (the thesis' "robust cubic" and others)
+and quadrics (sphere, cylinder, cone, ...).
 
 Large clouds are solved on an even sample first and finished on all points. Not modelled: errors in x and y, correlated
-noise, overhangs, creases, several sheets. Damage of one to three sigma bends every point-wise robust fit by a third of
-a sigma.
-"""
+noise, overhangs, creases, several sheets. Damage of one to three sigma shifts point-wise robust fits by a third of a
+sigma."""
 
 from __future__ import annotations
 
@@ -27,20 +26,20 @@ from harness.vocabulary.meshes import FILES, FileUnit, FrontAxis
 SAMPLE_POINTS = 2048
 BISQUARE_TUNING = 4.685  # 95 % efficiency for Gaussian noise; MATLAB's default
 LTS_SAMPLE, LTS_SMALL, LTS_STARTS, LTS_KEPT, LTS_STEPS = 8192, 600, 500, 10, 10
-"""FAST-LTS: points in the large and in the first sample, elemental starts, starts carried on and their steps."""
-LTS_COVERAGE = 0.55  # fraction of points that the fit must explain: up to 45 % damage is survived
+"""FAST-LTS: points in the large and in the first sample, elemental starts, continued starts and their steps."""
+LTS_COVERAGE = 0.55  # fraction of points that the fit must explain: it tolerates up to 45 % damage
 LTS_SEED = 20201102
 LAR_THINNING, LAR_STEPS, HALVINGS = 12, 60, 12
 KNEES = np.array([1.0, 0.1, 0.03, 0.003, 3e-4, 3e-5, 3e-6])  # knees of Huber's function, in units of the median |r|
 BISQUARE_CONVERGED, GAP_CONVERGED = 1e-2, 1e-6
-"""Bisquare stops below this part of a standard error of the fit, LAR when the duality gap is within this part."""
-TINY_M = 1e-9  # residuals below a nanometre are rounding of the arithmetic
+"""Bisquare stops below this share of a standard error of the fit, LAR if the relative duality gap is this small."""
+TINY_M = 1e-9  # residuals below a nanometre are rounding errors
 
-Solution = tuple[np.ndarray, str]  # coefficients (p,) and what was done
+Solution = tuple[np.ndarray, str]  # coefficients (p,) and a description of the fit
 
 
 class ReferenceConfig(Config):
-    """A part's own mesh, which may be open: its ``unit``, and the axis of the file that points to the camera."""
+    """The part's own mesh, which may be open. ``front``: the axis of the file that points to the camera."""
 
     file: Annotated[str, Field(min_length=1, max_length=1000, description=FILES)]
     unit: FileUnit = "mm"
@@ -48,12 +47,12 @@ class ReferenceConfig(Config):
 
 
 class SurfaceConfig(Config):
-    """``shape``: ``polynomial`` of the stated total ``degree`` (3: MATLAB's poly33); ``mesh``: the ``reference``, laid
-    onto the cloud; ``auto``: the simplest of plane, polynomials, quadric and free form that the cloud's own evidence
-    asks for; ``free_form`` in any case. ``scale_mm``: the width above which a free form follows the cloud. ``method``:
-    ``lar`` least absolute residuals; ``bisquare`` Tukey's, from a least-squares start (MATLAB's semantics); ``lts`` a
-    FAST-LTS start, then bisquare, which survives damage of a third of the surface; ``least_squares``.
-    ``drop_cross_terms``: no term in both x and y (as the thesis' script)."""
+    """``shape``: ``polynomial``, of the stated total ``degree`` (3: MATLAB's poly33); ``auto``, the simplest of plane,
+    polynomials, quadric and free form that the cloud supports; ``free_form``; or ``mesh``, the ``reference`` fitted to
+    the cloud. ``scale_mm``: width above which a free form follows the cloud. ``method``: ``lar`` least absolute
+    residuals; ``bisquare`` Tukey's, from a least-squares start (MATLAB's semantics); ``lts`` bisquare from a FAST-LTS
+    start, which tolerates damage of a third of the surface; ``least_squares``. ``drop_cross_terms``: whether terms in
+    both x and y are left out (as in the thesis' script)."""
 
     shape: Literal["polynomial", "auto", "free_form", "mesh"] = "polynomial"
     reference: ReferenceConfig | None = None
@@ -79,7 +78,7 @@ class Chebyshev:
 
     @classmethod
     def over(cls, xy_m: np.ndarray, degree: int, cross_terms: bool = True) -> Chebyshev:
-        """Return the products up to a total degree over places (n, 2), of which no two need differ."""
+        """Return the products up to a total degree over places (n, 2), which may coincide."""
         orders = [(i, total - i) for total in range(degree + 1) for i in range(total, -1, -1)]
         low, high = (np.array([end(xy_m[:, 0]), end(xy_m[:, 1])]) for end in (np.min, np.max))
         # separable polynomials f(x) + g(y) stay separable under scaling of each axis
@@ -134,14 +133,14 @@ class Surface:
 
 
 def fit_surface(x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray, config: SurfaceConfig) -> Surface:
-    """Fit z(x, y) to finite points, each (n,). LAR is within 2e-6 of the least sum of absolute residuals; bisquare is
-    within 0.05 of a standard error of the fixed point of all points. Deterministic. Raises UserError where there are
-    fewer points than coefficients, or where all points lie on a line."""
+    """Fit z(x, y) to finite points, each (n,). LAR is within 2e-6 of the least sum of absolute residuals, bisquare
+    within 0.05 standard errors of the fixed point of all points. Deterministic. Raises UserError if there are fewer
+    points than coefficients, or if all points lie on a line."""
     terms = (2 * config.degree + 1) if config.drop_cross_terms else (config.degree + 1) * (config.degree + 2) // 2
     if len(z_m) < terms:
         degree = f"a surface of degree {config.degree}"
         what = f"{len(z_m)} valid points cannot determine the {terms} coefficients of {degree}"
-        legal, fix = f"{terms} points at least", "widen the crop, lower surface.degree, or check the capture"
+        legal, fix = f"at least {terms} points", "widen the crop, lower surface.degree, or check the capture"
         raise UserError(what, legal=legal, fix=fix)
     xy = np.column_stack([x_m, y_m]).astype(np.float64)
     chebyshev = Chebyshev.over(xy, config.degree, not config.drop_cross_terms)
@@ -174,14 +173,14 @@ def _solved(basis: np.ndarray, z: np.ndarray, weight: np.ndarray | None = None) 
 
 
 def _factor(gram: np.ndarray) -> np.ndarray | None:
-    """Return Cholesky's factor, lower; None where the matrix is singular to working precision."""
+    """Return the lower Cholesky factor; None if the matrix is singular to working precision."""
     factor, failed = dpotrf(gram, lower=True)
     size = factor.diagonal()
     return None if failed or not size.min() > 1e-7 * size.max() else factor
 
 
 def _thinned(basis: np.ndarray, z: np.ndarray, points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return about so many of the points, evenly strided; all where there are few or these would not determine it."""
+    """Return about ``points`` of the points, evenly strided; all if these are too few for the fit."""
     stride = len(z) // points
     if stride < 2:
         return basis, z
@@ -209,7 +208,7 @@ def _lar(basis: np.ndarray, z: np.ndarray, start: np.ndarray, knees: np.ndarray 
             rows = np.ascontiguousarray(np.take(basis, near, axis=1).T)
             new = _smoothed_descent(rows, z[near], far_pull, c, knee, enough)
             after = z - new @ basis
-            # a far point may have crossed the surface, or come within the knee of it
+            # a far point may have crossed the surface or come within its knee
             if not (far & ((r * after <= 0.0) | (np.abs(after) < knee))).any():
                 break
             reach *= 3.0
@@ -224,8 +223,8 @@ def _lar(basis: np.ndarray, z: np.ndarray, start: np.ndarray, knees: np.ndarray 
 
 @numba.njit(**PLAIN)
 def _huber(rows: np.ndarray, z: np.ndarray, c: np.ndarray, knee: float) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return the sum of Huber's function over its knee, its negative gradient (p,), and the inner normal matrix,
-    its lower half."""
+    """Return the sum of Huber's function over its knee, its negative gradient (p,), the inner normal matrix's lower
+    half."""
     terms = len(c)
     value, pull, inside = 0.0, np.zeros(terms), np.zeros((terms, terms))
     for i in range(len(z)):
@@ -247,7 +246,7 @@ def _huber(rows: np.ndarray, z: np.ndarray, c: np.ndarray, knee: float) -> tuple
 def _smoothed_descent(
     rows: np.ndarray, z: np.ndarray, far_pull: np.ndarray, start: np.ndarray, knee: float, enough: float
 ) -> np.ndarray:
-    """Minimise sum huber(r, knee) - c' far_pull: Newton, or where it fails a majorising step, which always descends."""
+    """Minimise sum huber(r, knee) - c' far_pull by Newton steps, or by majorising steps, which always descend."""
 
     def state(c: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
         value, pull, inside = _huber(rows, z, c, knee)
@@ -296,7 +295,7 @@ def _reweighted(basis: np.ndarray, z: np.ndarray, start: np.ndarray | None, step
     adjust = 1.0 / np.sqrt(1.0 - np.minimum(leverage, 0.9999))
     for _ in range(steps):
         adjusted = (z - c @ basis) * adjust
-        # MATLAB's robust sigma: median of |r| without as many of the smallest as there are terms, over 0.6745
+        # MATLAB's robust sigma: median of |r| over 0.6745, without the smallest |r|, one for each term
         sizes = np.abs(adjusted)
         place = min(terms - 1 + (len(sizes) - terms + 1) // 2, len(sizes) - 1)
         scale = max(float(np.partition(sizes, place)[place]) / 0.6745, TINY_M)
@@ -319,7 +318,7 @@ def _lts_start(basis: np.ndarray, z: np.ndarray) -> np.ndarray:
     ridge = 1e-12 * np.eye(terms)
 
     def concentrated(basis: np.ndarray, z: np.ndarray, c: np.ndarray, steps: int) -> np.ndarray:
-        """Return coefficients (m, p) after so many steps, those with the least sum of the smallest squares first."""
+        """Return coefficients (m, p) after this many steps, those with the least sum of the smallest squares first."""
         kept = min(len(z), max(int(LTS_COVERAGE * len(z)), (len(z) + terms + 1) // 2))
         for _ in range(steps):
             squares = (z - c @ basis) ** 2
@@ -336,8 +335,8 @@ def _lts_start(basis: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 
 Fit = Callable[[np.ndarray], np.ndarray]
-"""Measured points (n, 3), metres, to the surface's z (n,), metres; NaN where a ray misses the surface."""
-RIDGE = 1e-9  # share of the largest diagonal element that is added to each: keeps normal equations regular
+"""Maps measured points (n, 3), metres, to the surface's z (n,), metres; NaN where a ray misses the surface."""
+RIDGE = 1e-9  # share of the largest diagonal element, added to every one so that normal equations stay regular
 
 
 def polynomial(points: np.ndarray, weights: np.ndarray, degree: int) -> Fit:
@@ -359,7 +358,7 @@ def _ridged(design: np.ndarray, z: np.ndarray, weights: np.ndarray) -> np.ndarra
 
 def quadric(points: np.ndarray, weights: np.ndarray, central: bool) -> Fit | None:
     """Fit the quadric with the least weighted squares along the rays, to first order: Taubin's algebraic fit (1991),
-    then Gauss-Newton. None without a single sheet. ``central``: rays leave the origin, else along z."""
+    then Gauss-Newton. None if it has no single sheet. ``central``: rays leave the origin, else along z."""
     middle = np.average(points, axis=0, weights=weights)
     size = float(np.sqrt(np.average(((points - middle) ** 2).sum(axis=1), weights=weights))) or 1.0
     scaled = (points - middle) / size
@@ -402,7 +401,7 @@ def quadric(points: np.ndarray, weights: np.ndarray, central: bool) -> Fit | Non
         k = np.einsum("ni,ij,nj->n", start, matrix, start) + start @ c[6:9] + c[9]
         with np.errstate(invalid="ignore", divide="ignore"):
             root = sheet * np.sqrt(b * b - 4 * a * k)
-            # of the two equal forms the one without cancellation
+            # the form without cancellation
             return np.where(b * sheet > 0, 2 * k / (-b - root), (-b + root) / (2 * a))
 
     return z_at

@@ -19,11 +19,10 @@ from harness.vocabulary.geometry import Cloud
 
 
 class ThesisConfig(ScoreMapConfig):
-    """``scale`` is the unit of score: ``mad`` (median |residual| / 0.6745), ``residual_std``, ``raw_z_std``, or
+    """``scale``: the unit of score: ``mad`` (median |residual| / 0.6745), ``residual_std``, ``raw_z_std``, or
     ``highest_before``, the cloud's largest residual towards the camera, where no hole can be; k = 1 then requires a
     residual behind the surface to exceed it. With a shape other than ``polynomial``, the unit is the local noise.
-    ``use_variance``: where a map states each point's variance, the unit is proportional to each point's own deviation
-    (not with ``raw_z_std``)."""
+    ``use_variance``: whether a map's stated variance scales the unit at each point (not with ``raw_z_std``)."""
 
     crop: CropConfig = Field(default_factory=BoxCrop)
     surface: SurfaceConfig = Field(default_factory=SurfaceConfig)
@@ -44,7 +43,7 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
         return 1.0 if self.settings.scale == "highest_before" else None
 
     def analyse(self, cloud: Cloud) -> Evidence:
-        """Score |residual| / scale in the crop. Raises UserError where it determines no surface."""
+        """Score |residual| / scale in the crop. Raises UserError if it determines no surface."""
         mask = crop(cloud, self.settings.crop)
         if self.settings.surface.shape != "polynomial":
             return self._before_background(cloud, mask)

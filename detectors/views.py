@@ -12,7 +12,7 @@ from harness.vocabulary.geometry import Cloud
 
 @dataclass(frozen=True)
 class View:
-    """A view. ``T_reference_view_guess`` (4, 4): its camera frame to the first view's, roughly; None: unknown."""
+    """A view. ``T_reference_view_guess`` (4, 4): rough pose, its camera frame to the first view's; None: unknown."""
 
     name: str
     cloud: Cloud
@@ -29,10 +29,10 @@ class PreparedView:
 
     @property
     def points_m(self) -> np.ndarray:
-        """(n, 3) the target's points, camera frame of this view, in the order of the grid."""
+        """The target's points (n, 3), camera frame of this view, in the order of the grid."""
         return np.asarray(self.view.cloud.points_m[self.inside])
 
     @property
     def mark_points_m(self) -> np.ndarray:
-        """(m, 3) the fiducial cloud: valid points of the fiducial colour."""
+        """The fiducial cloud (m, 3): valid points of the fiducial colour."""
         return np.asarray(self.view.cloud.points_m.reshape(-1, 3)[self.marks.points])

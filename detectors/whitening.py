@@ -1,5 +1,5 @@
-"""The bank of matched filters' templates, and the noise that they are whitened by. Pictures are residuals in deviations
-of the local noise, on grids wider by the longest lag, so that nothing wraps around."""
+"""The templates of the matched filters, and the whitening of noise. Pictures are residuals in standard deviations of
+the local noise, on grids padded by the longest lag, so that nothing wraps around."""
 
 from __future__ import annotations
 
@@ -14,41 +14,41 @@ import scipy.fft
 import scipy.linalg
 
 SMALL_RADII_PX, HALVES_PX = (0.5, 1.5), ((0.0, 0.0), (0.5, 0.5), (0.0, 0.5), (0.5, 0.0))
-"""Radii of small discs, and the places between pixels at which they are compared: through a window with sharp sides
-half a pixel costs up to a seventh of the score. The first stands for all holes smaller than a pixel."""
+"""Radii of small discs, and the positions between pixels at which they are compared: half a pixel costs up to a seventh
+of the score if the window has sharp sides. The first radius stands for all holes smaller than a pixel."""
 RADII_PX = (2.2, 3.2, 4.5, 6.4, 9.0, 13.0, 18.0)
 """Radii of further discs."""
 DENT_RADII_PX = (5.0, 6.5, 8.0, 10.0, 12.0, 14.5, 17.5)
-"""Radii of paraboloids: denser, as before a fixed pattern their rims decide."""
+"""Radii of paraboloids. They are denser because before a fixed pattern the rims decide."""
 SLOT_PX, SLOTS_DEG = (20.0, 2.0), tuple(22.5 * k for k in range(8))
-"""Length and width of slots, and the angle of each to the rows."""
+"""Length and width of slots, and their angles to the rows."""
 WINDOWS_PX = (1, 3, 5)
-"""Sides of the square over which cameras average: 3 before a Kinect v2, 5 before an Azure Kinect, 1: the lens blurs."""
+"""Sides of the square over which cameras average: 3 for a Kinect v2, 5 for an Azure Kinect, 1: only the lens blurs."""
 LENS_BLUR_PX = 0.6
 LONGEST_LAG_PX = 28
-"""Lag at which the covariance has faded (Parzen's window)."""
+"""Lag at which Parzen's window fades the covariance to 0."""
 COARSE_PX = 9.0
-"""Radius from which on the scores of every second pixel are taken: between them they change by some hundredths."""
+"""Radius from which only every second pixel is scored: between these pixels, scores change by some hundredths."""
 LEAST_POWER = 0.01
-"""The spectrum is nowhere below this share of its mean."""
-MOST_WHITENED = 2000  # pixels whose dense covariance is factored: 0.2 s and 64 MB
+"""Least value of the spectrum, as a share of its mean."""
+MOST_WHITENED = 2000  # most pixels whose dense covariance is factored: 0.2 s and 64 MB
 SIDES_PX = (0, 1, 2, 3, 5, 8, 12, 18)
-"""Halves of the sides that a `Worth` may have: the share that is seen is taken once for each."""
+"""Half-sides that a `Worth` may have: the visible share is computed once for each."""
 GRID = 96
 """Side of the grid that holds the widest template and the reach of its whitened edge."""
 CONVERGED, MOST_ITERATIONS, FADED = 0.01, 40, 0.1
-"""Relative residual at which C^-1 r is solved, most steps, and the weight of 0 in what fills unknown pixels."""
+"""Relative residual at which C^-1 r is solved, most steps, and weight of 0 in the values that fill unknown pixels."""
 
 
 def grid_of(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the grid on which a picture of this shape is transformed; it holds every template; half of it is even."""
+    """Return the grid for transforms of pictures of this shape; it holds every template, and its half is even."""
     quarters = (math.ceil((max(side, GRID) + LONGEST_LAG_PX) / 4) for side in shape)
     return tuple(4 * scipy.fft.next_fast_len(quarter, real=True) for quarter in quarters)
 
 
 def noise_covariance(noise: np.ndarray, quiet: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the autocovariance (2 `LONGEST_LAG_PX` + 1, squared) of the quiet pixels, lag 0 in the middle: means of
-    products over pairs of known pixels, faded out by Parzen's window."""
+    """Return the autocovariance (2 `LONGEST_LAG_PX` + 1, squared) of the quiet pixels, lag 0 in the middle: mean
+    products of pairs of known pixels, faded out by Parzen's window."""
     products = np.abs(scipy.fft.rfft2(np.where(quiet, noise, np.float32(0.0)), shape)) ** 2
     pairs = np.abs(scipy.fft.rfft2(quiet.astype(np.float32), shape)) ** 2
     lags = np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1)
@@ -59,14 +59,14 @@ def noise_covariance(noise: np.ndarray, quiet: np.ndarray, shape: tuple[int, ...
 
 
 def spectrum(covariance: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the power spectrum on ``shape``, as `scipy.fft.rfft2` orders it, of an autocovariance."""
+    """Return the power spectrum of an autocovariance on ``shape``, ordered as by `scipy.fft.rfft2`."""
     power = scipy.fft.rfft2(_centred(covariance, shape)).real
     return np.asarray(np.maximum(power, max(LEAST_POWER * float(power.mean()), 1e-12)).astype(np.float32))
 
 
 def window_of(covariance: np.ndarray) -> int:
-    """Return the side of `WINDOWS_PX` that the noise indicates: its covariance falls steadily with the lag up to the
-    side of a square, and bends there; neighbours that share less than half were not averaged."""
+    """Return the side of `WINDOWS_PX` that the noise indicates: averaging over a square makes the covariance fall
+    steadily with the lag up to its side, and bend there. A correlation of neighbours below 0.5 means no averaging."""
     middle = len(covariance) // 2
     by_lag = (covariance[middle, middle:] + covariance[middle:, middle]) / 2.0
     if by_lag[1] < 0.5 * by_lag[0]:
@@ -85,9 +85,9 @@ def inverse_times(
     values: np.ndarray, known: np.ndarray, power: np.ndarray, shape: tuple[int, ...], start: np.ndarray | None = None
 ) -> np.ndarray:
     """Return C^-1 r (r, c) over the known pixels, 0 elsewhere, for the covariance with this power spectrum, by
-    conjugate gradients that start from ``start`` (r, c) or the preconditioner. That is the stationary inverse of r with
-    unknown pixels filled by their neighbours, and the transpose of that filling: where outlines are not straight or
-    pixels are missing, edges to zeros take up to four times the steps."""
+    conjugate gradients from ``start`` (r, c) or the preconditioner. The preconditioner fills unknown pixels from their
+    neighbours, applies the stationary inverse, and then the transpose of the filling: with zeros instead, ragged
+    outlines and missing pixels take up to four times the steps."""
     (h, w), mask, target = values.shape, np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     mask[:h, :w], target[:h, :w] = known, values * known
     power, inverse = (packed(each * np.complex64(1 + 1j)) / np.float32(mask.size) for each in (power, 1.0 / power))
@@ -133,14 +133,14 @@ def _blurred(image: np.ndarray) -> np.ndarray:
 
 
 def transformed(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the spectrum of an image (r, c), zero beyond, on a grid of even sides, as `cv2.dft` packs it."""
+    """Return the spectrum of an image (r, c), padded with zeros to a grid of even sides, packed as by `cv2.dft`."""
     padded = np.zeros(shape, np.float32)
     padded[: image.shape[0], : image.shape[1]] = image
     return np.asarray(cv2.dft(padded))
 
 
 def packed(half: np.ndarray) -> np.ndarray:
-    """Return a spectrum of `scipy.fft.rfft2` (r, c / 2 + 1), r and c even, as `cv2.dft` packs it (r, c)."""
+    """Return a spectrum of `scipy.fft.rfft2` (r, c / 2 + 1), r and c even, packed as by `cv2.dft` (r, c)."""
     rows = len(half)
     found = np.empty((rows, 2 * half.shape[1] - 2), np.float32)
     found[:, 1:-1:2], found[:, 2::2] = half[:, 1:-1].real, half[:, 1:-1].imag
@@ -152,33 +152,33 @@ def packed(half: np.ndarray) -> np.ndarray:
 
 
 def response(spectrum_of: np.ndarray, template: np.ndarray, shape: tuple[int, ...], symmetric: bool) -> np.ndarray:
-    """Return the correlation (r, c) of a picture with a template, both packed (`spectra`); of a `halved` picture
-    for a ``shape`` half as large, in the middles of 2 x 2 pixels."""
+    """Return the correlation (r, c) of a picture with a template, both packed (`spectra`). For a `halved` picture and a
+    ``shape`` half as large, it is that in the middles of 2 x 2 pixels."""
     whole = spectrum_of * template if symmetric else cv2.mulSpectrums(spectrum_of, template, 0, conjB=True)
     return np.asarray(cv2.dft(whole, dst=whole, flags=cv2.DFT_INVERSE | cv2.DFT_SCALE))[: shape[0], : shape[1]]
 
 
 def halved(picture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the spectrum of a picture's samples in the middles of 2 x 2 pixels, without higher frequencies."""
+    """Return the spectrum of a picture sampled in the middles of 2 x 2 pixels, without higher frequencies."""
     return packed(_low(scipy.fft.rfft2(picture, shape)) * _middles(shape))
 
 
 @lru_cache(maxsize=4)
 def _middles(shape: tuple[int, ...]) -> np.ndarray:
-    """Return the factors that move a spectrum's lower half by half a pixel, and scale it to a quarter of the pixels."""
+    """Return the factors that shift a spectrum's lower half by half a pixel and scale it to a quarter of the pixels."""
     cycles = np.add.outer(np.fft.fftfreq(shape[0] // 2) / 2, np.arange(shape[1] // 4 + 1) / shape[1])
     return np.asarray(np.exp(1j * np.pi * cycles) / 4.0, np.complex64)
 
 
 def _low(spectrum_of: np.ndarray) -> np.ndarray:
-    """Return the lower half of a spectrum's frequencies along either axis, as `scipy.fft.rfft2` orders them."""
+    """Return the lower half of a spectrum's frequencies along both axes, ordered as by `scipy.fft.rfft2`."""
     rows, columns = spectrum_of.shape[0] // 4, spectrum_of.shape[1] // 2 + 1
     return np.concatenate((spectrum_of[:rows, :columns], spectrum_of[-rows:, :columns]))
 
 
 class Template(NamedTuple):
-    """A damage's picture on a square of odd side, its centre ``halves`` (down, right) of half a pixel off the middle;
-    the radius of a disc as large; whether it is a slot; whether its scores are taken on every second pixel."""
+    """A damage's picture on a square of odd side. ``radius_px``: of a disc of equal size. ``halves`` (down, right):
+    offset of its centre from the middle in half pixels. ``coarse``: whether it is scored on every second pixel."""
 
     image: np.ndarray
     radius_px: float
@@ -188,9 +188,9 @@ class Template(NamedTuple):
 
 
 class Worth(NamedTuple):
-    """The whitened energy of a template, and the sides (along columns, along rows), in pixels of its scores' picture,
-    of the rectangle over which it spreads as widely; ``raised``: by how much the square of a score exceeds that of the
-    template with the most independent places where maxima are as rare, halved for the many wide templates."""
+    """``energy``: whitened energy of a template. ``sides`` (along columns, along rows): of the rectangle that spreads
+    as widely, in pixels of its scores' picture. ``raised``: amount by which the square of a score exceeds that of the
+    template with the most independent places where maxima are equally rare; half of it for the many wide templates."""
 
     energy: float
     sides: tuple[int, int]
@@ -202,7 +202,7 @@ def worths(power: np.ndarray, window_px: int) -> tuple[Worth, ...]:
     found, crowds, white = [], [], 1.0 / np.sqrt(power)
     for sizes, seen_by in zip(_sizes(window_px), (white, _low(white)), strict=True):
         values = sizes * seen_by
-        # by Parseval's theorem; a second moment over space is the energy of a derivative over frequency
+        # Parseval's theorem: a second moment over space is the energy of a derivative over frequency
         side, half = values.shape[1], np.full(values.shape[2], 2.0, np.float32)
         half[[0, -1]] = 1.0
         energies, turned = values**2 * half, np.roll(values, 1, axis=1)
@@ -211,7 +211,7 @@ def worths(power: np.ndarray, window_px: int) -> tuple[Worth, ...]:
         along = 2.0 * (np.diff(values, axis=2) ** 2).sum(axis=(1, 2))
         reach = np.sqrt(3.0 * np.stack((along, down), axis=1) / energy[:, None]) * side / (2.0 * math.pi)
         halves = np.array(SIDES_PX)[np.abs(np.array(SIDES_PX) - reach[..., None]).argmin(axis=2)]
-        # maxima are as dense as the root of the score's second spectral moments (Adler 1981)
+        # the density of maxima is the root of the score's second spectral moments (Adler 1981)
         of_rows = energies.sum(axis=2) @ np.fft.fftfreq(side) ** 2
         of_columns = energies.sum(axis=1) @ (np.arange(values.shape[2]) / side) ** 2
         crowds += (np.sqrt(of_rows * of_columns) / energy * side**2).tolist()
@@ -220,19 +220,19 @@ def worths(power: np.ndarray, window_px: int) -> tuple[Worth, ...]:
             for each, (across, along) in zip(energy.tolist(), halves.tolist(), strict=True)
         ]
     most = max(crowds)
-    return tuple(one._replace(raised=math.log(most / crowd)) for one, crowd in zip(found, crowds, strict=True))
+    return tuple(worth._replace(raised=math.log(most / crowd)) for worth, crowd in zip(found, crowds, strict=True))
 
 
 @lru_cache(maxsize=6)
 def spectra(shape: tuple[int, ...], window_px: int) -> tuple[np.ndarray, ...]:
-    """Return the templates' spectra, `packed`, on a grid that holds them, for the height 1 of the undisturbed damage;
-    of coarse templates the lower half; of symmetric ones the real factor of each number."""
+    """Return the templates' spectra, `packed`, on a grid that holds them, for an undisturbed damage of height 1. Coarse
+    templates have only the lower half, symmetric ones the real factor of each number."""
     drawn = zip(bank(window_px), _drawn(shape, window_px), strict=True)
     return tuple(packed(each if any(template.halves) else each.real * (1 + 1j)) for template, each in drawn)
 
 
 def _drawn(shape: tuple[int, ...], window_px: int) -> list[np.ndarray]:
-    """Return the spectra as `scipy.fft.rfft2` orders them."""
+    """Return the spectra in the order of `scipy.fft.rfft2`."""
     kinds = bank(window_px)
     drawn = (scipy.fft.rfft2(_centred(template.image, shape)) for template in kinds)
     return [_low(each) if template.coarse else each for template, each in zip(kinds, drawn, strict=True)]
@@ -240,7 +240,7 @@ def _drawn(shape: tuple[int, ...], window_px: int) -> list[np.ndarray]:
 
 @lru_cache(maxsize=3)
 def _sizes(window_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sizes (t, r, c) of the spectra on `GRID`, those of coarse templates, which come last, apart."""
+    """Return the magnitudes (t, r, c) of the spectra on `GRID`; coarse templates, the last ones, separately."""
     sizes = list(map(np.abs, _drawn((GRID, GRID), window_px)))
     fine = sum(not template.coarse for template in bank(window_px))
     return np.stack(sizes[:fine]), np.stack(sizes[fine:])
@@ -248,7 +248,7 @@ def _sizes(window_px: int) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=3)
 def bank(window_px: int) -> tuple[Template, ...]:
-    """Return the templates as seen through a window of `WINDOWS_PX`: discs, paraboloids, slots; coarse ones last."""
+    """Return the templates as seen through a window of `WINDOWS_PX`: discs, paraboloids and slots; coarse ones last."""
 
     def disc(radius_px: float, off: tuple[float, float] = (0.0, 0.0)) -> Template:
         def inside(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -271,7 +271,7 @@ def bank(window_px: int) -> tuple[Template, ...]:
         return Template(seen(inside, SLOT_PX[0] / 2), SLOT_PX[0] / 4, slot=True, coarse=True)
 
     def seen(shape: Callable[[np.ndarray, np.ndarray], np.ndarray], reach_px: float) -> np.ndarray:
-        """Return a shape of x and y in pixels, averaged over pixels, and through the window or a lens."""
+        """Return a shape of x and y in pixels, averaged over pixels and blurred by the window or a lens."""
         finer, half = 4, int(reach_px + 5)
         places = (np.arange((2 * half + 1) * finer) + 0.5) / finer - (half + 0.5)
         height = shape(places[None, :], places[:, None]).astype(float)
@@ -288,13 +288,13 @@ def bank(window_px: int) -> tuple[Template, ...]:
 def whitener(
     used: np.ndarray, correlation: np.ndarray | None, deviation: float, model_error: np.ndarray
 ) -> np.ndarray | None:
-    """Return the matrix (n, n) by which rows (k, n) of errors at the ``used`` pixels (r, c) are multiplied to become
-    independent errors of deviation 1; None where there are too many pixels, or the correlation is not known or none.
-    Errors are noise of one ``deviation`` and the model's own (r, c), both correlated by lag (odd, odd)."""
+    """Return the matrix (n, n) that turns rows (k, n) of errors at the ``used`` pixels (r, c) into independent errors
+    of variance 1. None if there are too many pixels, or if the correlation is unknown or zero. Errors are noise of one
+    ``deviation`` and the model's own (r, c), both with the ``correlation`` by lag (odd, odd)."""
     count, (h, w) = int(used.sum()), used.shape
     if correlation is None or count > MOST_WHITENED:
         return None
-    # the correlation at all lags of the patch, in which the lag of two pixels is the difference of their flat indices
+    # the correlation at all lags of the patch: the lag of two pixels is the difference of their flat indices
     lags, (down, right) = np.zeros((2 * h - 1, 2 * w - 1)), (side // 2 for side in correlation.shape)
     reach = min(down, h - 1), min(right, w - 1)
     within = tuple(slice(middle - far, middle + far + 1) for middle, far in zip((h - 1, w - 1), reach, strict=True))
@@ -312,11 +312,11 @@ def whitener(
 
 
 def correlated_products(columns: np.ndarray, across: int, down: int) -> np.ndarray:
-    """Return S' S (p, p) with S the columns (p, h, w), zero outside, summed over ``down`` x ``across`` windows."""
+    """Return S' S (p, p); S is the columns (p, h, w), zero outside, summed over ``down`` x ``across`` windows."""
     count, h, w = columns.shape
     padded = np.zeros((count, h + down - 1, w + across - 1))
     padded[:, :h, :w] = columns
     size, last, border = (across, down), (across - 1, down - 1), cv2.BORDER_CONSTANT  # windows end at their pixel
-    summed = [cv2.boxFilter(one, -1, size, anchor=last, normalize=False, borderType=border) for one in padded]
+    summed = [cv2.boxFilter(each, -1, size, anchor=last, normalize=False, borderType=border) for each in padded]
     flat = np.array(summed).reshape(count, -1)
     return np.asarray(flat @ flat.T)

@@ -47,7 +47,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     import numpy as np
 
     from harness.evaluation.study.record import read_record
-    from harness.inspection.told import print_notes, print_warnings
+    from harness.inspection.output import print_notes, print_warnings
     from harness.own_camera.camera_file import Stated, camera_of_size, opened_as, simulated, with_lens, write_camera
     from harness.own_camera.certificate import write_certificate
     from harness.own_camera.measure import characteristics, read_still

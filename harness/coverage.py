@@ -130,7 +130,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     camera = config.simulated.camera
     detector = f"the detector {config.detector.name} at a threshold of {chosen.task.threshold:.3g}"
     unit = f"unit {camera.unit_seed} of {camera_title(Path(camera.name).stem)}, {many(config.capture.frames, 'frame')}"
-    first = f"Simulated, for {unit}, {detector}. {found.said}"
+    first = f"Simulated, for {unit}, {detector}. {found.statement}"
     html = coverage_html(name, sentence, first, scene, poses, goals, warnings, command)
     write_text(folder / COVERAGE_PAGE.name, html)
     grids = [table.grid(rows[table], terminal=True) for table in (GOALS, POSES) if rows[table]]

@@ -48,7 +48,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 (also if the pattern is not stable), 2 for a user's mistake, 130 after Ctrl-C."""
     from detectors.flat_captures import separated
     from detectors.flat_field import save_flat_field
-    from harness.inspection.told import mm, print_warnings
+    from harness.inspection.output import mm, print_warnings
     from harness.report.blocks import save_png
     from harness.tables.flat_field import FLAT_CAPTURES, FLAT_FIGURES, figures_of
     from harness.tables.text import show

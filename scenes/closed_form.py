@@ -1,4 +1,4 @@
-"""Views in closed form: endless planes under one emitter, with direct light only. For calibration and checks."""
+"""Views in closed form: infinite planes under one emitter, with direct light only. For calibration and checks."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Plane:
         return np.array([self.slope_x, self.slope_y, -1.0]) / np.sqrt(self.slope_x**2 + self.slope_y**2 + 1)
 
     def z_along_m(self, slopes: np.ndarray) -> np.ndarray:
-        """Return z (...) where rays with ``slopes`` (..., 2) meet the plane; NaN where they never do."""
+        """Return z (...) where rays with ``slopes`` (..., 2) meet the plane; NaN for rays that do not."""
         one_by_z = (1 - self.slope_x * slopes[..., 0] - self.slope_y * slopes[..., 1]) / self.distance_m
         with np.errstate(divide="ignore"):
             return np.where(one_by_z > 0, 1 / one_by_z, np.nan)
@@ -63,9 +63,10 @@ def image_view(camera: AnyCamera, region: Region, z_m: np.ndarray, light: np.nda
 def layered_view(
     camera: AnyCamera, region: Region, front: Plane, back: Plane, covers: Covers, albedo: float
 ) -> NoiseFreeView:
-    """Return a view of a part of the plane ``front`` (where it ``covers``) before the endless plane ``back``, both
-    Lambertian with the same albedo. Each pixel sums phasors over its footprint; the front casts a shadow on the back.
-    Surfaces: "front", "back". Not modelled: the front's thickness, light between the planes, the emitter's cone."""
+    """Return a view of a part of the plane ``front`` (where it ``covers``) in front of the infinite plane ``back``,
+    both Lambertian with the same albedo. Each pixel sums phasors over its footprint; the front casts a shadow on the
+    back. Surfaces: "front", "back". Not modelled: the front's thickness, light between the planes, the emitter's
+    cone."""
     lens, optics, waves = camera.nominal_lens, camera.optics, wave_numbers(camera.optics.frequencies_hz)
     footprint = footprint_of(lens, region, optics.beam_fwhm_rad)
 

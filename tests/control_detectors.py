@@ -33,12 +33,12 @@ class Oracle:
         self.settings = settings
         self._truth = truth
 
-    def told(self, truth: tuple[TrueDamage, ...]) -> Oracle:
+    def with_truth(self, truth: tuple[TrueDamage, ...]) -> Oracle:
         """Return the detector for one cloud with this truth; empty on a hole-free board."""
         return Oracle(self.settings, tuple(truth))
 
     def analyse(self, cloud: Cloud) -> Evidence:
-        """Score 1 on the pixels of true damage, 0 on others. Raises UserError where it was not told the truth."""
+        """Score 1 on the pixels of true damage, 0 on others. Raises UserError if it has not received the truth."""
         truth = self._known()
         if not cloud.valid.any():
             raise UserError("the cloud has no valid point to judge", fix="check the capture")
@@ -62,12 +62,12 @@ class Oracle:
         damage = next((each for each in self._known() if np.array_equal(each.centre_m, detection.centre_m)), None)
         if damage is None:
             raise ValueError("the detection is none of this oracle's")
-        told = measure_extents(cloud, detection, "handed the truth")
-        return replace(told, extent_diameter_m=damage.diameter_m, extent_centre_m=damage.centre_m)
+        measured = measure_extents(cloud, detection, "handed the truth")
+        return replace(measured, extent_diameter_m=damage.diameter_m, extent_centre_m=damage.centre_m)
 
     def _known(self) -> tuple[TrueDamage, ...]:
         if self._truth is None:
-            what = "the detector 'oracle' was not told the truth: it tests studies on simulated boards alone"
+            what = "the detector 'oracle' has not received the truth: it tests studies on simulated boards alone"
             raise UserError(what, fix="use it in an experiment with a simulated source, or choose another detector")
         return self._truth
 

@@ -299,12 +299,14 @@ def test_listed_pixels_go_through_the_same_chain_as_frames():
     assert summer is not None and isinstance(imager, AmcwImager)
     light, places = summer.light, summer.list
     normals = standard_normals(random_stream(1), (len(places.halo), 3, 2, LANES))
-    planes = np.empty((len(places.halo), 3, kernels.BLOCK), np.float32)
-    kernels.noisy_phasors(light.phasor, light.amplitude, light.turn, light.swell, normals, planes)
+    planes = np.empty((len(places.halo) // kernels.BESIDE + 2, 3, 3, kernels.STRIDE), np.float32)
+    noise = np.zeros((len(places.halo), LANES), np.float32)
+    kernels.noisy_phasors(*light[:2], *light[3:], summer.shares, normals, planes, noise)
     filtered = np.empty((3, 3, len(places.range), LANES), np.float32)
     edge = np.empty((3, len(places.range), LANES), np.float32)
     kernels.filter_listed(planes, places.window, imager.filter_settings, filtered, edge)
-    by_plane = planes.reshape(-1, 3, 3, LANES)
+    by_plane = planes.reshape(-1, 3, 3, kernels.BESIDE, LANES).transpose(0, 3, 1, 2, 4).reshape(-1, 3, 3, LANES)
+    by_plane = by_plane[: len(places.halo)]
     for lane in (0, LANES - 1):
         shape = unit.exposure.shape
         phasors, amplitude = np.zeros((2, 3, np.prod(shape)), np.float32), np.full((3, np.prod(shape)), -1, np.float32)

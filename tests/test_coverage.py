@@ -117,7 +117,7 @@ def test_the_program_says_where_the_camera_is_blind(
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["plate", "--set", "sweep={}"], "is no study of drawn damage"),
+        (["plate", "--set", "sweep={}"], "is not a study of drawn damage"),
         (["detection_limit", "--size", "5mm"], "set-ups, but only --goal can compare several"),
         (["pipe", "--size", "5"], "not a length with a unit"),
         (["pipe", "--goal", "5mm", "--suggest", "2"], "leave out --size"),

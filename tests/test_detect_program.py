@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from detectors.interface import Detection, Evidence, Measurement
 from harness import detect
 from harness.inspection.arguments import crop_from_text
-from harness.inspection.told import print_findings
+from harness.inspection.output import print_findings
 from harness.report.findings import finding_of
 from harness.tables.trials import FINDINGS_OF_CAPTURE
 from harness.vocabulary.errors import UserError
@@ -83,7 +83,7 @@ def test_it_says_first_what_it_took_and_how_to_take_another(
     assert (
         first.startswith("target 1 of 2: 0.50 m away (0.49 to 0.51 m), 30") and " % of the view, tilted by 6" in first
     )
-    assert second.startswith("  alternative, with --target 2: 1.20 m away (1.20 to 1.20 m), ")
+    assert second.startswith("  instead, with --target 2: 1.20 m away (1.20 to 1.20 m), ")
     told = json.loads((tmp_path / "out" / "findings.json").read_text())["target"]
     assert told["taken"] == 1 and [each["number"] for each in told["candidates"]] == [1, 2]
     assert told["candidates"][0]["extent_mm"] == pytest.approx([300, 240], abs=8)
@@ -92,9 +92,7 @@ def test_it_says_first_what_it_took_and_how_to_take_another(
     assert [row["kind"] for row in rows_of(tmp_path / "out" / "findings.csv")] == ["hole"]
     assert detect.main([str(before_wall), "--target", "2"]) == 0
     first, second = capsys.readouterr().out.splitlines()[:2]
-    assert first.startswith("target 2 of 2: 1.20 m away") and second.startswith(
-        "  alternative, with --target 1: 0.50 m"
-    )
+    assert first.startswith("target 2 of 2: 1.20 m away") and second.startswith("  instead, with --target 1: 0.50 m")
 
 
 def test_a_target_that_is_not_there_is_refused_with_those_that_are(
@@ -102,7 +100,7 @@ def test_a_target_that_is_not_there_is_refused_with_those_that_are(
 ) -> None:
     message = failed(capsys, before_wall, "--target", "3")
     assert "there are 2 large smooth surfaces" in message and "--target 1: 0.50 m" in message
-    assert "but the crop is --crop none" in failed(capsys, before_wall, "--target", "1", "--crop", "none")
+    assert "another crop" in failed(capsys, before_wall, "--target", "1", "--crop", "none")
 
 
 # ---- what it finds ---------------------------------------------------------------------------------------------------
@@ -225,7 +223,7 @@ def test_auto_crop_without_a_grid_keeps_the_hole_and_leaves_the_rim(
 ) -> None:
     cloud = plane.write_ply(tmp_path / "c.ply", plane.points_m(plane.depth_mm()), grid=False)
     assert detect.main([str(cloud), "--out", str(tmp_path / "out"), "--detector", "thesis"]) == 0
-    assert "points off the target or on its rim are not judged" in capsys.readouterr().out
+    assert "points lie off the target or on its rim" in capsys.readouterr().out
     (row,) = rows_of(tmp_path / "out" / "findings.csv")
     v, u = np.mgrid[: plane.LENS.height, : plane.LENS.width]
     assert int(row["points"]) == (np.hypot(u - plane.HOLE_U, v - plane.HOLE_V) < plane.HOLE_RADIUS_PX).sum()
@@ -241,7 +239,7 @@ def test_a_quiet_capture_sets_the_threshold(capture: Path, tmp_path: Path, capsy
     assert {str(quiet), str(capture)} == {
         str(Path(file["path"]).parent.parent) for file in files if "depth" in file["path"]
     }
-    assert "without a finding on" in capsys.readouterr().out
+    assert "silent on" in capsys.readouterr().out
     k = json.loads((tmp_path / "a" / "findings.json").read_text())["threshold"]["k"]
     assert detect.main([str(quiet), "--threshold", str(k)]) == 0
     assert "no findings" in capsys.readouterr().out
@@ -288,7 +286,7 @@ def test_a_filter_that_hides_the_rim_of_a_hole_to_the_room_behind_is_told_first(
     (tmp_path / "lens.json").write_text('{"fx": 400, "fy": 400, "cx": 80, "cy": 60}')
     assert detect.main([str(tmp_path / "depth.npy"), "--intrinsics", str(tmp_path / "lens.json")]) == 0
     said = capsys.readouterr().out
-    assert ("show the far background or nothing (1) may be up to" in said.split("target 1")[0]) == is_doubted
+    assert ("show what lies far behind, or nothing (1), may be up to" in said.split("target 1")[0]) == is_doubted
 
 
 def test_settings_reach_the_detector(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -320,7 +318,7 @@ def test_a_camera_may_lend_its_lens(tmp_path: Path, capsys: pytest.CaptureFixtur
     (
         (("--crop", "circle"), "--crop circle"),
         (("--crop", "box:1,2,3"), "box:x0,x1,y0,y1,z0,z1"),
-        (("--crop", "box:500,-500,-500,500,100,900"), "a lower bound is not below its upper bound"),
+        (("--crop", "box:500,-500,-500,500,100,900"), "a lower bound is not below the upper one"),
         (("--crop", "box:a,2,3,4,5,6"), "not all of its values are numbers"),
         (("--crop", "box:-500,500,-500,500,5000,9000"), "holds none of the cloud's"),
         (("--crop", "polygon:200,1,300,1,200,90"), "none of the cloud's 6911 points"),
@@ -330,7 +328,7 @@ def test_a_camera_may_lend_its_lens(tmp_path: Path, capsys: pytest.CaptureFixtur
         (("--detector", "thesys"), "did you mean 'thesis'"),
         (("--threshold", "0"), "above 0"),
         (("--threshold", "nan"), "above 0"),
-        (("--threshold", "3", "--quiet-capture", "x"), "give only one of them"),
+        (("--threshold", "3", "--quiet-capture", "x"), "give one of them"),
         (("--threshold", "3", "--false-calls", "1"), "--threshold and --false-calls set the threshold"),
         (("--quiet-capture", "x", "--false-calls", "1"), "--quiet-capture and --false-calls set"),
         (("--false-calls", "0"), "above 0"),

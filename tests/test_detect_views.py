@@ -234,15 +234,15 @@ def test_views_without_overlap_are_refused(
     far[0, 3] = 1.0
     poses.write_text(json.dumps([np.eye(4).tolist(), far.tolist()]))
     said = failed(capsys, *views[:2], "--register", "nominal", "--poses", poses, "--out", tmp_path / "out")
-    assert "view_1: the views do not overlap: 0 %" in said and "correct their --poses" in said
+    assert "view_1: the views do not overlap: 0 %" in said and "correct --poses" in said
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
     ("arguments", "told"),
     (
-        (("--register", "nominal"), "needs the poses of the views"),
-        (("--register", "marks", "--quiet-capture", "x"), "--quiet-capture is a single cloud"),
+        (("--register", "nominal"), "none are stated"),
+        (("--register", "marks", "--quiet-capture", "x"), "--quiet-capture is one cloud"),
         (("--register", "marks", "--poses", "nowhere"), "nowhere: cannot be read"),
         (("--register", "marks", "--set", "mapping.merge.cell=1"), "unknown key `cell` in `mapping.merge`"),
         (
@@ -253,10 +253,10 @@ def test_views_without_overlap_are_refused(
         (("--register", "marks", "--crop", "box:0,1,0,1,0,1"), "view view_0: the crop box"),
         (("--register", "marks", "--threshold", "0"), "above 0"),
         (("--register", "marks", "--topic", "points2"), "is not a ROS bag"),
-        (("--merge", "grid"), "--merge: applies to several views"),
-        (("--marks", "red"), "--marks: applies to several views"),
-        (("--poses", "x"), "--poses: applies to several views"),
-        (("--set", "mapping.views=2"), "--set mapping.views=2: applies to several views"),
+        (("--merge", "grid"), "--merge: concerns several views"),
+        (("--marks", "red"), "--marks: concerns several views"),
+        (("--poses", "x"), "--poses: concerns several views"),
+        (("--set", "mapping.views=2"), "--set mapping.views=2: concerns several views"),
     ),
 )
 def test_a_mistake_is_one_message_and_leaves_nothing(
@@ -275,7 +275,7 @@ def test_several_captures_are_no_list_of_frames_and_no_capture_counts_twice(
     views: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     said = failed(capsys, *views[:2])
-    assert f"2 PATHs, but {views[0]} is a complete capture" in said and "--register marks|" in said
+    assert f"2 PATHs, but {views[0]} is a whole capture" in said and "--register marks|" in said
     assert f"{views[0]}: is named twice" in failed(capsys, views[0], views[1], views[0] + "/", "--register", "marks")
 
 

@@ -93,7 +93,7 @@ def test_tags_that_are_cut_or_lack_range_are_in_doubt():
     marks = find_marks(replace(cloud, points_m=points), inside & np.isfinite(points[..., 2]), CodedMarks())
     doubts = {mark.code: mark.doubt for mark in marks.marks}
     assert doubts[3].endswith("beyond the crop's edge")
-    assert doubts[7].startswith("without range in")
+    assert doubts[7].endswith("of it has no range")
     assert (doubts[11], doubts[19]) == ("", "")
 
 

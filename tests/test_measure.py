@@ -267,7 +267,7 @@ def test_a_smooth_dent_is_not_taken_for_waves_of_the_noise() -> None:
 
 def test_a_hole_lost_in_the_blur_falls_back_and_says_so() -> None:
     m = measured(Board(2.0, 12.7, wall=0.3), 0.15, 3, threshold=4.0)
-    assert m.model_note.startswith("diameter and depth cannot be told apart") and "half depth" in m.model_note
+    assert m.model_note.startswith("the blur hides the difference") and "half-depth contour" in m.model_note
     assert m.model_diameter_m > 2.0e-3 and np.isnan(m.model_diameter_se_m)
 
 

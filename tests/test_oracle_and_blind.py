@@ -10,7 +10,7 @@ from control_detectors import BlindDetector, Oracle, judged_area_m2
 from scipy import stats
 
 from detectors import load_detector
-from detectors.interface import ToldTheTruth, TrueDamage
+from detectors.interface import NeedsTruth, TrueDamage
 from harness import testing as checks
 from harness.synthetic_clouds import DISTANCE_M, LENS, SHAPE, cylinder, plane, with_gaps, without
 from harness.testing import CHECKS
@@ -38,10 +38,10 @@ TRUTH = (damage(20, 30, 5.0), damage(60, 80, 0.4), damage(60, 90, 3.0))
 
 def oracle(*truth: TrueDamage) -> Oracle:
     unaware = load_detector("oracle", {})
-    assert isinstance(unaware, ToldTheTruth)
-    told = unaware.told(truth)
-    assert isinstance(told, Oracle)
-    return told
+    assert isinstance(unaware, NeedsTruth)
+    detector = unaware.with_truth(truth)
+    assert isinstance(detector, Oracle)
+    return detector
 
 
 # ---------------------------------------------------------------- the oracle
@@ -94,8 +94,8 @@ def test_the_oracle_keeps_the_contract_of_its_own_cloud() -> None:
             check(lambda: oracle(*TRUTH), cloud)
 
 
-def test_the_oracle_that_was_told_nothing_says_so() -> None:
-    with pytest.raises(UserError, match="was not told the truth"):
+def test_the_oracle_without_the_truth_says_so() -> None:
+    with pytest.raises(UserError, match="has not received the truth"):
         Oracle(Config()).analyse(plane(seed=1))
 
 

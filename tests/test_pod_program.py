@@ -406,7 +406,7 @@ HIT = ["--size", "a", "--hit", "hit"]
         (
             GOOD.replace("3.0,0", "-1,0"),
             HIT,
-            ["line 7: a is -1, and no size is below 0", "not their logarithms"],
+            ["line 7: a is -1, but a size cannot be below 0", "not their logarithms"],
         ),
         (GOOD.replace(",0,", ",1,"), HIT, ["all 12 rows of hit are hits", "both hits and misses"]),
         (GOOD.replace(",1,", ",0,"), HIT, ["all 12 rows of hit are misses"]),

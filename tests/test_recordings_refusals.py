@@ -120,9 +120,9 @@ def test_clouds_of_different_sizes_are_named(tmp_path: Path) -> None:
 def test_frames_without_one_valid_pixel_are_refused(tmp_path: Path) -> None:
     png(tmp_path / "1.png", STORED * 0)
     png(tmp_path / "2.png", STORED * 0)
-    assert "not one valid pixel in 2 frames" in refusal(tmp_path, lens=plane.LENS)
+    assert "no valid pixel in 2 frames" in refusal(tmp_path, lens=plane.LENS)
     np.save(tmp_path / "nan.npy", np.full((72, 96), np.nan))
-    assert "not one valid pixel in 1 frame" in refusal(tmp_path / "nan.npy", lens=plane.LENS)
+    assert "no valid pixel in 1 frame" in refusal(tmp_path / "nan.npy", lens=plane.LENS)
 
 
 def test_one_empty_frame_among_good_ones_is_no_error(tmp_path: Path) -> None:
@@ -278,7 +278,7 @@ def test_a_file_of_bare_numbers_needs_its_layout(tmp_path: Path) -> None:
         ("1 2 3\nfour five six\n", "cannot be read as points"),
         ("x y z i\n1 2 3\n", "names the columns"),
         (" ".join(["1"] * 40) + "\n", "name depth.npy"),
-        ("9" * 400 + " 1 1\n", "wrong unit|not one valid|finite"),
+        ("9" * 400 + " 1 1\n", "wrong unit|no valid pixel|finite"),
     ),
 )
 def test_a_faulty_list_of_points_is_explained(tmp_path: Path, text: str, told: str) -> None:

@@ -112,7 +112,7 @@ def test_mistakes_are_told(tmp_path: Path) -> None:
         load_detector("local", {"surface": {"shape": "mesh"}})
     sheet = trimesh.Trimesh([(0, 0, 0), (10, 0, 0), (0, 10, 0)], [(0, 2, 1)])
     sheet.export(tmp_path / "away.stl")
-    with pytest.raises(UserError, match="no triangle of it faces"):
+    with pytest.raises(UserError, match="none of its triangles faces"):
         front_of(ReferenceConfig(file=str(tmp_path / "away.stl")))
     with pytest.raises(UserError, match="cannot be read"):
         front_of(ReferenceConfig(file=str(tmp_path / "none.stl")))

@@ -168,7 +168,7 @@ def test_a_wrong_guess_turns_the_board_about():
     # the twin fits as well, and nothing in the clouds tells: what the guess says is what is believed
     assert not turned.failure and target_error_m(turned, reference, other)[0] > 0.1
     judged = judge(turned, reference.prepared, other.prepared)
-    assert judged.failure.startswith("stands 180 degrees and ")
+    assert judged.failure.startswith("is 180 degrees and ")
 
 
 def replace_guess(view: PreparedView, guess: np.ndarray | None) -> PreparedView:

@@ -111,7 +111,7 @@ class TestValidity:
         said = section(result, "Departures from MIL-HDBK-1823A")
         for words in (
             "simulated",
-            "Targets share boards, 8 to a board",
+            "Targets share boards, 8 per board",
             "more than once",
             "Unflawed places",
             "deviance",

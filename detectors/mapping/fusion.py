@@ -1,18 +1,17 @@
 """Fusion in the target's frame: registered views to one 2.5-D map over the fitted surface, with its variance.
 
 Each pixel's depth counts as a height over the surface at the place where its *ray meets the surface*. On an intact
-surface that is the point itself; at a hole it is the mouth, which thereby lies in one place for all views. A point at
-the bottom of a wide hole, or in front of the surface, is displaced in a slanted view.
+surface that is the point itself; at a hole it is the mouth, which therefore has the same place in all views. In a
+slanted view, points at the bottom of a wide hole or in front of the surface are displaced.
 
-View i measures a cell's height as h + e_i + f(p_i) + g_i: e_i is the noise that the sensor's law and the registration's
-covariance explain; f the camera's fixed pattern, which belongs to the *pixel* p_i that looks at the cell; g_i what is
-fixed for a view and cell alone. Half the mean square difference of two views is noise + var g + var f (1 - exp(-(|p_i -
-p_j| / length)^exponent)), a variogram with nugget and sill (Matheron 1963; Cressie 1993), fitted here to medians,
-because at damage views see different parts of it. Views that look through the same pixels share f.
+View i measures a cell's height as h + e_i + f(p_i) + g_i. e_i: noise that the sensor's law and the registration's
+covariance explain. f: the camera's fixed pattern, a function of the *pixel* p_i that sees the cell. g_i: an error that
+is fixed for a view and cell. Half the mean square difference of two views is noise + var g + var f (1 - exp(-(|p_i -
+p_j| / length)^exponent)), a variogram with nugget and sill (Matheron 1963; Cressie 1993). It is fitted to medians,
+because views see different parts of damage. Views that look through the same pixels share f.
 
-Not modelled: errors that all views share in all pixels, or registrations to one reference; a pattern that is not the
-same all over the sensor; changes of the blur. Where views are no farther apart than the pattern is long, its sill is an
-extrapolation."""
+Not modelled: errors that all views share in all pixels, or registrations to one reference; a pattern that varies over
+the sensor; changes of the blur. If views are no farther apart than the pattern's length, its sill is extrapolated."""
 
 from __future__ import annotations
 
@@ -32,24 +31,24 @@ from harness.vocabulary.geometry import Cloud, MapViews, Reason, Region, invert,
 
 CELLS = 2000
 CLASSES, PER_CLASS = 12, 100
-"""Number of classes of distance on the sensor, with equal numbers of pairs, and the fewest pairs worth a median."""
+"""Number of distance classes on the sensor, with equal numbers of pairs; fewest pairs for a median."""
 LENGTHS = 24
 """Number of trial lengths, geometric from a pixel to the largest distance between views."""
 EXPONENTS = (1.0, 1.5, 2.0)
-"""The covariance of a pattern that a filter smooths over a few pixels is flat at first (2), not pointed (1)."""
+"""A pattern that a filter smooths over a few pixels has a covariance that is flat at first (2), not pointed (1)."""
 MEDIAN_SQUARE = 0.45494
 """Median of the square of a standard normal deviate."""
 MEDIAN_ERROR = 2.33
-"""Standard error of the median of n such squares, relative to it, times the root of n."""
+"""Relative standard error of the median of n such squares, times the root of n."""
 GATE_SIGMAS = 5.0
 """An observation this many deviations from the median of at least three views is an outlier."""
 
 
 @dataclass(frozen=True)
 class BetweenViews:
-    """``own_m2``: variance of what is fixed for a view and cell alone; ``pattern_m2``: of the fixed pattern, with
-    covariance exp(-(distance / ``length_px``)^``exponent``) between pixels. ``noise_share``: part of the variance that
-    the sensor's law states that is noise; below 1 only where the law was read off a single frame."""
+    """Differences between views. ``own_m2``: variance of the error of a view and cell. ``pattern_m2``: variance of the
+    fixed pattern, with covariance exp(-(distance / ``length_px``)^``exponent``) between pixels. ``noise_share``: share
+    of the sensor law's variance that is noise; below 1 only if the law is from a single frame."""
 
     own_m2: float = 0.0
     pattern_m2: float = 0.0
@@ -61,9 +60,9 @@ class BetweenViews:
 def between_views(
     heights: np.ndarray, sensor: np.ndarray, other: np.ndarray, looks_px: np.ndarray, repeated: bool
 ) -> BetweenViews:
-    """Estimate it from heights (k, h, w), NaN where a view has none, with variances that the ``sensor`` and ``other``
-    (lens, registration) explain, and the direction ``looks_px`` (k, h, w, 2) in which each view sees each cell, in
-    pixels. ``repeated``: the sensor's variances come from repeated frames. All zero with too little overlap."""
+    """Estimate `BetweenViews` from heights (k, h, w), NaN where a view has none; the variances that the ``sensor`` and
+    ``other`` (lens, registration) explain; and the direction ``looks_px`` (k, h, w, 2), in pixels, in which each view
+    sees each cell. ``repeated``: the sensor's variances come from repeated frames. All zero with too little overlap."""
     several = np.flatnonzero(np.isfinite(heights).sum(axis=0).ravel() >= 2)
     some = several[:: max(1, len(several) // CELLS)]
     values = (heights, sensor, other, looks_px)
@@ -77,7 +76,7 @@ def between_views(
     parts = np.array_split(np.argsort(apart, kind="stable"), min(CLASSES, max(1, len(apart) // PER_CLASS)))
     distance, square, of_sensor, of_other = (np.array([np.median(c[part]) for part in parts]) for c in columns)
     half_square = np.maximum(0.5 * square / MEDIAN_SQUARE, 1e-16)
-    # the k (k - 1) / 2 differences of k views hold k - 1 independent ones
+    # k - 1 of the k (k - 1) / 2 differences of k views are independent
     error = half_square * MEDIAN_ERROR / np.sqrt(2.0 / len(heights) * len(apart) / len(parts))
     known = (half_square - of_other - (of_sensor if repeated else 0.0)) / error
     first = (np.ones_like(distance) if repeated else of_sensor) / error
@@ -107,10 +106,10 @@ def _law(
 
 @dataclass(frozen=True)
 class SurfaceMap:
-    """Values of each cell (h, w): ``height_m``: mean deviation from the fitted surface along z, positive behind, NaN
-    where no view counts; ``variance_m2``: of an intact surface's height, by sensor, lens and registration, and by what
-    views disagree about beyond; ``temporal_m2``: the part of it that more frames would lessen. ``seen_by`` (k, h, w)
-    bool: views that count; ``shares`` (k, h, w): their weights, which sum to 1. ``rejected``: number of outliers."""
+    """Values of each cell (h, w). ``height_m``: mean deviation from the fitted surface along z, positive behind; NaN
+    where no view counts. ``variance_m2``: of an intact surface's height, from sensor, lens, registration and further
+    differences between views. ``temporal_m2``: the part of it that more frames would lower. ``seen_by`` (k, h, w) bool:
+    views that count. ``shares`` (k, h, w): their weights, with sum 1. ``rejected``: number of outliers."""
 
     cell_m: float
     height_m: np.ndarray
@@ -125,9 +124,9 @@ class SurfaceMap:
 def combine(
     heights: np.ndarray, sensor: np.ndarray, other: np.ndarray, looks_px: np.ndarray, repeated: bool, cell_m: float
 ) -> SurfaceMap:
-    """Combine the views' heights (k, h, w); arguments as of `between_views`. The weight of a view is the inverse of its
-    own variance (the best weights under the covariance can be negative, which a hole seen by some views only does not
-    forgive); the variance of the mean takes the covariance of views into account."""
+    """Combine the views' heights (k, h, w); arguments as in `between_views`. The weight of a view is the inverse of its
+    own variance. (The best weights under the covariance can be negative, which fails at a hole seen by only some
+    views.) The variance of the mean includes the covariance of views."""
     between = between_views(heights, sensor, other, looks_px, repeated)
     temporal = between.noise_share * sensor
     own = temporal + other + between.own_m2
@@ -152,8 +151,8 @@ def combine(
 
 def _outliers(heights: np.ndarray, variances: np.ndarray) -> np.ndarray:
     """Return (k, h, w) bool: observations more than `GATE_SIGMAS` deviations (their own, or the robust spread of the
-    views if larger) from the median of at least three views, where they cannot be damage: as far before the fitted
-    surface, where damage would have been in the others' way; or behind, but alone among their neighbours."""
+    views if larger) from the median of at least three views that cannot be damage: in front of the fitted surface,
+    where damage would have hidden it from the others; or behind it, but alone among their neighbours."""
     middle = pixel_medians(heights)
     deviation = heights - middle
     limit = GATE_SIGMAS * np.maximum(1.4826 * pixel_medians(np.abs(deviation)), np.sqrt(variances))
@@ -167,29 +166,29 @@ def _outliers(heights: np.ndarray, variances: np.ndarray) -> np.ndarray:
 
 
 LATERAL_PX = 0.1
-"""Standard deviation of the direction in which a pixel looks: the reprojection error of a well calibrated lens."""
+"""Standard deviation of a pixel's direction: the reprojection error of a well calibrated lens."""
 SMOOTH_POINTS = 8192
 BINS, PER_BIN = 16, 40
 SAMPLED = 16_384
-"""Number of pixels from which the law is read: the median of a class is then known to 7 % from three frames."""
+"""Number of pixels for the law: the median of a class is then known to 7 % from three frames."""
 LEAST_M2 = 1e-14
-"""Least variance: no point is known better than to 0.1 um, and no weight is infinite."""
+"""Least variance, so that no weight is infinite: no point is known better than to 0.1 um."""
 
 
 def fuse(
     views: Sequence[placing.ChosenView], cell_m: float | None
 ) -> tuple[Cloud, np.ndarray, SurfaceMap, tuple[str, ...]]:
-    """Return the map as an organised cloud, its frame in the first view's (4, 4), what else is known, and notes. The
-    cloud's ``variance_m2`` over ``count`` is the temporal part of the variance, ``mean_variance_m2`` all of it, which
-    one view does not know of itself (then None). Rounding is in it. Raises UserError where the points do not determine
-    a surface or the map would have too many cells."""
+    """Return the map as an organised cloud, its frame in the first view's (4, 4), further results, and notes. The
+    cloud's ``variance_m2`` over ``count`` is the temporal part of the variance, ``mean_variance_m2`` the whole with
+    rounding (None for a single view, which cannot know it). Raises UserError if the points do not determine a surface
+    or the map would have too many cells."""
     T_reference_map = placing.T_reference_map_of(views[0])
     surface = placing.common_surface(views, T_reference_map)
     placed = [placing.place(view, T_reference_map, surface) for view in views]
     grid = placing.grid_over(placed, cell_m)
     x, y = grid.places()
     z = surface.evaluate(x, y)
-    # the product of the gradient with a small displacement is the change of height along z
+    # gradient times a small displacement is the change of height along z
     gradient = surface.gradients(x, y, grid.step)
     points = np.stack([x, y, z], axis=-1)
 
@@ -246,7 +245,7 @@ def fuse(
 
 
 def _roughness(view: placing.PlacedView) -> np.ndarray:
-    """Return (h, w) z less the view's own smooth surface; only needed, and computed, where frames do not repeat."""
+    """Return z minus the view's own smooth surface (h, w); computed only if frames do not repeat."""
     inside = view.chosen.inside
     rough = np.full(inside.shape, np.nan)
     if not (view.chosen.cloud.count[inside] > 1).any():
@@ -270,7 +269,7 @@ def _neighbour_correlation(view: placing.PlacedView) -> float:
 
 
 def _median(values: np.ndarray) -> float:
-    """Return the median of some of the finite values, evenly taken; NaN where there is none."""
+    """Return the median of an even sample of the finite values; NaN if there are none."""
     known = values[np.isfinite(values)]
     return float(np.median(known[:: max(1, len(known) // SMOOTH_POINTS)])) if len(known) else np.nan
 
@@ -278,7 +277,7 @@ def _median(values: np.ndarray) -> float:
 def _registration_variance(
     view: placing.ChosenView, points_m: np.ndarray, along: np.ndarray, T_reference_map: np.ndarray
 ) -> np.ndarray:
-    """Return the variance (h, w), by the registration, of the displacements w x (p - centre) + t of points (h, w, 3)
+    """Return the variance (h, w) that the registration gives to displacements w x (p - centre) + t of points (h, w, 3)
     along vectors (h, w, 3): that of w . ((p - centre) x along) + t . along; 0 without a covariance."""
     if not view.known_covariance:
         return np.zeros(points_m.shape[:2])
@@ -291,7 +290,7 @@ def _registration_variance(
 
 def _notes(views: Sequence[placing.ChosenView], found: SurfaceMap) -> tuple[str, ...]:
     between = found.between
-    notes = ["one view: its variance excludes errors that are constant within a view (pattern, wiggling)"]
+    notes = ["one view: its variance excludes errors that are constant in a view (pattern, wiggling)"]
     if len(views) > 1:
         notes = [
             f"fixed pattern {1e3 * np.sqrt(between.pattern_m2):.3f} mm over {between.length_px:.1f} px of the sensor,"
@@ -308,9 +307,9 @@ def _notes(views: Sequence[placing.ChosenView], found: SurfaceMap) -> tuple[str,
 def depth_noise(cloud: Cloud, inside: np.ndarray, deviation_m: np.ndarray) -> tuple[np.ndarray, bool]:
     """Return the variance (h, w) of the average's z, NaN where the cloud has no point, and True if it comes from the
     sample variances of repeated frames inside the target. The law is v = k q + c with q = 1 / amplitude^2 (phase noise:
-    Lange and Seitz 2001), or the range to the fourth where a tenth of the points has no amplitude; a pixel's own sample
-    variance would favour pixels quiet by chance. ``deviation_m`` (h, w): z less the view's own smooth surface, whose
-    squares stand in for the variances of a single frame. Not modelled: noise that frames share, multipath, pattern."""
+    Lange and Seitz 2001), or the range to the fourth if a tenth of the points has no amplitude; a pixel's own sample
+    variance would favour pixels that are quiet by chance. ``deviation_m`` (h, w): z minus the view's own smooth
+    surface, whose squares replace the variances for a single frame. Not modelled: shared noise, multipath, pattern."""
     q, valid = (cloud.points_m**2).sum(axis=-1) ** 2, cloud.valid
     if cloud.amplitude is not None:
         known = valid & (np.nan_to_num(cloud.amplitude) > 0)
@@ -331,7 +330,7 @@ def depth_noise(cloud: Cloud, inside: np.ndarray, deviation_m: np.ndarray) -> tu
         numbers, where = np.unique(freedom[some], return_inverse=True)
         samples = samples[some] / (2.0 * gammaincinv(numbers / 2.0, 0.5) / numbers)[where]
         x = q[used][some]
-        # the law goes through the medians of classes of q: robust against damage in the view
+        # medians of classes of q make the fit robust against damage in the view
         parts = np.array_split(np.argsort(x, kind="stable"), max(1, min(BINS, len(x) // PER_BIN)))
         typical = float(np.median(x))
         middle = np.array([np.median(x[part]) for part in parts]) / typical

@@ -1,9 +1,9 @@
 """The steps from views to one cloud: prepare, register (`detectors.registration.register`), and merge.
 
 A volume is a truncated signed distance field over the views' depth images (Open3D's VoxelBlockGrid). Depth is resampled
-by the same triangles as for the map to an image without distortion, because the field's projection has no lens model.
-All views count alike, and depth counts along its own optical axis (Curless and Levoy 1996). Not modelled: noise and
-incidence in the weights; views through a hole, which remove part of its rim."""
+with the triangles of the map to an image without distortion, because the field's projection has no lens model. All
+views have equal weight, and depth counts along the view's own optical axis (Curless and Levoy 1996). Not modelled:
+noise and incidence in the weights; views through a hole, which remove part of its rim."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, Region, invert, transform_points
 
 TRUNCATION_VOXELS = 4.0
-"""Distance at which the field is cut off: over 5 mm for pixels of 1.4 mm, ten times the noise of one frame."""
+"""Distance at which the field is truncated: over 5 mm for pixels of 1.4 mm, ten times the noise of one frame."""
 OVERSAMPLING = 2
-"""Pixels of the undistorted image along a side of a pixel; the field takes the depth of the nearest one."""
+"""Pixels of the undistorted image along a side of an original pixel; the field takes the nearest depth."""
 WALL_DEG = 60.0
-"""Angle between the normals of a crossing and of the smooth face, beyond which the crossing lies on a wall. A dent as
-deep as its radius has flanks of 45 degrees; a drilled wall has 90, less what the camera's blur takes."""
+"""A crossing whose normal is farther from that of the smooth face lies on a wall. A dent as deep as its radius has
+flanks of 45 degrees; a drilled wall has 90, less the effect of the camera's blur."""
 LOOKED_UP_AT = 0.5
-"""Added to the principal point: Open3D cuts pixel positions off, so the first pixel's centre is 0.5."""
+"""Added to the principal point, because Open3D truncates pixel positions: the first pixel's centre is 0.5."""
 BLOCK, BLOCKS_AT_FIRST = 8, 4096
-"""Voxels along a side of a block (larger blocks lie mostly beyond the cut), and blocks reserved at first."""
+"""Voxels along a side of a block (larger ones lie mostly outside the truncated field), and blocks reserved at first."""
 
 
 def integrate(views: Sequence[ChosenView], voxel_m: float | None) -> tuple[Cloud, tuple[str, ...]]:
-    """Return an unorganised cloud in the first view's frame, the field's zero crossings, sorted by x, y, z; and notes.
-    ``count`` is 1, ``variance_m2`` of all points the median variance of one frame's z over the views' targets, for the
-    floor that rounding sets. Raises UserError where the field or the targets hold no smooth surface."""
+    """Return the field's zero crossings as an unorganised cloud in the first view's frame, sorted by x, y, z; and
+    notes. ``count`` is 1; ``variance_m2`` of all points is the median variance of one frame's z over the views'
+    targets, for the floor that rounding sets. Raises UserError if the field or the targets have no smooth surface."""
     clouds = [view.cloud for view in views]
     z = clouds[0].points_m[views[0].inside][:, 2]
     pitch = float(np.median(z)) * views[0].slope_step
@@ -71,7 +71,7 @@ def integrate(views: Sequence[ChosenView], voxel_m: float | None) -> tuple[Cloud
 
 
 def _undistorted(view: ChosenView) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-    """Return depth (h, w, 1) float32, 0 for none, on a pinhole's grid; colour (h, w, 3) 0..1 if any; camera matrix."""
+    """Return depth (h, w, 1) float32, 0 if none, on a pinhole's grid; colour (h, w, 3) 0..1 if any; camera matrix."""
     cloud, inside = view.cloud, view.inside
     with np.errstate(invalid="ignore"):
         slopes = cloud.points_m[..., :2] / cloud.points_m[..., 2:]
@@ -88,7 +88,7 @@ def _undistorted(view: ChosenView) -> tuple[np.ndarray, np.ndarray | None, np.nd
 
 
 def _crossings(views: Sequence[ChosenView], voxel: float) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Return places, normals (n, 3) of zero crossings, first view's frame; and colours if all views have them."""
+    """Return places and normals (n, 3) of zero crossings in the first view's frame; colours if all views have any."""
     coloured = all(view.cloud.rgb is not None for view in views)
     names, channels = ["tsdf", "weight", "color"][: 2 + coloured], [[1], [1], [3]][: 2 + coloured]
     with open3d_on_one_thread() as o3d:
@@ -129,14 +129,14 @@ def _facing(views: Sequence[ChosenView], points_m: np.ndarray, normals: np.ndarr
 
 
 SEVERAL = -1
-"""Number of a view that stands for several views, or an unknown view."""
+"""Stands for several views, or for an unknown view."""
 MAX_BOXES = 1 << 21
 """Most boxes of the grid along one axis, so that three axes fit into a 63-bit key."""
 
 
 @dataclass(frozen=True)
 class Merged:
-    """One cloud of several views. ``T_reference_cloud`` (4, 4): its frame to the first view's camera frame.
+    """One cloud of several views. ``T_reference_cloud`` (4, 4): from its frame to the first view's camera frame.
     ``views_used``: names of the merged views. ``surface_map``: further results of a fused map."""
 
     cloud: Cloud
@@ -156,8 +156,8 @@ class Mapped:
     merged: Merged
 
     def view_of_points(self) -> np.ndarray:
-        """Return (n,) for each point of the merged cloud the index of its view in ``merged.views_used``, or `SEVERAL`:
-        of a map as it knows, else by the nearest point, several where another view has one within twice that."""
+        """Return (n,) for each point of the merged cloud the index of its view in ``merged.views_used``, or `SEVERAL`.
+        A map knows its views; else it is that of the nearest point, or several if another has one within twice that."""
         merged = self.merged
         count = merged.cloud.valid.size
         if merged.surface_map is not None:
@@ -175,14 +175,14 @@ class Mapped:
 
 
 def prepare(view: View, config: MappingConfig) -> PreparedView:
-    """Cut the target out of a view and find its marks. Raises UserError where the crop leaves nothing."""
+    """Cut the target out of a view and find its marks. Raises UserError if the crop leaves nothing."""
     inside = crop(view.cloud, config.crop)
     return PreparedView(view, inside, find_marks(view.cloud, inside, config.marks))
 
 
 def merge(views: Sequence[PreparedView], registrations: Sequence[Registration], config: AnyMerge) -> Merged:
-    """Merge the views whose registration did not fail to one cloud; works for a single view too. Raises UserError where
-    nothing is left to merge, or the settings ask for too many cells."""
+    """Merge the views, or the single view, whose registration did not fail. Raises UserError if no view is left, or if
+    the settings ask for too many cells."""
     began = time.perf_counter()
     chosen, left_out = list[ChosenView](), tuple[str, ...]()
     for prepared, registration in zip(views, registrations, strict=True):
@@ -212,7 +212,7 @@ def merge(views: Sequence[PreparedView], registrations: Sequence[Registration], 
 
 def _on_grid(views: Sequence[ChosenView], step_m: float) -> Cloud:
     """The thesis' merge (MATLAB's pcmerge) as an unorganised cloud in the first view's frame: boxes in the order of x,
-    then y, then z; then the rest. Raises UserError where there are more boxes along an axis than can be numbered. The
+    then y, then z; then the rest. Raises UserError if there are more boxes along an axis than can be numbered. The
     overlap of the clouds' axis-parallel bounding boxes is divided into boxes from its lowest corner; each box with
     points becomes their plain mean, in place and in colour; points beyond the overlap stay. Of more than two clouds all
     go into one grid, over the union of the pairwise overlaps, where pcmerge called in turn would weight a late cloud
@@ -238,7 +238,7 @@ def _on_grid(views: Sequence[ChosenView], step_m: float) -> Cloud:
         sums = np.concatenate([np.add.reduceat(columns[shared][order], starts, axis=0), sums])
     clouds = [view.cloud for view in views]
     n, samples = sums[:, 9:], sums[:, 7]
-    # MATLAB rounds the mean colour
+    # MATLAB rounds mean colours
     colour = np.floor(sums[:, 3:6] / n + 0.5)
     return Cloud(
         points_m=(sums[:, :3] / n)[None],

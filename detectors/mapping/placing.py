@@ -1,7 +1,7 @@
-"""The map's frame and cells, and views placed in it: where a ray meets the target's surface, and how far off it ends.
+"""The map's frame and cells, and the views placed in it: where a ray meets the target's surface, and how far off.
 
-Samples are resampled to a grid over triangles of neighbours, which leaves no gaps and no beats between two grids; it
-blurs by a tent whose variance is a sixth of the spacing squared."""
+Samples are resampled to a grid over triangles of neighbours, which leaves no gaps and no moire between two grids. It
+blurs with a tent whose variance is a sixth of the spacing squared."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud, invert, transform_points
 
 LONGEST_EDGE = 4.0
-"""Longest edge, in spacings, of a triangle between samples without a grid; a longer edge bridges a gap."""
+"""Longest edge, in spacings, of a triangle between samples without a grid: longer edges cross a gap."""
 SLACK = 1e-9
-"""A cell on the edge between two triangles belongs to the first; rounding must not take it from both."""
+"""Tolerance for a cell on the edge between two triangles: it belongs to the first, and rounding must not lose it."""
 
 
 @dataclass(frozen=True)
@@ -44,27 +44,28 @@ class CellGrid:
 
 @dataclass(frozen=True)
 class Raster:
-    """The samples around each cell of a grid. ``weights``: sparse (h * w, n), the part of each of n samples in the mean
-    over a cell; a row sums to 1, and is empty where less than half of the cell is covered."""
+    """The samples around each cell of a grid. ``weights``: sparse (h * w, n), the share of each of n samples in the
+    mean over a cell. A row sums to 1, and is empty if less than half of the cell is covered."""
 
     weights: Any
     shape: tuple[int, int]
 
     def at_cells(self, values: np.ndarray) -> np.ndarray:
-        """Return samples' values (n,) or (n, c) at the cells, (h, w) or (h, w, c); NaN where the cell is not known."""
+        """Return samples' values (n,) or (n, c) at the cells, (h, w) or (h, w, c); NaN where the cell is unknown."""
         found = np.asarray(self.weights @ values.astype(np.float64))
         found[self.weights.getnnz(axis=1) == 0] = np.nan
         return found.reshape(*self.shape, *values.shape[1:])
 
     @property
     def concentration(self) -> np.ndarray:
-        """Return (h, w) sum of squares of the samples' weights: independent errors shrink in variance by it."""
+        """Return the sum of squares (h, w) of the samples' weights: the factor of the variance of independent
+        errors."""
         return np.asarray(self.weights.multiply(self.weights).sum(axis=1), np.float64).reshape(self.shape)
 
 
 def raster_between(places: np.ndarray, valid: np.ndarray, organised: bool, spacing: float, grid: CellGrid) -> Raster:
-    """Place the cells of a grid among the ``valid`` of samples at ``places`` (v, u, 2), on a pixel grid or not (v = 1).
-    ``spacing`` of the samples: a cell is divided into parts that are no larger, and takes their mean."""
+    """Return the `Raster` of a grid over the ``valid`` samples at ``places`` (v, u, 2), on a pixel grid or not (v = 1).
+    Cells larger than ``spacing``, that of the samples, are divided into parts, whose mean they take."""
     parts = max(1, round(grid.step / spacing))
     step = grid.step / parts
     corner = np.array([grid.x0, grid.y0]) - 0.5 * (grid.step - step)
@@ -83,7 +84,7 @@ def raster_between(places: np.ndarray, valid: np.ndarray, organised: bool, spaci
 
 
 def _of_grid(valid: np.ndarray) -> np.ndarray:
-    """Return (t, 3) flat indices: two triangles for each four neighbours, or one if one of the four is invalid."""
+    """Return triangles (t, 3) of flat indices: two for each four neighbours, or one if one of the four is invalid."""
     index = np.arange(valid.size).reshape(valid.shape)
     a, b, c, d = (index[r, s].ravel() for r in (slice(-1), slice(1, None)) for s in (slice(-1), slice(1, None)))
     has_a, has_b, has_c, has_d = (valid.ravel()[corner] for corner in (a, b, c, d))
@@ -93,7 +94,7 @@ def _of_grid(valid: np.ndarray) -> np.ndarray:
 
 
 def _of_points(places: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Return (t, 3) indices of samples (n, 2) without a grid: Delaunay's triangles with short edges."""
+    """Return triangles (t, 3) of indices of samples (n, 2) without a grid: Delaunay triangles with short edges."""
     known = np.flatnonzero(valid)
     triangles = known[Delaunay(places[known]).simplices.astype(np.int64)]
     lengths = np.linalg.norm(places[triangles] - places[np.roll(triangles, 1, axis=1)], axis=-1)
@@ -126,7 +127,7 @@ def _fill(places: np.ndarray, triangles: np.ndarray, corners: np.ndarray, shares
 
 FIT_POINTS = 20_000
 STEEPEST = 0.1
-"""Cosine between optical axis and surface normal below which the axis does not say where the target is."""
+"""Cosine between optical axis and surface normal below which the axis does not locate the target."""
 MAX_CELLS = 1 << 24
 """Most cells of a map: those of a board of 4 m in millimetres."""
 
@@ -152,7 +153,7 @@ class ChosenView:
 
     @cached_property
     def slope_step(self) -> float:
-        """Median step of x/z and y/z from pixel to pixel; without a grid, as if the points lay on a square one."""
+        """Median step of x/z and y/z between pixels; without a grid, that of a square grid with as many points."""
         points = self.cloud.points_m
         with np.errstate(invalid="ignore"):
             slopes = np.where(self.inside[..., None], points[..., :2] / points[..., 2:], np.nan)
@@ -166,9 +167,9 @@ class ChosenView:
 
 @dataclass(frozen=True)
 class PlacedView:
-    """A view in the map's frame. ``places_m`` (h, w, 2): x, y where each pixel's ray meets the surface; ``deviation_m``
-    (h, w): how far behind (+) the surface, along z, it ends. NaN outside the target. ``pixel_m`` (2,): sides along x
-    and y of a rectangle that spreads as far as a pixel on the surface; ``pitch_m``: of the square of a pixel's area."""
+    """A view in the map's frame. ``places_m`` (h, w, 2): x, y where each pixel's ray meets the surface. ``deviation_m``
+    (h, w): how far behind (+) the surface, along z, the ray ends. NaN outside the target. ``pixel_m`` (2,): sides along
+    x and y of a rectangle that spreads as far as a pixel on the surface. ``pitch_m``: of a square with its area."""
 
     chosen: ChosenView
     T_map_view: np.ndarray
@@ -180,9 +181,9 @@ class PlacedView:
 
 def T_reference_map_of(first: ChosenView) -> np.ndarray:
     """Return the map's frame in the first view's camera frame (4, 4), from the plane through its target by least
-    absolute residuals: z away from the viewer along the plane's normal, x as near as can be to the camera's. The origin
-    stands before the place where the optical axis meets the plane, as far from it as the camera; where the axis meets
-    no target, before the target's middle."""
+    absolute residuals. z points away from the viewer along the plane's normal, x as near as possible to the camera's x.
+    The origin is in front of the point where the optical axis meets the plane, at the camera's distance; if the axis
+    meets no target, it is in front of the target's middle."""
     points = _some(first.cloud.points_m[first.inside], FIT_POINTS)
     x, y, z = points.T
     plane = fit_surface(x, y, z, SurfaceConfig(degree=1))
@@ -204,16 +205,16 @@ def _some(points: np.ndarray, number: int) -> np.ndarray:
 
 
 def common_surface(views: Sequence[ChosenView], T_reference_map: np.ndarray) -> Surface:
-    """Fit a robust cubic z(x, y) in the map's frame through all targets. Raises UserError where they give none."""
+    """Fit a robust cubic z(x, y) in the map's frame through all targets. Raises UserError if they give none."""
     points = np.concatenate([_some(view.points_reference_m, FIT_POINTS // len(views)) for view in views])
     x, y, z = transform_points(invert(T_reference_map), points).T
     return fit_surface(x, y, z, SurfaceConfig())
 
 
 def place(view: ChosenView, T_reference_map: np.ndarray, surface: Surface) -> PlacedView:
-    """Follow each pixel's ray from its point to the surface. Two steps: what is left is the square of the surface's
-    slope times the deviation (0.3 % of it at 3 degrees). Pixels are measured by medians; without a grid as if points
-    lay on a square one. A pixel is the parallelogram J of its steps, of variance (Jxu^2 + Jxv^2) / 12 along x."""
+    """Follow each pixel's ray from its point to the surface in two steps; the remaining error is the squared slope of
+    the surface times the deviation (0.3 % of it at 3 degrees). Pixel sizes are medians; without a grid, points count as
+    if on a square grid. A pixel is the parallelogram J of its steps, of variance (Jxu^2 + Jxv^2) / 12 along x."""
     T_map_view = invert(T_reference_map) @ view.registration.T_reference_view
     inside = view.inside
     points = transform_points(T_map_view, view.cloud.points_m[inside])
@@ -239,7 +240,7 @@ def place(view: ChosenView, T_reference_map: np.ndarray, surface: Surface) -> Pl
 
 
 def grid_over(views: Sequence[PlacedView], cell_m: float | None) -> CellGrid:
-    """Lay cells over all that any view sees, at whole multiples of the cell (none: the first view's pitch)."""
+    """Return cells over all that any view sees, at whole multiples of the cell (None: the first view's pitch)."""
     step = cell_m if cell_m is not None else views[0].pitch_m
     low = np.min([np.nanmin(view.places_m, axis=(0, 1)) for view in views], axis=0)
     high = np.max([np.nanmax(view.places_m, axis=(0, 1)) for view in views], axis=0)

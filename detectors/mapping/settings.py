@@ -13,7 +13,7 @@ from harness.vocabulary.config import Config
 
 
 class GridMerge(Config):
-    """The thesis' merge (MATLAB's pcmerge): the mean of all points in each cube of a grid, first view's frame."""
+    """The thesis' merge (MATLAB's pcmerge): the mean of all points in each cube of a grid in the first view's frame."""
 
     kind: Literal["grid"] = "grid"
     step_mm: float = Field(default=0.1, gt=0, le=50, description="side of a cube")
@@ -40,7 +40,7 @@ AnyMerge = GridMerge | FusedMerge | VolumeMerge
 class MappingConfig(Config):
     """Settings of crop (in each view's own frame), marks, registration and merge."""
 
-    views: int | None = Field(default=None, ge=1, le=1000, description="uses the first so many; null: all")
+    views: int | None = Field(default=None, ge=1, le=1000, description="number of views to use; null: all")
     crop: CropConfig = Field(default_factory=AutoCrop)
     marks: MarksConfig = Field(default_factory=ColourMarks)
     registration: RegistrationConfig = Field(default_factory=lambda: PlainRegistration(method="marks"))

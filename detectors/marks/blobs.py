@@ -1,8 +1,8 @@
-"""Groups of pixels whose colour differs from the target's own: candidates for marks, with their rims.
+"""Groups of pixels whose colour differs from the target's own colour: candidates for marks, with their rims.
 
-A smooth polynomial fitted over the target removes light of uneven colour. The scatter of the remainder (minimum
-covariance determinant, Rousseeuw 1985) measures how far the target's own colour varies; the threshold is extrapolated
-from its tail to a given rate of false pixels. Marks may cover a quarter of the target. Not modelled: hard shadows."""
+A smooth polynomial fitted over the target removes uneven light. The scatter of the remainder (minimum covariance
+determinant, Rousseeuw 1985) measures the variation of the target's own colour; the threshold is extrapolated from its
+tail to a given rate of false pixels. Marks may cover a quarter of the target. Not modelled: hard shadows."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from detectors.surface import SurfaceConfig, fit_surface
 from harness.vocabulary.geometry import Cloud
 
 FALSE_RATE = 1e-5
-"""Share of the target's own pixels that the extrapolated tail puts beyond the threshold. Real tails put ten (Gauss) to
-a hundred (Laplace) times as many there; they form no mark, because a mark has nine pixels that touch."""
+"""Share of the target's own pixels beyond the threshold by the extrapolated tail. Real tails have ten (Gauss) to a
+hundred (Laplace) times as many, which form no mark, because a mark has nine pixels that touch."""
 DEGREE = 2
 """Degree of the polynomial: the light of one lamp, or of two lamps of different colour, bends once over a board."""
 SAMPLE, STEPS, CORE = 4096, 6, 0.6
@@ -29,36 +29,36 @@ CORE_SHRINKS = {1: 0.2146, 2: 0.3891}
 GAUSSIAN_LIMITS = {1: 4.4172, 2: 4.7985}
 """Distances that a share `FALSE_RATE` of a Gaussian exceeds, in one and two dimensions."""
 NEARBY_PX = 16
-"""Distance over which a camera smears colour: JPEG keeps one for two by two pixels, in blocks of eight of these."""
+"""Distance over which a camera smears colour: JPEG stores one value for two by two pixels, in blocks of eight."""
 TAIL = (0.4, 0.7)
 """Quantiles from which the tail is extrapolated; pixels above them may belong to marks."""
 
 
 def chromaticity(rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return shares (n, 2) of red and of blue in the sum of the channels, and the variance (n,) that rounding to whole
-    counts gives each of them, of colours (n, 3) uint8. Half a count is added, so that black has a share."""
+    """Return the shares (n, 2) of red and blue in the sum of the channels of colours (n, 3) uint8, and the variance
+    (n,) of each from rounding to whole counts. Half a count is added, so that black has a share."""
     counts = rgb.astype(np.float64) + 0.5
     total = counts.sum(axis=1)
     return counts[:, [0, 2]] / total[:, None], 1.0 / 12.0 / total**2
 
 
 def lightness(rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the logarithm (n, 1) of the mean of the channels and the variance (n,) that rounding gives it."""
+    """Return the logarithm (n, 1) of the mean of the channels, and its variance (n,) from rounding."""
     mean = rgb.astype(np.float64).mean(axis=1) + 0.5
     return np.log(mean)[:, None], 1.0 / 36.0 / mean**2
 
 
 def stand_out(features: np.ndarray, rounding: np.ndarray, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distance of pixels from the target's own colour (n,): in deviations of its scatter (the contrast), and
-    in units of the threshold (the margin). ``features`` (n, p), p 1 or 2; ``rounding`` (n,): their variance from whole
-    counts, in proportion to which all noise is taken to grow. ``xy`` (n, 2): any smooth co-ordinates."""
+    """Return the distance (n,) of pixels from the target's own colour: in deviations of its scatter (the contrast), and
+    in units of the threshold (the margin). ``features`` (n, p), p 1 or 2. ``rounding`` (n,): their variance from whole
+    counts; all noise is assumed to grow in proportion to it. ``xy`` (n, 2): any smooth co-ordinates."""
     stride = max(1, len(features) // SAMPLE)
     (x, y), (some_x, some_y) = xy.T, xy[::stride].T
     smooth = SurfaceConfig(degree=DEGREE, method="lts")  # marks may cover a quarter, all at one end
     offset = np.stack([f - fit_surface(some_x, some_y, f[::stride], smooth).evaluate(x, y) for f in features.T], axis=1)
     darkness = np.sqrt(np.maximum(rounding / np.median(rounding), 1.0))
     apart, p = (offset / darkness[:, None])[::stride], features.shape[1]
-    # the covariance (p, p) of the bulk about the backdrop, scaled as the innermost part of a Gaussian
+    # covariance (p, p) of the bulk about the backdrop, scaled like the innermost part of a Gaussian
     scatter = np.diag([max(sigma_of(each), 1e-6) ** 2 for each in apart.T])
     for _ in range(STEPS):
         square = np.einsum("ni,ij,nj->n", apart, np.linalg.inv(scatter), apart)
@@ -77,39 +77,39 @@ def stand_out(features: np.ndarray, rounding: np.ndarray, xy: np.ndarray) -> tup
 
 
 def above_half(chosen: np.ndarray, contrast: np.ndarray) -> np.ndarray:
-    """Return (h, w) bool: those of the ``chosen`` pixels whose contrast exceeds half of the greatest nearby (of medians
-    of 3 x 3), so that a group ends half way along its edge."""
+    """Return (h, w) bool: those ``chosen`` pixels whose contrast exceeds half of the largest nearby (of medians of 3 x
+    3), so that a group ends half way along its edge."""
     beyond = np.where(chosen, contrast, 0.0).astype(np.float32)
     greatest = cv2.dilate(cv2.medianBlur(beyond, 3), np.ones((2 * NEARBY_PX + 1,) * 2, np.uint8))
     return np.asarray(chosen & (beyond > 0.5 * greatest))
 
 
 LEAST_PIXELS, MOST_BLOBS = 9, 200
-"""Least number of pixels of a mark, three by three (fewer have no inside), and the most groups that are examined."""
+"""Fewest pixels of a mark, three by three (fewer have no inside), and the most groups that are examined."""
 RIM_PX, RING_PX = 2, 8
-"""Width of the band about a group that is searched for a mixed rim, and of the band taken as its surroundings."""
+"""Width of the band around a group that is searched for a mixed rim, and of the band for its surroundings."""
 MIXED_SHARE = 0.15
-"""Share of the rim, two pixels wide, that lies between 0.2 and 0.8 of the way from one colour to the other: it is 0.6 /
-2 where a colour is the mean over the pixel's area, and 0 where it is the colour at the pixel's centre."""
+"""Share of the rim, two pixels wide, with colours between 0.2 and 0.8 of the way from one colour to the other: 0.6 / 2
+if a colour is the mean over the pixel's area, and 0 if it is the colour at the pixel's centre."""
 SHARE_SIGMA = 0.1
 """Standard deviation of a rim pixel's share of area: the camera's transfer curve and the lens's blur are unknown."""
 ALIKE = 0.35
-"""A pixel has a blob's colour if its distance to that is below this part of its distance to the surroundings'."""
+"""A pixel has a blob's colour if its distance to it is below this share of its distance to the surroundings' colour."""
 CUT_SHARE = 0.05
-"""If more than this share of the pixels around a blob have its colour but lie off the target, the blob goes on."""
+"""A blob continues beyond the target if more than this share of the pixels around it have its colour but lie off it."""
 SHIFTS = 12  # shifts of the lattice along each axis, over which the error of a centroid is averaged
 RECTANGULAR = 0.85
-"""Least share of its smallest enclosing rectangle that a rectangle's pixels fill; those of an ellipse fill 0.79."""
+"""Least share of the smallest enclosing rectangle that a rectangle's pixels fill; those of an ellipse fill 0.79."""
 SIZES, TURNS = 5, np.array([-1.0, 0.0, 1.0]) / 3
-"""Number of outlines between one pixel and the next, over width and height; their turns, in pixels over the length."""
+"""Number of outlines between one pixel and the next, in width and height; rotations, in pixels over the length."""
 
 
 @dataclass(frozen=True)
 class Blob:
-    """``pixels`` (n,) flat indices and ``weights`` (n,) how much of the blob's colour they have, 0..1. ``grid`` (n, 2)
-    their places on a grid of unit step, with ``grid_covariance`` (2, 2) of the centroid there. ``surroundings`` (m,)
-    flat indices of the target's points on and about it. ``contrast`` (3,): logarithm of its colour over that of its
-    surroundings, channel by channel, in which the light cancels. ``doubt``: that it is cut, empty if not."""
+    """``pixels`` (n,): flat indices. ``weights`` (n,): their share of the blob's colour, 0..1. ``grid`` (n, 2): their
+    places on a grid of unit step. ``grid_covariance`` (2, 2): of the centroid there. ``surroundings`` (m,): flat
+    indices of the target's points on and around it. ``contrast`` (3,): logarithm of its colour over that of its
+    surroundings by channel, in which the light cancels. ``doubt``: that it is cut, else empty."""
 
     pixels: np.ndarray
     weights: np.ndarray
@@ -121,8 +121,8 @@ class Blob:
 
 
 def find_blobs(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray) -> list[Blob]:
-    """Find the connected groups of ``coloured`` (h, w) pixels, the largest first; single missing pixels do not part
-    them. Whether a rim's colours are mixtures is a property of the camera, so it is decided for all groups together."""
+    """Return the connected groups of ``coloured`` (h, w) pixels, largest first; single missing pixels do not separate
+    them. Whether rims have mixed colours is a property of the camera, so it is decided for all groups together."""
     closed = cv2.morphologyEx(coloured.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     _, labels, boxes, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
     order = 1 + np.argsort(-boxes[1:, cv2.CC_STAT_AREA], kind="stable")[:MOST_BLOBS]
@@ -131,7 +131,7 @@ def find_blobs(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray) -> list[B
     rims = np.concatenate([np.zeros(0), *(rim for rim, _ in windows)])
     mixed = len(rims) > 0 and bool(np.mean((rims > 0.2) & (rims < 0.8)) >= MIXED_SHARE)
     blobs = [blob for _, settled in windows if (blob := settled(mixed)) is not None]
-    # those that share pixels with a larger one are parts of it
+    # a blob that shares pixels with a larger one is part of it
     taken = np.zeros(inside.size, dtype=bool)
     kept = []
     for blob in sorted(blobs, key=lambda b: -float(b.weights.sum())):
@@ -145,7 +145,7 @@ def find_blobs(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray) -> list[B
 def _window(
     cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, labels: np.ndarray, label: int, box: np.ndarray
 ) -> tuple[np.ndarray, Callable[[bool], Blob | None]]:
-    """Compute the shares (n,) of the way from the surroundings' colour (0) to the group's (1) on either side of its
+    """Return the shares (n,) of the way from the surroundings' colour (0) to the group's (1) on both sides of its
     border, and a function that makes a blob of the group once it is known whether rims are mixed."""
     left, top, width, height, area = (int(value) for value in box)
     margin = max(RING_PX + 2, round(0.5 * np.sqrt(area)))
@@ -157,21 +157,21 @@ def _window(
     core = _eroded(group)
     core = core if core.sum() >= LEAST_PIXELS else group
     ring = grown(group, RING_PX) & ~grown(group, RIM_PX + 2) & target & ~others
-    if ring.sum() < LEAST_PIXELS:  # none of the target's own colour is visible around it
+    if ring.sum() < LEAST_PIXELS:  # the target's own colour is not visible around it
         return np.zeros(0), lambda mixed: None
     rgb = _evenly_lit(cloud.rgb[cut].astype(float), ring, group)
     other = np.median(rgb[ring], axis=0)
     span = np.median(rgb[core], axis=0) - other
     share = (rgb - other) @ span / max(float(span @ span), 1e-12)
-    # neighbours share their colour in a camera's mosaic and in JPEG: independent pixels that would average alike
+    # mosaic and JPEG make neighbours share colour: the scatter of equivalent independent pixels
     strays = float(np.sqrt(max(np.mean(share[ring] ** 2), 25.0 * np.mean(cv2.blur(share, (5, 5))[ring] ** 2))))
-    # the threshold that found the group knows the target's colour only, and leaves gaps at low contrast: take the
+    # the threshold that found the group only knows the target's colour and leaves gaps at low contrast: take the
     # connected pixels nearer to the group's colour, as far as the surroundings reach
     group = parts_with((share > 0.5) & target & grown(group, RING_PX), group)
     rim = grown(group, 1) & ~_eroded(group) & target
 
     def settled(mixed: bool) -> Blob | None:
-        """Weigh each pixel by its share of the group's colour if rims are mixed, else by 1; None for too few pixels."""
+        """Return the blob, pixels weighted by their share of the group's colour if rims are mixed; None if too few."""
         weights = group.astype(float)
         if mixed:
             near = grown(group, RIM_PX) & target & ~(others & ~group)
@@ -179,7 +179,7 @@ def _window(
         v, u = np.nonzero((weights > 0.5) & target)
         if len(u) < LEAST_PIXELS or min(np.ptp(u), np.ptp(v)) < 1:
             return None
-        # the reason why the group may continue where the target has no points
+        # whether the group may continue where the target has no points
         around = grown(group, 1) & ~group
         alike = np.linalg.norm(rgb - other - span, axis=-1) < ALIKE * np.linalg.norm(span)
         on = around & alike & ~target
@@ -193,7 +193,7 @@ def _window(
         used_v, used_u = np.nonzero((weights > 0) & target)
         grid = np.stack([used_u, used_v], axis=1).astype(float)
         if mixed:
-            # the weights of the rim are wrong by `SHARE_SIGMA`, and by the scatter of the surroundings' colours
+            # the rim's weights err by `SHARE_SIGMA` and by the scatter of the surroundings' colours
             arm = np.argwhere(rim)[:, ::-1] - np.argwhere(group)[:, ::-1].mean(axis=0)
             covariance = (SHARE_SIGMA**2 + strays**2) * arm.T @ arm / max(float(weights.sum()), 1.0) ** 2
         else:
@@ -207,8 +207,8 @@ def _window(
 
 
 def _evenly_lit(rgb: np.ndarray, ring: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Return colours (h, w, 3) as if the light at the group's middle fell everywhere: each channel over a plane fitted
-    to the ring. Otherwise light that falls off along a group would weigh its two ends differently."""
+    """Return colours (h, w, 3) as if the light at the group's middle fell everywhere: each channel is divided by a
+    plane fitted to the ring. Otherwise uneven light along a group would weight its two ends differently."""
     v, u = np.mgrid[0 : rgb.shape[0], 0 : rgb.shape[1]]
     middle_v, middle_u = (float(axis[group].mean()) for axis in (v, u))
     basis = np.stack([np.ones(rgb.shape[:2]), (u - middle_u) / rgb.shape[1], (v - middle_v) / rgb.shape[0]], axis=-1)
@@ -241,19 +241,19 @@ def centroid_covariance_px2(polygon_px: np.ndarray) -> np.ndarray:
 
 
 def region_covariance_px2(pixels: np.ndarray) -> np.ndarray:
-    """Return the covariance (2, 2) of the centroid of a region known by its pixel positions (m, 2) alone, which are on
-    no line. Their convex outline represents it, or their smallest rectangle if they fill that. Its size and slope
-    are known to part of a pixel, and decide whether the errors of opposite edges add or cancel: the covariance is the
-    mean over outlines up to a pixel larger and turned by up to that."""
+    """Return the covariance (2, 2) of the centroid of a region known only by its pixel positions (m, 2), not all on a
+    line. It is represented by its convex outline, or by its smallest rectangle if it fills that. Its size and slope are
+    known to a part of a pixel and decide whether errors of opposite edges add or cancel, so the covariance is the mean
+    over outlines up to a pixel larger and rotated by up to a pixel."""
     hull = cv2.convexHull(pixels.astype(np.float32))
     box_middle, size, angle = cv2.minAreaRect(hull)
-    # the outermost centres lie half a pixel within the region
+    # the outermost pixel centres lie half a pixel inside the region
     if len(pixels) > RECTANGULAR * (size[0] + 1) * (size[1] + 1):
         outline = cv2.boxPoints((box_middle, (size[0] + 1, size[1] + 1), angle)).astype(np.float64)
     else:
         outline = hull[:, 0].astype(np.float64)
     area, centre = _area_and_centre(outline)
-    # with as large an area as the pixels have
+    # with the same area as the pixels
     outline = centre + (outline - centre) * np.sqrt(len(pixels) / abs(float(area)))
     extent = np.ptp(outline, axis=0)
     middle = (outline.max(axis=0) + outline.min(axis=0)) / 2

@@ -1,9 +1,9 @@
-"""The marks of one view: coloured spots or codes (OpenCV's) that are found, judged and, if need be, put in doubt.
+"""Finds and judges the marks of one view: coloured spots, or codes (OpenCV's); unreliable marks are in doubt.
 
-The slope of a mark's plane is fitted to the mark and its surroundings, but the offset to the mark alone, because a mark
-may be thick or ranged differently. Its centroid is the mean of the pixels' rays cut by this plane, weighted by the
-surface that they cover and by their colour. Spots behind the surface are holes. Not modelled: a surface or tag that
-bends within the mark; a lens whose distortion is more than quadratic over one tag."""
+The slope of a mark's plane is fitted to the mark and its surroundings, but the offset only to the mark, because a mark
+may be thick or have a range error of its own. Its centroid is the mean of the points where the pixels' rays meet this
+plane, weighted by the surface that they cover and by their colour. Spots behind the surface are holes. Not modelled: a
+surface or tag that bends within the mark; a lens whose distortion is more than quadratic over one tag."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Patch:
         return np.asarray(steep / np.linalg.norm(steep))
 
     def above_m(self, points_m: np.ndarray) -> np.ndarray:
-        """Return z of points (n, 3) less the plane's: positive behind it."""
+        """Return z of points (n, 3) minus the plane's z: positive behind it."""
         x, y, z = points_m.T
         return np.asarray(z - self.slope_x * x - self.slope_y * y - self.offset_m)
 
@@ -54,8 +54,8 @@ class Patch:
         return np.asarray(points_m * scale[:, None])
 
     def range_covariance_m2(self, centre_m: np.ndarray, cloud: Cloud, pixels: np.ndarray) -> np.ndarray:
-        """Return the covariance (3, 3) of a centre (3,) on the plane by its pixels' mean z (n,): from scatter about the
-        plane, the frames' noise or a map's variance, whichever is largest; `CORRELATED_PIXELS` share it."""
+        """Return the covariance (3, 3) of a centre (3,) on the plane from its pixels' mean z (n,): from the largest of
+        scatter about the plane, the frames' noise and a map's variance; `CORRELATED_PIXELS` share it."""
         frames = cloud.variance_m2.ravel()[pixels] / np.maximum(cloud.count.ravel()[pixels], 1)
         known = frames[np.isfinite(frames)]
         variance = max(self.sigma_m**2, float(known.mean()) if len(known) else 0.0)
@@ -63,7 +63,7 @@ class Patch:
             stated = cloud.mean_variance_m2.ravel()[pixels]
             variance = max(variance, float(np.nanmean(stated)) if np.isfinite(stated).any() else 0.0)
         ray = centre_m / centre_m[2] if cloud.projection == "central" else np.array([0.0, 0.0, 1.0])
-        # a plane shifted along z by d is met further along the ray by d n_z / n.ray of it
+        # if the plane is shifted along z by d, a ray meets it d n_z / n.ray farther along
         along = ray * self.normal[2] / (self.normal @ ray)
         return np.asarray(variance * min(1.0, CORRELATED_PIXELS / len(pixels)) * np.outer(along, along))
 
@@ -71,8 +71,8 @@ class Patch:
 @dataclass(frozen=True)
 class Spot:
     """The place of a blob: ``centre_m`` (3,) with ``covariance_m2`` (3, 3), ``area_m2``, ``pitch_m`` between pixels,
-    and ``behind_m``: how far it lies behind its surroundings, with its standard deviation. ``sizes_m`` (3,): sides of
-    the rectangle with its second moments, and the mean breadth over the length, which gaps lessen."""
+    and ``behind_m``: its distance behind its surroundings, with standard deviation. ``sizes_m`` (3,): sides of the
+    rectangle with its second moments, and the mean breadth over the length, which gaps reduce."""
 
     blob: Blob
     centre_m: np.ndarray
@@ -91,14 +91,14 @@ class Spot:
 
 
 def fit_patch(points_m: np.ndarray) -> Patch | None:
-    """Fit the plane of at least two thirds of points (n, 3); return None where they are too few or lie on a line."""
+    """Fit the plane of at least two thirds of points (n, 3); None if they are too few or lie on a line."""
     x, y, z = points_m[:: max(1, len(points_m) // PATCH_POINTS)].T
     try:
         plane = fit_surface(x, y, z, SurfaceConfig(degree=1))
     except UserError:
         return None
     level, at_x, at_y = plane.evaluate(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])).tolist()
-    # points off the plane on one side only have shifted it, but not turned it
+    # points off the plane on only one side have shifted it, but not rotated it
     off = z - plane.evaluate(x, y)
     off = off[np.abs(off - median_of(off)) <= 3.0 * max(sigma_of(off - median_of(off)), LEAST_SCALE_M)]
     return Patch(at_x - level, at_y - level, level + float(off.mean()), max(float(off.std()), LEAST_SCALE_M))
@@ -124,7 +124,7 @@ def place_spot(cloud: Cloud, blob: Blob, patch: Patch) -> Spot:
     scatter = np.cov((on_plane - centre).T, aweights=covers, ddof=0)
     _, minor, major = np.sqrt(12.0 * np.maximum(np.linalg.eigvalsh(scatter), 0.0))
     pixel_area = float(np.linalg.norm(np.cross(jacobian[:, 0], jacobian[:, 1])))
-    # the scatter of a flat mark: a hole's own depths differ, and must not hide that it is one
+    # the scatter of a flat mark: the different depths in a hole must not hide that it is a hole
     behind_sigma = patch.sigma_m * float(np.sqrt(2.0 * min(1.0, CORRELATED_PIXELS / len(pixels))))
     area, pitch = pixel_area * float(weights.sum()), float(np.sqrt(pixel_area))
     covariance, sizes = (covariance + covariance.T) / 2, np.array([major, minor, area / major])
@@ -134,7 +134,7 @@ def place_spot(cloud: Cloud, blob: Blob, patch: Patch) -> Spot:
 CORNER_PX = 0.25
 """Standard deviation of a refined corner per axis: 0.18 on drawn sharp tags of 40 pixels, 0.34 with a blur of 1.5."""
 LEAST_SEEN, WHOLE = 0.5, 0.95
-"""Least share of a tag's pixels on the target for a tag of the target, and for a tag that is not in doubt."""
+"""Least share of a tag's pixels on the target for a tag of the target, and for a tag without doubt."""
 HALF_STEPS = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
 
 
@@ -159,7 +159,7 @@ def coded_marks(cloud: Cloud, inside: np.ndarray, dictionary: str) -> MarkSet:
 
 
 def _coded_mark(cloud: Cloud, inside: np.ndarray, code: int, corners: np.ndarray, twice: bool) -> Mark | None:
-    """Return the tag as a mark; None where it lies off the target or has no range."""
+    """Return the tag as a mark; None if it lies off the target or has no range."""
     area = np.zeros(inside.shape, dtype=np.uint8)
     cv2.fillConvexPoly(area, np.rint(corners).astype(np.int32), 1)
     pixels = np.flatnonzero((area > 0) & inside)
@@ -182,9 +182,9 @@ def _coded_mark(cloud: Cloud, inside: np.ndarray, code: int, corners: np.ndarray
     if twice:
         doubt = f"code {code} is seen more than once"
     elif seen < WHOLE and without > 1.0 - WHOLE:
-        doubt = f"without range in {100 * without:.0f} % of it"
+        doubt = f"{100 * without:.0f} % of it has no range"
     elif seen < WHOLE:
-        doubt = f"{100 * (1 - seen):.0f} % of it beyond the crop's edge"
+        doubt = f"{100 * (1 - seen):.0f} % of it is beyond the crop's edge"
     area_m2 = float(np.linalg.norm(np.cross(places[2] - places[0], places[3] - places[1]))) / 2
     return Mark(centre, (covariance + covariance.T) / 2, patch.normal, pixels, area_m2, code, doubt)
 
@@ -195,25 +195,25 @@ def _quadratic(uv: np.ndarray) -> np.ndarray:
 
 
 CLEAR_MARGIN = 2.0
-"""If the marks' pixels pass the threshold by this factor, their outlines are whole; else lightness is tried."""
+"""If the marks' pixels exceed the threshold by this factor, their outlines are whole; else lightness is tried."""
 LEAST_TARGET = 100
 BEHIND_M = 2.0 * MM
 """A mark may seem to lie this far behind its surroundings: cameras range dark and bright surfaces differently."""
 BEHIND_SIGMAS = 5.0
 RAISED_SHARE = 0.25
-"""Largest height of a mark above its surroundings, as a share of its breadth: allows a tag on board, but no object."""
+"""Largest height of a mark above its surroundings, as a share of its breadth: allows a tag on board, no object."""
 SAME_COLOUR = 0.35
-"""Two spots have the same colour if their contrasts to their surroundings differ by less than this fraction of them."""
+"""Two spots have the same colour if their contrasts to their surroundings differ by less than this share of them."""
 WEAK_SHARE = 1 / 3
-"""Share of the strongest colour's contrast to its surroundings; weaker spots beside such marks are stains."""
+"""Share of the strongest colour's contrast to its surroundings; beside such marks, weaker spots are stains."""
 UNLIKE_SHARE, UNLIKE_PIXELS = 0.3, 1.5
-"""A mark is unlike the others if its sizes are off their median by more than this fraction and these pixels."""
+"""A mark is unlike the others if its sizes differ from their median by more than this share and this many pixels."""
 LARGEST_SHARE = 0.15
-"""Share of the target; a larger spot is a part of the target that has another colour."""
+"""Share of the target; a larger spot is a part of the target with another colour."""
 
 
 def find_marks(cloud: Cloud, inside: np.ndarray, config: RedMarks | ColourMarks | CodedMarks) -> MarkSet:
-    """Find the marks among the pixels ``inside`` (h, w) bool of a cloud with colour. No picture makes it raise: a set
+    """Find the marks among the pixels ``inside`` (h, w) bool of a cloud with colour. It raises for no picture; a set
     that cannot support a registration says so in its ``problem``."""
     none = MarkSet((), np.zeros(0, dtype=np.int64))
     if cloud.rgb is None:
@@ -236,8 +236,8 @@ def find_marks(cloud: Cloud, inside: np.ndarray, config: RedMarks | ColourMarks 
         if not cloud.organised:
             return MarkSet((), np.flatnonzero(coloured), "marks need a pixel grid, which this cloud does not have")
         return _marks(cloud, inside, coloured, "" if coloured.any() else missing)
-    # lightness is tried where chromaticity gives too few marks or hardly any contrast: black and white have the light's
-    # own chromaticity, and black hardly any
+    # lightness is tried if chromaticity gives too few marks or hardly any contrast: black and white have the light's
+    # chromaticity, and black hardly any
     found, margin = _standing_out(cloud, inside, chromaticity)
     if len(found.trusted) >= LEAST_MARKS and margin >= CLEAR_MARGIN:
         return found
@@ -284,7 +284,7 @@ def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str)
             colours.append([spot])
     groups = []
     for colour in colours:
-        # where most of a colour's area lies behind, holes too small to look deep share the colour of those that do
+        # if most of a colour's area lies behind, its flat-looking spots are holes too small to look deep
         flat = [s for s in colour if not s.is_hole]
         if flat and 2.0 * sum(s.area_m2 for s in colour if s.is_hole) <= sum(s.area_m2 for s in colour):
             whole, usual_m = [s for s in flat if not s.blob.doubt], None
@@ -298,7 +298,7 @@ def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str)
     for vivid, found in groups:
         doubt = ""
         if vivid < WEAK_SHARE * max(enough, default=0.0):
-            doubt = "its colour contrast is weak beside that of the others"
+            doubt = "its colour contrast is weak compared with the others"
         elif enough and sum(not mark.doubt for mark in found) < LEAST_MARKS:
             doubt = f"fewer than {LEAST_MARKS} marks have its colour; enough have another"
         marks += [replace(mark, doubt=mark.doubt or doubt) for mark in found]
@@ -309,7 +309,7 @@ def _marks(cloud: Cloud, inside: np.ndarray, coloured: np.ndarray, missing: str)
 
 
 def _mark(spot: Spot, usual_m: np.ndarray | None, n_target: int) -> Mark:
-    """Return the spot as a mark, with its doubt; ``usual_m`` (3,): the usual sizes; ``n_target``: pixels of target."""
+    """Return the spot as a mark, with its doubt. ``usual_m`` (3,): usual sizes. ``n_target``: the target's pixels."""
     doubt, sizes_m = spot.blob.doubt, spot.sizes_m
     pixels = spot.blob.pixels[spot.blob.weights > 0.5]
     if doubt:

@@ -14,19 +14,19 @@ from harness.vocabulary.geometry import MM
 
 LEAST_MARKS = 3
 OFF_LINE_SIGMAS, OFF_LINE_SHARE = 5.0, 0.02
-"""Marks count as lying on a line if their root mean square distance from it is less than so many standard deviations of
-a mark's position, or than this share of their spread along it: there, a millimetre of error at a mark becomes 50 mm."""
+"""Marks count as lying on a line if their root mean square distance from it is below this many standard deviations of a
+mark's position, or below this share of their spread along it: there, a millimetre of error at a mark becomes 50 mm."""
 
 
 class RedMarks(Config):
-    """The thesis' rule: pixels whose red exceeds the cropped cloud's mean by so many standard ``deviations``."""
+    """The thesis' rule: pixels whose red exceeds the cropped cloud's mean by this many standard ``deviations``."""
 
     kind: Literal["red"] = "red"
     deviations: float = Field(default=2.6, gt=0, le=20)
 
 
 class ColourMarks(Config):
-    """Pixels whose chromaticity differs from the target's own, or whose lightness does if that gives too few marks."""
+    """Pixels whose chromaticity, or, if that gives too few marks, whose lightness differs from the target's own."""
 
     kind: Literal["colour"] = "colour"
 
@@ -56,7 +56,7 @@ class Mark:
     """One mark in one view, camera frame, metres. ``centre_m`` (3,): its centroid on the surface. ``covariance_m2`` (3,
     3): of the centroid, without errors that all pixels of the mark share (a range offset, lens distortion). ``normal``
     (3,): of the surface there, towards the camera. ``pixels`` (n,): flat indices into the cloud's grid. ``area_m2``: on
-    the surface. ``code``: None for a piece of tape. ``doubt``: why not to rely on it."""
+    the surface. ``code``: None for a piece of tape. ``doubt``: why it is unreliable."""
 
     centre_m: np.ndarray
     covariance_m2: np.ndarray
@@ -69,8 +69,8 @@ class Mark:
 
 @dataclass(frozen=True)
 class MarkSet:
-    """All marks of one view. ``points`` (n,): flat indices of every pixel of the fiducial colour within the crop, the
-    thesis' fiducial cloud. ``problem``: why no registration can rest on these marks, with what is missing."""
+    """All marks of one view. ``points`` (n,): flat indices of all pixels of the fiducial colour in the crop, the
+    thesis' fiducial cloud. ``problem``: why these marks do not suffice for a registration, with what is missing."""
 
     marks: tuple[Mark, ...]
     points: np.ndarray
@@ -84,7 +84,7 @@ class MarkSet:
 
 
 def problem_of(marks: Sequence[Mark], missing: str = "") -> str:
-    """Return why no registration can rest on these marks; empty where one can. ``missing``: why there are not more."""
+    """Return why these marks do not suffice for a registration, else "". ``missing``: why there are not more."""
     trusted = [mark for mark in marks if not mark.doubt]
     if len(trusted) >= LEAST_MARKS:
         return off_line_problem(trusted)
@@ -95,7 +95,7 @@ def problem_of(marks: Sequence[Mark], missing: str = "") -> str:
 
 
 def off_line_problem(marks: Sequence[Mark]) -> str:
-    """Return a sentence, with their distance from the line, if the marks lie on a line; empty otherwise."""
+    """Return a sentence, with the distance from the line, if the marks lie on a line; else ""."""
     places = np.stack([mark.centre_m for mark in marks])
     sizes = np.linalg.svd(places - places.mean(axis=0), compute_uv=False) / np.sqrt(len(marks))
     error = float(np.sqrt(np.mean([np.linalg.eigvalsh(mark.covariance_m2)[-1] for mark in marks])))

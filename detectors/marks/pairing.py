@@ -1,12 +1,12 @@
-"""Matches of the marks of two views, by code or by the distances between marks; and the transform between them.
+"""Matches the marks of two views, by code or by the distances between marks, and finds the transform between them.
 
-Two marks and their normals fix a placement (Grimson and Lozano-Perez 1987, without the tree): each ordered pair of
-marks of the larger set that is as far apart as a pair of the smaller set is a hypothesis, and each further mark counts
-for it whose distances to both fit. More than half of the smaller set must agree. The normals face the camera on both
-sides, so a mirror image is no solution.
+Two marks and their normals fix a placement (Grimson and Lozano-Perez 1987, without the tree). A hypothesis is an
+ordered pair of marks of the larger set with the distance of a pair of the smaller set; further marks support it if
+their distances to both fit. More than half of the smaller set must agree. Normals face the camera, so a mirror image is
+not a solution.
 
-Kabsch's closed form (1976; Umeyama 1991 for the sign) starts the rigid transform; Gauss-Newton on the full covariances
-gives the most probable one, and its covariance. Not modelled: marks that are seen twice, or moved between the views;
+Kabsch's closed form (1976; Umeyama 1991 for the sign) gives the start; Gauss-Newton with the full covariances gives the
+most probable rigid transform and its covariance. Not modelled: marks that are seen twice, or moved between the views;
 errors that the points of one set share."""
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from harness.vocabulary.geometry import MM, invert, transform_points
 
 MAX_STEPS = 20
 SMALL_STEP_M = 1e-10
-"""Gauss-Newton, which converges within three to five steps, stops where no point moves by more."""
+"""Gauss-Newton, which converges within three to five steps, stops when no point moves by more."""
 
 
 @dataclass(frozen=True)
 class Placement:
-    """``T_to_from`` (4, 4) rigid. ``covariance`` (6, 6) of a small error (w, t): a point p of the target frame is
-    wrong by w x (p - ``centre_m``) + t. ``residuals_m`` (n, 3): mapped points less their partners; ``chi2`` their sum
-    of squares in units of the covariances, of 3 n - 6 degrees of freedom."""
+    """``T_to_from`` (4, 4): rigid. ``covariance`` (6, 6): of a small error (w, t), by which a point p of the target
+    frame is off by w x (p - ``centre_m``) + t. ``residuals_m`` (n, 3): mapped points minus their partners. ``chi2``:
+    their sum of squares in units of the covariances, with 3 n - 6 degrees of freedom."""
 
     T_to_from: np.ndarray
     covariance: np.ndarray
@@ -42,8 +42,8 @@ class Placement:
 
 
 def kabsch(from_m: np.ndarray, to_m: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return least-squares rigid transforms (..., 4, 4), proper, of points (..., n, 3) onto (..., n, 3), with
-    ``weights`` (..., n) of 0 or more. Points on a line leave the turn about it undetermined, and any is given."""
+    """Return the proper least-squares rigid transforms (..., 4, 4) of points (..., n, 3) onto (..., n, 3), with
+    ``weights`` (..., n) of 0 or more. The rotation of points on a line about it is undetermined and arbitrary."""
     share = (weights / weights.sum(axis=-1, keepdims=True))[..., None]
     from_centre, to_centre = (share * from_m).sum(axis=-2), (share * to_m).sum(axis=-2)
     spread = np.swapaxes(share * (from_m - from_centre[..., None, :]), -1, -2) @ (to_m - to_centre[..., None, :])
@@ -59,7 +59,7 @@ def kabsch(from_m: np.ndarray, to_m: np.ndarray, weights: np.ndarray) -> np.ndar
 
 def place(from_m: np.ndarray, from_spread_m2: np.ndarray, to_m: np.ndarray, to_spread_m2: np.ndarray) -> Placement:
     """Find the most probable rigid transform of points (n, 3) onto (n, 3) with covariances (n, 3, 3), n >= 3. Raises
-    numpy.linalg.LinAlgError where the points leave it undetermined (two, or all on a line)."""
+    numpy.linalg.LinAlgError if the points leave it undetermined (two, or all on a line)."""
 
     def state(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         spread = to_spread_m2 + T[:3, :3] @ from_spread_m2 @ T[:3, :3].T
@@ -86,22 +86,22 @@ def place(from_m: np.ndarray, from_spread_m2: np.ndarray, to_m: np.ndarray, to_s
 SHARED_M = 1.0 * MM
 """Standard deviation per axis of an error that a mark's pixels share but two views do not; in no covariance."""
 DISTANCE_SIGMAS = 4.0
-"""Standard deviations by which a distance between two marks may differ: a true pair is lost once in 16,000."""
+"""Largest difference of a distance between two marks, in standard deviations: a true pair is lost once in 16,000."""
 FIT_CHI2 = 21.1
-"""Limit of chi^2 of a matched mark's place, three degrees of freedom: a true match is lost once in 10,000."""
+"""Largest chi^2 of a matched mark's place, with three degrees of freedom: a true match is lost once in 10,000."""
 GUESS_SIGMA_M = 50 * MM
-"""Root mean square error of the guess at the marks: five degrees over half a metre, and some centimetres."""
+"""Root mean square error of the guess at the marks: five degrees over half a metre, and a few centimetres."""
 PAIR_WORTH = 3.0
 """Logarithm of the odds that a mark of one view is found in the other: 20 to 1."""
 CLEAR_ODDS, FEWER = 4.5, 3
-"""Logarithm of the odds, 90 to 1, that decide between two placements; how many pairs fewer the winner may have."""
+"""Log odds, 90 to 1, that decide between two placements; largest number of pairs that the winner may lack."""
 NO_PAIRS = np.zeros((0, 2), dtype=np.int64)
 
 
 @dataclass(frozen=True)
 class Pairing:
-    """``pairs`` (n, 2): indices into the reference's marks and into the view's, in the reference's order. ``problem``:
-    why they must not be used, empty where they may. ``notes``: further remarks."""
+    """``pairs`` (n, 2): indices into the reference's and the view's marks, in the reference's order. ``problem``: why
+    they must not be used, else empty. ``notes``: further remarks."""
 
     pairs: np.ndarray
     problem: str = ""
@@ -109,7 +109,7 @@ class Pairing:
 
 
 def pair_marks(reference: Sequence[Mark], view: Sequence[Mark], T_reference_view_guess: np.ndarray | None) -> Pairing:
-    """Match the marks of two views by the placement that the number of its pairs, their fit and the guess favour."""
+    """Match the marks of two views by the placement that is best in number of pairs, fit and closeness to the guess."""
     counts = f"{len(reference)} marks in the reference and {len(view)} in the view"
     if min(len(reference), len(view)) < LEAST_MARKS:
         return Pairing(NO_PAIRS, f"{counts}, {LEAST_MARKS} needed in each")
@@ -121,7 +121,7 @@ def pair_marks(reference: Sequence[Mark], view: Sequence[Mark], T_reference_view
     if not solutions:
         least = max(LEAST_MARKS, min(len(reference), len(view)) // 2 + 1)
         what = f"of {counts}, no {least} have matching distances"
-        return Pairing(NO_PAIRS, f"{what}: the targets differ, or something else was taken for marks")
+        return Pairing(NO_PAIRS, f"{what}: the targets differ, or other objects were taken for marks")
     away = np.zeros(len(solutions))
     if T_reference_view_guess is not None:
         placed = [transform_points(T if swapped else invert(T), theirs.places) for _, T, _ in solutions]
@@ -155,8 +155,8 @@ def _by_code(reference: Sequence[Mark], view: Sequence[Mark]) -> Pairing:
 
 
 class _Side:
-    """The marks of one view: ``places`` and ``normals`` (n, 3), ``distances`` (n, n), the ``variances`` (n, n) of
-    these, and ``worst`` (n,), each place's variance in its worst direction."""
+    """The marks of one view: ``places`` and ``normals`` (n, 3), ``distances`` (n, n) with ``variances`` (n, n), and
+    ``worst`` (n,), each place's variance in its worst direction."""
 
     def __init__(self, marks: Sequence[Mark]) -> None:
         self.places = np.stack([mark.centre_m for mark in marks])
@@ -184,10 +184,10 @@ Solution = tuple[tuple[int, ...], np.ndarray, float]
 
 
 def _solutions(few: _Side, many: _Side) -> list[Solution]:
-    """Return placements that bring more than half of the smaller set together, at most `FEWER` below the best."""
+    """Return the placements that match over half of the smaller set and at most `FEWER` pairs less than the best."""
     n = len(few.places)
     least = max(LEAST_MARKS, n // 2 + 1)
-    # pairs of which every set of more than half of the marks holds one: disjoint ones, the longest first, and of an odd
+    # every set of more than half of the marks contains one of these pairs: disjoint ones, longest first, and for an odd
     # number the last mark with both marks of the first pair
     pairs: list[tuple[int, int]] = []
     free = set(range(n))
@@ -203,7 +203,7 @@ def _solutions(few: _Side, many: _Side) -> list[Solution]:
             found.setdefault(solution[0], solution)
             best = max(best, n - solution[0].count(-1))
     near = [solution for solution in found.values() if n - solution[0].count(-1) >= best - FEWER]
-    # leave out those that place the marks as a better one does, to within half the distance between neighbours
+    # leave out solutions that place the marks like a better one, to within half the distance between neighbours
     limit = (few.distances + np.where(np.eye(n, dtype=bool), np.inf, 0.0)).min() / 2
     kept: list[Solution] = []
     for solution in sorted(near, key=lambda s: (s[0].count(-1), s[2], s[0])):
@@ -227,7 +227,7 @@ def _holding(few: _Side, many: _Side, i: int, j: int, least: int) -> list[Soluti
         variance = few.variances[mark][None, :, None] + many.variances[partner][:, None, :]
         # a mark's distance to itself is exactly 0 on both sides
         consistent &= off <= DISTANCE_SIGMAS * np.sqrt(variance)
-    # ... on the side of the line through them that the normals tell: the mirror image beyond the line lies two heights
+    # ... on the side of the line through them that the normals indicate: the mirror image beyond it lies two heights
     # away; half a height allows for normals wrong by 30 degrees
     (axes,), (middle,) = few.frames(np.array([i]), np.array([j]))
     axes_there, middle_there = many.frames(a, b)
@@ -239,7 +239,7 @@ def _holding(few: _Side, many: _Side, i: int, j: int, least: int) -> list[Soluti
     partner = _mutual(np.where(consistent, off, np.inf))
     partner = partner[(partner >= 0).sum(axis=1) >= least]
     for _ in range(2):
-        # the first pass uses the marks that the distances gave, the second those that fitted
+        # the first pass uses the marks with fitting distances, the second those that fit the transform
         if len(partner) == 0:
             return []
         weights = np.where(partner >= 0, 1.0 / (few.worst[None] + many.worst[partner]), 0.0)
@@ -255,7 +255,7 @@ def _holding(few: _Side, many: _Side, i: int, j: int, least: int) -> list[Soluti
 
 
 def _mutual(cost: np.ndarray) -> np.ndarray:
-    """Return (k, n): for each row of costs (k, n, m) its cheapest column where that is mutual, else -1."""
+    """Return (k, n): for each row of costs (k, n, m) its cheapest column if that is mutual, else -1."""
     column, row = cost.argmin(axis=2), cost.argmin(axis=1)
     back = np.take_along_axis(row, column, axis=1) == np.arange(cost.shape[1])
     finite = np.isfinite(np.take_along_axis(cost, column[..., None], axis=2)[..., 0])

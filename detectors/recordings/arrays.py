@@ -1,10 +1,9 @@
-"""Captures in files of arrays: which array holds the distances, and the meaning of its axes; also height maps and bare
-numbers.
+"""Captures from files of arrays: which array holds the distances, and what its axes mean; height maps; bare numbers.
 
 The libraries that read them run within `files.limited_memory`. Arrays of objects, which would need pickle, are refused.
-A height map's pixels lie a stated pitch apart, and it is a cloud in parallel projection: x and y count from its middle,
-and z, which points away from the viewer, is `DISTANCE_M` at the median height. If no unit is stated, the program takes
-micrometres, millimetres or metres, whichever gives the relief a plausible part of the extent."""
+A height map's pixels are a stated pitch apart. It becomes a cloud in parallel projection: x and y count from its
+middle; z points away from the viewer and is `DISTANCE_M` at the median height. If no unit is stated, the program takes
+micrometres, millimetres or metres, whichever makes the relief a plausible share of the extent."""
 
 from __future__ import annotations
 
@@ -35,21 +34,21 @@ LEGAL_RAW = (
 )
 LEGAL_PICTURES = "a page or more of one channel in 16 bits or floating point, or of x, y, z in floating point"
 EXPORT = "Location = pc.Location; Color = pc.Color; save('cloud.mat','Location','Color','-v7')"
-"""The line for MATLAB that turns a point cloud ``pc`` into arrays."""
+"""The MATLAB line that saves a point cloud ``pc`` as arrays."""
 
 Arrays = Mapping[str, np.ndarray]
 ArraysLoader = Callable[[Path], Arrays]
-"""Function that loads a file's arrays by name; the only array of a file without names is called ""."""
+"""Function that loads a file's arrays by name; the name of a single array without a name is ""."""
 
 
 def load_npy(path: Path) -> dict[str, np.ndarray]:
-    """Map an ``.npy`` file. Raises UserError where it is broken or holds objects."""
+    """Map an ``.npy`` file. Raises UserError if it is broken or holds objects."""
     with read_errors(f"{path}: cannot be read as arrays", LEGAL_ARRAYS):
         return {"": np.lib.format.open_memmap(path, mode="r")}
 
 
 def load_npz(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of an ``.npz`` file by name. Raises UserError where it is broken, too large, or has objects."""
+    """Return the arrays of an ``.npz`` file by name. Raises UserError if it is broken, too large, or has objects."""
     with read_errors(f"{path}: cannot be read as arrays", LEGAL_ARRAYS):
         with zipfile.ZipFile(path) as archive:
             stated = sum(entry.file_size for entry in archive.infolist())
@@ -67,7 +66,7 @@ def load_mat(path: Path) -> dict[str, np.ndarray]:
     fix = f"save it with '-v7', not '-v7.3'; save the arrays of a point cloud pc: {EXPORT}"
     with read_errors(f"{path}: cannot be read as a MATLAB file", LEGAL_MAT, fix):
         try:
-            # cells and structs hold no frames, and nested deeply enough they end the process without a word
+            # cells and structs hold no frames, and deeply nested ones end the process without a message
             flat = [name for name, _, kind in scipy.io.whosmat(path) if kind not in ("cell", "struct")]
         except TypeError as error:
             raise ValueError("it holds a MATLAB object, which cannot be read outside MATLAB") from error
@@ -86,7 +85,7 @@ def load_mat(path: Path) -> dict[str, np.ndarray]:
 def load_picture(path: Path) -> dict[str, np.ndarray]:
     """Return a TIFF's pages, or a PFM, of numbers or x, y, z. Raises UserError for broken files and pictures."""
     level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # a message below replaces its output
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the messages below replace its output
     try:
         with read_errors(f"{path}: cannot be read", LEGAL_PICTURES):
             is_read, pages = cv2.imreadmulti(str(path), flags=cv2.IMREAD_UNCHANGED)
@@ -105,15 +104,15 @@ SENSOR_SIZES = (
     *((256, 192), (160, 120), (240, 180), (1024, 768), (1280, 720), (848, 480), (1280, 960), (1280, 1024)),
 )  # (width, height) of the depth images of usual cameras
 SAME_SCENE, SEVERAL = 0.05, 8
-"""Most relative difference of the median pixel between successive frames, and number of frames examined."""
+"""Largest relative difference of the median pixel between successive frames, and number of frames examined."""
 NEIGHBOURS = 0.1
-"""The same between neighbouring pixels: rows of a flat floor differ by 1 %, noise by less; a wrong layout by 100 %."""
+"""Largest difference between neighbours: rows of a flat floor differ by 1 %, noise by less; a wrong layout by 100 %."""
 
 
 @dataclass(frozen=True)
 class RawLoader:
-    """Whole frames of ``width`` x ``height`` numbers, row by row, from a byte of a file on. ``step``: bytes from pixel
-    to pixel, more than a number's if brightness and confidence lie between."""
+    """Whole frames of ``width`` x ``height`` numbers, row by row, from byte ``offset`` of a file on. ``step``: bytes
+    from pixel to pixel, more than a number's if brightness and confidence lie between."""
 
     width: int
     height: int
@@ -136,7 +135,7 @@ class RawLoader:
         return cls(int(width), int(height), kind if kind[0] in "<>" else f"<{kind}", int(step or own), int(offset or 0))
 
     def __call__(self, path: Path) -> dict[str, np.ndarray]:
-        """Map the frames (n, h, w). Raises UserError where there is none."""
+        """Map the frames (n, h, w). Raises UserError if there is none."""
         kind, size = np.dtype(self.kind), path.stat().st_size - self.offset
         frame = self.width * self.height * self.step
         if size < frame:
@@ -147,7 +146,7 @@ class RawLoader:
         return {"": np.ndarray((size // frame, self.height, self.width), kind, content, strides=strides)}
 
     def refuse_doubtful(self, path: Path, frames: np.ndarray) -> int:
-        """Return the bytes left over after the frames. Raises UserError where neighbours differ too much."""
+        """Return the number of bytes after the last frame. Raises UserError if neighbours differ too much."""
         rough = _apart(frames[0][:, 1:], frames[0][:, :-1])
         if not rough < NEIGHBOURS:
             what = f"in this layout the median pixel differs from its neighbour by {100 * rough:.3g} %"
@@ -156,13 +155,13 @@ class RawLoader:
 
 
 def raw_layout_of(path: Path) -> UserError:
-    """Return the message for a file of bare numbers: the layouts of usual cameras that its size fits."""
+    """Return the error for a file of bare numbers, with the layouts of common cameras that fit its size."""
     size = path.stat().st_size
     layouts = {f"{w}x{h}": size // (w * h) for w, h in SENSOR_SIZES if size % (w * h) == 0 and size >= 2 * w * h}
     ranked = sorted(layouts, key=lambda wh: layouts[wh] != 2)[:4]
     fitting = " or ".join(f"--raw {wh}" + ("" if (n := layouts[wh]) == 2 else f":u2/{n}" * (n < 17)) for wh in ranked)
     fix = "state the layout" + (f"; its size fits {fitting}" if fitting else "")
-    return UserError(f"{path}: nothing says how its {size} bytes are laid out", legal=LEGAL_RAW, fix=fix)
+    return UserError(f"{path}: the layout of its {size} bytes is unknown", legal=LEGAL_RAW, fix=fix)
 
 
 LOADERS: dict[str, ArraysLoader] = {
@@ -173,16 +172,16 @@ DISTANCE_NAMES = ("depth", "z", "z_mm", "depth_mm", "xyz", "points", "location")
 COLOUR_NAMES = ("rgb", "color", "colour", "colors")
 AMPLITUDE_NAMES = ("amplitude", "ir", "intensity")
 LEGAL_AXES = "depth (h, w) or (n, h, w); points (h, w, 3), (n, h, w, 3) or, without a pixel grid, (n_points, 3)"
-FEWEST_ROWS = 8  # of an image: fewer are columns of a table of points
+FEWEST_ROWS = 8  # of an image; an array with fewer rows is a table of points
 FRAMES_OF_POINTS = 20
-"""(a, b, 3) is taken for a frames of b points, not for a grid, from b = 20 a on: no sensor is that wide."""
+"""(a, b, 3) counts as a frames of b points, not as a grid, from b = 20 a on: no sensor is that wide."""
 
 Stack = tuple[np.ndarray, np.ndarray | None, np.ndarray | None, bool, str]
 """Distances (n, h, w) or points (n, h, w, 3), colour, amplitude; whether there is a pixel grid; a note on the axes."""
 
 
 def open_arrays(path: Path, given: Given) -> Recording:
-    """Open a file of arrays: frames, or with a pitch a height map. Raises UserError where none or several fit."""
+    """Open a file of arrays: frames or, with a pitch, a height map. Raises UserError if no array or several fit."""
     load = RawLoader.stated(given.raw) if given.raw is not None else LOADERS[path.suffix.lower()]
     if given.pitch is not None:
         return _open_height_map(path, load, given)
@@ -194,7 +193,7 @@ def open_arrays(path: Path, given: Given) -> Recording:
     lens: Lens | None = None
     files: tuple[Path, ...] = ()
     if distances.ndim == 3:
-        hint = "; of a height map, the distance between its pixels: --pitch 0.5mm"
+        hint = "; for a height map, state the distance between its pixels: --pitch 0.5mm"
         lens, files = lens_for(str(path), given, width, height, beside=[path.parent, path.parent.parent], hint=hint)
     scale_m = given.scale_m or default_metres(distances.dtype)
 
@@ -222,7 +221,7 @@ def open_array_list(paths: Sequence[Path], given: Given, name: str) -> Recording
 
 
 def _refuse_other_planes(name: str, key: str, frames: np.ndarray, left_over: int) -> None:
-    """Raise UserError where the first planes (n, h, w) are no frames of one scene, but x and y, colour or amplitude."""
+    """Raise UserError if the first planes (n, h, w) are not frames of one scene, but x and y, colour or amplitude."""
     changed = [each for each in map(_apart, frames[:SEVERAL], frames[1:SEVERAL]) if math.isfinite(each)]
     worst = max(changed, default=0.0)
     if len(frames) > 1 and (left_over or not worst < SAME_SCENE):
@@ -263,8 +262,8 @@ def _stack(path: Path, load: ArraysLoader, given: Given) -> Stack:
 
 
 def _frames_are_last(array: np.ndarray) -> bool:
-    """Return whether an array (h, w, n) holds depth images along its last axis, as MATLAB stacks them. Of three planes
-    the content tells: x, y and z of points are not nearly equal everywhere, repeated distances are."""
+    """Return whether an array (h, w, n) holds depth images along its last axis, as MATLAB stacks them. With three
+    planes, the content decides: x, y and z of points are not nearly equal everywhere, repeated distances are."""
     if not _is_deep(array):
         return False
     return array.shape[2] != 3 or all(_apart(array[..., k], array[..., 2]) < SAME_SCENE for k in (0, 1))
@@ -275,14 +274,14 @@ def _is_deep(array: np.ndarray) -> bool:
 
 
 def _apart(first: np.ndarray, second: np.ndarray) -> float:
-    """Return the median relative difference where both have a number; infinity where none has."""
+    """Return the median relative difference where both have a number; infinity if there is none."""
     both = (first > 0) & (second > 0)
     one, other = (plane[both].astype(np.float64) for plane in (first, second))
     return float(np.median(np.abs(one - other) / one)) if both.any() else float("inf")
 
 
 def _named_array(name: str, arrays: Arrays, usual: Sequence[str], given: str | None) -> tuple[str, np.ndarray]:
-    """Return (name, array): the one that NAME[:NUMBER] names, or else the one with a usual name, or the only one."""
+    """Return (name, array): the one that NAME[:NUMBER] selects, else one with a usual name, else the only one."""
     held = ", ".join(f"{key} {value.shape}".strip() for key, value in arrays.items()) or "nothing"
     key, _, number = (given or "").partition(":")
     if not key:
@@ -290,7 +289,7 @@ def _named_array(name: str, arrays: Arrays, usual: Sequence[str], given: str | N
         found = found or [key for key in arrays if "depth" in key.lower()] or list(arrays)
         if len(found) != 1:
             what = f"{name}: no array, or several arrays, that could be the depth (it holds {held})"
-            fix = f"choose one, for instance --array {found[0]} (of a height map with --pitch)" if found else None
+            fix = f"choose one, for instance --array {found[0]} (add --pitch for a height map)" if found else None
             raise UserError(what, legal=f"one array named {', '.join(usual)}; {LEGAL_AXES}", fix=fix)
         (key,) = found
     if key not in arrays:
@@ -326,11 +325,11 @@ HEIGHT_NAMES = ("height", "heights", "heightmap", "height_map", "elevation", "de
 DOWN_NAMES = ("depth", "distance", "range", "z_depth")  # names of arrays whose numbers grow away from the viewer
 DISTANCE_M = 1.0
 RELIEF = (5e-4, 0.5)
-"""Plausible relief (1st to 99th percentile) over the map's shorter side: no two units, 1000 apart, fit."""
+"""Plausible relief (1st to 99th percentile) over the map's shorter side: of two units, 1000 apart, only one fits."""
 
 
 def _open_height_map(path: Path, load: ArraysLoader, given: Given) -> Recording:
-    """Open a height map. Raises UserError where the array is no single map, or its unit cannot be determined."""
+    """Open a height map. Raises UserError if the array is not a single map, or its unit cannot be determined."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?(?:e-?\d+)?)\s*(um|mm|cm|m)", (given.pitch or "").strip())
     pitch_m = float(match.group(1)) * UNITS_M[match.group(2)] if match else math.nan
     if not 1e-7 <= pitch_m <= 1:
@@ -360,7 +359,7 @@ def _open_height_map(path: Path, load: ArraysLoader, given: Given) -> Recording:
 
 
 def _map_frames(path: Path, load: ArraysLoader, array: str | None, pitch_m: float, scale_m: float) -> Iterator[Frame]:
-    """Yield the map as a frame. ``scale_m`` below 0: heights grow towards the viewer."""
+    """Yield the map as a frame. If ``scale_m`` is below 0, heights grow towards the viewer."""
     name, heights = _map_in(path, load, array)
     known = np.isfinite(heights)
     z_m = scale_m * heights.astype(np.float64)
@@ -374,7 +373,7 @@ def _map_frames(path: Path, load: ArraysLoader, array: str | None, pitch_m: floa
 
 
 def _map_in(path: Path, load: ArraysLoader, array: str | None) -> tuple[str, np.ndarray]:
-    """Return the name and the map (h, w). Raises UserError for several maps, which are no frames of one capture."""
+    """Return the name and the map (h, w). Raises UserError for several maps, which are not frames of one capture."""
     name, values = _named_array(str(path), load(path), (*HEIGHT_NAMES, *DOWN_NAMES), array)
     values = values[0] if values.ndim == 3 and values.shape[0] == 1 else values
     if values.ndim == 3:

@@ -1,8 +1,8 @@
 """ROS bags (ROS 2: folder, .db3, .mcap; ROS 1: .bag) with depth images or sensor_msgs/PointCloud2 as captures.
 
-``rosbags`` unpacks chunks whole: it runs within `files.limited_memory`. A depth image needs the CameraInfo that its
-driver publishes beside it. Where rays of a CameraInfo pass through a cloud's points, z and that lens are used: a
-pixel's ray is then the same in all frames."""
+``rosbags`` unpacks whole chunks, so it runs within `files.limited_memory`. A depth image needs the CameraInfo that its
+driver publishes with it. If the rays of a CameraInfo pass through a cloud's points, z and that lens are used: a pixel's
+ray is then the same in all frames."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ MAX_MESSAGE_BYTES = 2**28  # 256 MiB: a cloud of four million points with 64 byt
 
 @dataclass(frozen=True)
 class Bag:
-    """The bag that ``path`` names. ``files`` hold the messages, in order."""
+    """The bag at ``path``. ``files``: they hold the messages, in order."""
 
     path: Path
     files: tuple[Path, ...]
@@ -46,17 +46,17 @@ class Bag:
 
     @cached_property
     def topics(self) -> dict[str, str]:
-        """Return topic to message type, sorted; of a topic with several types the last."""
+        """Return the message type of each topic, sorted; for a topic with several types, the last."""
         with self._opened() as reader:
             return dict(sorted((connection.topic, connection.msgtype) for connection in reader.connections))
 
     def first(self, topic: str) -> Any:
-        """Return the first message of a topic, None where it has none."""
+        """Return the first message of a topic, None if it has none."""
         return next(self.messages(topic), ("", None))[1]
 
     def messages(self, topic: str) -> Iterator[tuple[str, Any]]:
         """Yield (name, message) of a topic in the order of their times within each file, one held at a time. Raises
-        UserError where a file is damaged or a message is larger than `MAX_MESSAGE_BYTES`."""
+        UserError if a file is damaged or a message is larger than `MAX_MESSAGE_BYTES`."""
         types = _types(self._is_ros1)
         decode = types.deserialize_ros1 if self._is_ros1 else types.deserialize_cdr
         with self._opened() as reader:
@@ -97,14 +97,14 @@ class Bag:
 
 @lru_cache
 def _types(is_ros1: bool) -> Any:
-    """Return types of messages, kept: the code that reads one is made when it is first met."""
+    """Return the message types. They are kept, because the code that reads a type is made when it is first used."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
 
 
 def is_bag(path: Path) -> bool:
-    """Return whether a path is a bag's file, or a folder with a bag, whole or not."""
+    """Return whether a path is a bag's file, or a folder with a bag, complete or not."""
     if path.is_file():
         return path.suffix.lower() in (*BAG_SUFFIXES, ROS1_SUFFIX)
     try:
@@ -117,7 +117,7 @@ def is_bag(path: Path) -> bool:
 
 
 def find_bag(path: Path) -> Bag:
-    """Return a folder or file as a bag. Raises UserError where its description or one of its files is missing."""
+    """Return a folder or file as a bag. Raises UserError if its description or one of its files is missing."""
     if path.is_file():
         return Bag(path, (path,))
     metadata = path / METADATA
@@ -150,11 +150,11 @@ INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 UNIT_TYPE = "std_msgs/msg/Float32"
 USUAL_TOPIC = "points2"
 RAY_TOLERANCE_PX = 0.01
-"""A lens counts if each point lies within this of its pixel's ray: far more than the error of float32."""
+"""A lens fits if each point lies within this distance of its pixel's ray: far more than the error of float32."""
 
 
 def open_bag(path: Path, given: Given) -> Recording:
-    """Open a bag's depth images or clouds. Raises UserError where it is broken or empty, or a lens does not fit."""
+    """Open a bag's depth images or clouds. Raises UserError if it is broken or empty, or a lens does not fit."""
     bag = find_bag(path)
     chosen, note = _chosen_topic(bag, given)
     if bag.first(chosen) is None:
@@ -165,7 +165,7 @@ def open_bag(path: Path, given: Given) -> Recording:
 
 
 def _frames(bag: Bag, topic: str, scale_m: float, by_lens: bool) -> Iterator[Frame]:
-    """Yield the images or clouds of one topic, a frame a message. ``by_lens``: x and y come from the lens."""
+    """Yield the images or clouds of one topic, one frame per message. ``by_lens``: x and y come from the lens."""
     for name, message in bag.messages(topic):
         frame = frame_of_message(name, message, scale_m)
         yield replace(frame, xy_m=None) if by_lens else frame
@@ -209,7 +209,7 @@ def _open_images(bag: Bag, topic: str, given: Given) -> Recording:
     scale_m = given.scale_m
     unit_from = "ROS, which sets millimetres for integers and metres for floating point (REP 118)"
     for name, kind in bag.topics.items():
-        # RealSense's viewer states the unit beside a sensor's streams
+        # RealSense's viewer states the unit with a sensor's streams
         sensor, _, option = name.partition("/option/")
         is_stated = kind == UNIT_TYPE and option.startswith("Depth_Units") and topic.startswith(sensor + "/")
         if scale_m is None and is_whole and is_stated:
@@ -223,7 +223,7 @@ def _open_images(bag: Bag, topic: str, given: Given) -> Recording:
 
 
 def _chosen_topic(bag: Bag, given: Given) -> tuple[str, str]:
-    """Return the topic to read, and what the user should know of the others."""
+    """Return the topic to read, and a note on the other topics."""
     path, topics = bag.path, bag.topics
     clouds = [topic for topic, kind in topics.items() if kind == CLOUD_TYPE]
     images = _depth_topics(bag)
@@ -255,7 +255,7 @@ def _chosen_topic(bag: Bag, given: Given) -> tuple[str, str]:
 
 
 def _depth_topics(bag: Bag) -> list[str]:
-    """Return the topics whose first picture may be depth; 16-bit grey only under such a name, no copies."""
+    """Return the topics whose first picture may be depth: 16-bit grey only with such a name, and no copies."""
     found = []
     for topic in (name for name, kind in bag.topics.items() if kind in IMAGE_TYPES and not NOT_DEPTH.search(name)):
         message = bag.first(topic)
@@ -277,7 +277,7 @@ def _infos_of(bag: Bag, topic: str) -> list[str]:
 
 
 def _lens_of_images(bag: Bag, topic: str, shape: tuple[int, ...]) -> Lens:
-    """Return the lens of depth images. Raises UserError where the bag has none for them, or one of another model."""
+    """Return the lens of depth images. Raises UserError if the bag has none for them, or one of another model."""
     every = [name for name, kind in bag.topics.items() if kind == INFO_TYPE]
     why: list[str] = []
     is_rectified = "rect" in _of_pictures(topic).rpartition("/")[2]
@@ -294,8 +294,8 @@ def _lens_of_images(bag: Bag, topic: str, shape: tuple[int, ...]) -> Lens:
 
 
 def lens_of_info(message: Any, shape: tuple[int, ...], is_rectified: bool = False) -> Lens | str:
-    """Return the lens of a CameraInfo for images of a shape (h, w), or why it does not fit. A rectified image has
-    the lens P and no distortion. K and P are of the whole sensor: binning and the region of interest are taken off."""
+    """Return the lens of a CameraInfo for images of a shape (h, w), or why it does not fit. A rectified image has the
+    lens P and no distortion. K and P are of the whole sensor: binning and the region of interest are accounted for."""
     d, k, p = (np.asarray(getattr(message, key, getattr(message, key.upper(), ())), float) for key in ("d", "k", "p"))
     d = np.zeros(0) if is_rectified or not d.any() else d
     model = str(message.distortion_model)

@@ -1,9 +1,9 @@
 """Point clouds as files: PLY and PCD by Open3D, and lists of points as text (.xyz, .txt, .csv, .asc, .pts).
 
-Open3D drops the grid and fills a cut PLY up with zeros, so the header is read here: a PCD is organised where HEIGHT >
-1, a PLY where it states num_cols and num_rows. A list has a point a line: x y z, then an intensity, or red green blue,
-or both; a line of names may say otherwise. Its grid is stated by a comment or a first line of two whole numbers, or
-determined by a lens with as many pixels, or a sensor's usual size on which x/z and y/z rise evenly."""
+Open3D drops the grid and fills a truncated PLY with zeros, so the header is read here: a PCD is organised if HEIGHT >
+1, a PLY if it states num_cols and num_rows. A list has one point per line: x y z, then an intensity, or red green blue,
+or both, unless a line of names says otherwise. Its grid is stated by a comment or a first line of two whole numbers, or
+given by a lens with as many pixels, or by a common sensor size on which x/z and y/z rise evenly."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from harness.vocabulary.geometry import Frame, Lens
 CLOUDS = (".ply", ".pcd")
 POINT_LISTS = (".xyz", ".asc", ".pts", ".txt", ".csv")
 RASTER_CORRELATION = 0.999
-"""Correlation of x/z with the column and y/z with the row on a true pixel grid: a distorted lens bends 1 %."""
+"""Correlation of x/z with the column and y/z with the row on a true pixel grid; a distorted lens reduces it by 1 %."""
 
 
 def open_clouds(paths: Sequence[Path], given: Given, name: str) -> Recording:
-    """Open clouds in the order given, each a frame. Raises UserError on a broken file."""
+    """Open clouds in the order given, one frame each. Raises UserError for a broken file."""
     scale_m = given.scale_m or UNITS_M["m"]
     is_list = paths[0].suffix.lower() in POINT_LISTS
     read = partial(_frames, tuple(paths), _read_list if is_list else _read_cloud, given.lens, scale_m)
@@ -45,7 +45,7 @@ def open_clouds(paths: Sequence[Path], given: Given, name: str) -> Recording:
 
 
 def _frames(paths: tuple[Path, ...], reader: Any, lens: Lens | None, scale_m: float) -> Iterator[Frame]:
-    """Yield a cloud a file, (h, w), or (1, n) without a grid. ``lens`` only tells whether a list fills a pixel grid."""
+    """Yield one cloud per file, (h, w), or (1, n) without a grid. ``lens`` only tells if a list fills a pixel grid."""
     for path in paths:
         points, grid, rgb, amplitude = reader(path, lens)
         amplitude = None if amplitude is None else amplitude.astype(np.float32).reshape(grid)
@@ -54,7 +54,7 @@ def _frames(paths: tuple[Path, ...], reader: Any, lens: Lens | None, scale_m: fl
 
 
 def _stated_size(lines: Sequence[str]) -> tuple[int, int]:
-    """Return width and height that lines of a header state, 0 where they do not."""
+    """Return the width and height that lines of a header state, 0 if they do not."""
     text = "\n".join(lines).lower()
     names = (r"(?:num_)?(?:width|cols)", r"(?:num_)?(?:height|rows)")
     found = (re.search(rf"\b{name}\b\s*[:=]?\s*(\d{{1,9}})\b", text) for name in names)
@@ -63,7 +63,7 @@ def _stated_size(lines: Sequence[str]) -> tuple[int, int]:
 
 
 def _grid_of(points: np.ndarray, lens: Lens | None = None) -> tuple[int, int]:
-    """Return (h, w) of points (n, 3) whose grid nothing states."""
+    """Return (h, w) of points (n, 3) whose grid is not stated."""
     count = len(points)
     if lens is not None and lens.width * lens.height == count:
         return lens.height, lens.width
@@ -84,13 +84,13 @@ PLY_BYTES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4
 }  # fmt: skip
 HEADER_BYTES = 65536
 COUNT = re.compile(r"\d{1,15}", re.ASCII)
-"""A count in a header: more digits are no file's, and Python refuses to read thousands of them."""
+"""A count in a header. No file has more digits, and Python refuses to read thousands of them."""
 PCD_NUMBERS = 10_000  # numbers in one point; published clouds have descriptors with some hundred
 LZF_STRONGEST = 100  # largest compression factor of LZF: three bytes represent at most 264
 
 
 def _read_cloud(path: Path, _: Lens | None) -> tuple[np.ndarray, tuple[int, int], np.ndarray | None, np.ndarray | None]:
-    """Read one PLY or PCD. Raises UserError where it has no header, holds no points, or is cut off."""
+    """Read one PLY or PCD. Raises UserError if it has no header, holds no points, or is truncated."""
     o3d = load_open3d()
     with read_errors(f"{path}: cannot be read", LEGAL_CLOUD), path.open("rb") as file:
         content = file.read(HEADER_BYTES)
@@ -117,7 +117,7 @@ def _read_cloud(path: Path, _: Lens | None) -> tuple[np.ndarray, tuple[int, int]
 
 
 def _ply_header(path: Path, content: bytes) -> tuple[int, int, int]:
-    """Return width, height (1 without a grid) and the least number of bytes of the file that the header promises."""
+    """Return width, height (1 without a grid) and the least number of bytes of a file with this header."""
     end = re.search(rb"end_header\r?\n", content)
     if not content.startswith(b"ply") or end is None:
         raise UserError(f"{path}: is not a PLY file, or its header is cut off", legal=LEGAL_CLOUD)
@@ -189,7 +189,7 @@ COLUMNS = {
 
 
 def _read_list(path: Path, lens: Lens | None) -> tuple[np.ndarray, tuple[int, int], np.ndarray | None, Any]:
-    """Read one list of points. Raises UserError where it cannot be read as numbers."""
+    """Read one list of points. Raises UserError if it cannot be read as numbers."""
     with read_errors(f"{path}: cannot be read", LEGAL_LIST):
         content = bounded_bytes(path, TABLE_BYTES).removeprefix(codecs.BOM_UTF8)
     lines = content[:65536].decode("latin1").splitlines()[:HEAD_LINES]
@@ -222,7 +222,7 @@ def _numbers(line: str) -> list[float] | None:
 
 
 def _table(path: Path, content: bytes, skipped: int, line: str) -> np.ndarray:
-    """Return (n, columns) numbers. A comma within numbers that semicolons or tabs part is a decimal point."""
+    """Return numbers (n, columns). A comma within numbers that semicolons or tabs separate is a decimal point."""
     import pandas
 
     is_decimal_comma = "," in line and "." not in line and re.search(r"[;\t]", line)

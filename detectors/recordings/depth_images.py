@@ -1,8 +1,8 @@
 """Folders and lists of 16-bit depth PNGs: Open3D's recorder, Azure SDK exports, TUM RGB-D, or bare pictures.
 
-The layout is recognised by a sub-folder ``depth`` (with ``color`` or ``rgb`` beside it), by names that hold "depth", or
-by names that are numbers; else every 16-bit grey PNG counts. A ``depth.txt`` marks TUM RGB-D. A picture's first bytes
-show its kind, and Pillow reads its header: OpenCV would decode a header of 30,000 x 30,000 pixels into gigabytes."""
+The layout is recognised by a sub-folder ``depth`` (with ``color`` or ``rgb`` beside it), by names that contain "depth",
+or by names that are numbers; else every 16-bit grey PNG counts. A ``depth.txt`` marks TUM RGB-D. A picture's first
+bytes show its kind, and Pillow reads its header: OpenCV would decode 30,000 x 30,000 pixels into gigabytes."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ LEGAL_PICTURE = "PNG or JPEG"
 
 
 def read_picture(path: Path, flags: int) -> np.ndarray:
-    """Return a PNG or JPEG decoded by OpenCV with its ``flags``: (h, w) or (h, w, 3), blue first. Raises UserError
-    where it is another kind of file, cannot be decoded, or is too large."""
+    """Return a PNG or JPEG decoded by OpenCV with its ``flags``: (h, w) or (h, w, 3), blue first. Raises UserError if
+    it is another kind of file, cannot be decoded, or is too large."""
     with read_errors(f"{path}: cannot be read", LEGAL_PICTURE):
         content = bounded_bytes(path, PICTURE_BYTES)
     return decoded(str(path), content, flags)
@@ -49,7 +49,7 @@ def decoded(name: str, content: bytes, flags: int) -> np.ndarray:
 
 
 def refuse_broken_png(name: str, content: bytes) -> None:
-    """Raise UserError where a PNG is cut off or a checksum fails: the decoder may fill a cut picture up with zeros."""
+    """Raise UserError if a PNG is truncated or a checksum fails: the decoder may fill the rest with zeros."""
     try:
         _header(name, content).verify()
     except (SyntaxError, OSError, ValueError) as error:
@@ -59,7 +59,7 @@ def refuse_broken_png(name: str, content: bytes) -> None:
 
 
 def _header(name: str, content: bytes) -> ImageFile.ImageFile:
-    """Read a picture's header alone, as the kind that its first bytes say."""
+    """Read only the header of a picture, as the kind that its first bytes show."""
     kind = PngImagePlugin.PngImageFile if content.startswith(PNG_SIGNATURE) else JpegImagePlugin.JpegImageFile
     what = f"{name}: cannot be decoded: it is neither PNG nor JPEG, or it is truncated"
     with read_errors(what, LEGAL_PICTURE):
@@ -69,7 +69,7 @@ def _header(name: str, content: bytes) -> ImageFile.ImageFile:
 COLOUR_FOLDERS = ("color", "colour", "rgb")
 COLOUR_SUFFIXES = (".png", ".jpg", ".jpeg")
 TUM_MATCH_S = 0.02
-"""Largest difference of time stamps of depth and colour that still belong together (the benchmark's own default)."""
+"""Largest difference of time stamps of depth and colour that belong together (the benchmark's own default)."""
 LEGAL_PNG = "16-bit single-channel PNG (uint16, 0 = no depth)"
 NUMBER = re.compile(r"\d+(?:\.\d+)?")
 NOT_DEPTH = re.compile(
@@ -79,7 +79,7 @@ NOT_DEPTH = re.compile(
 
 
 def open_depth_folder(folder: Path, given: Given) -> Recording:
-    """Open a folder of depth PNGs. Raises UserError where it has none, or their lens is unknown."""
+    """Open a folder of depth PNGs. Raises UserError if it has none, or their lens is unknown."""
     inner = folder / "depth"
     depths = depth_files(inner if inner.is_dir() else folder)
     root = folder if inner.is_dir() or folder.name != "depth" else folder.parent
@@ -112,8 +112,8 @@ def open_depth_list(
     is_tum: bool = False,
     note: str = "",
 ) -> Recording:
-    """Open depth PNGs in the order given. ``root``: folder of the capture, beside or in which their lens is looked for;
-    ``colours``: the colour picture of each, if any. Raises UserError where their lens is not known."""
+    """Open depth PNGs in the order given. ``root``: folder of the capture, in or beside which their lens is sought.
+    ``colours``: the colour picture of each, if any. Raises UserError if their lens is not known."""
     root = root or depths[0].parent
     width, height = _depth_size(depths[0])
     lens, lens_files = lens_for(str(root), given, width, height, beside=(root, depths[0].parent, root.parent))
@@ -123,7 +123,7 @@ def open_depth_list(
         colours = ()
         notes = [f"colour pictures of {found[1]} x {found[0]} pixels are not aligned with the depth and are not used"]
     if not any(lens.distortion):
-        notes.append("no lens distortion is stated; the images are taken as undistorted")
+        notes.append("no lens distortion is stated; the images are assumed to be undistorted")
     scale_m = given.scale_m or UNITS_M["tum" if is_tum else "mm"]
     is_whole = scale_m != UNITS_M["tum"]  # its unit of 0.2 mm is finer than the steps of most cameras
     files, unit_from = (*depths, *filter(None, colours), *lens_files), "depth.txt, which marks TUM RGB-D" * is_tum
@@ -133,19 +133,19 @@ def open_depth_list(
 
 
 def _frames(depths: Sequence[Path], colours: Sequence[Path | None], scale_m: float) -> Iterator[Frame]:
-    """Yield a frame a file. Raises UserError where a file is missing, truncated or not 16-bit grey."""
+    """Yield one frame per file. Raises UserError if a file is missing, truncated or not 16-bit grey."""
     for depth, colour in zip_longest(depths, colours):
         rgb = _colour(colour) if colour else None
         yield frame_of(f"{depth.parent.name}/{depth.name}", read_depth_png(depth), scale_m, rgb)
 
 
 def shown(folder: Path) -> list[Path]:
-    """Return what a folder holds, in order, without the hidden files that systems leave beside each picture."""
+    """Return the contents of a folder, in order, without hidden files."""
     return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
 
 
 def depth_files(folder: Path) -> tuple[Path, ...]:
-    """Return a folder's depth pictures by their numbers, without masks. Raises UserError where there is none."""
+    """Return a folder's depth pictures by their numbers, without masks. Raises UserError if there is none."""
     pictures = [path for path in shown(folder) if path.suffix.lower() == ".png"]
     numbered = [path for path in pictures if NUMBER.fullmatch(path.stem)]
     # a 16-bit infrared picture looks like depth
@@ -156,7 +156,7 @@ def depth_files(folder: Path) -> tuple[Path, ...]:
 
 
 def depth_named(paths: Sequence[Path], others: Sequence[Path]) -> tuple[Path, ...]:
-    """Return the files whose names hold "depth", else ``others`` but `NOT_DEPTH`, in the order of their numbers."""
+    """Return the files whose names contain "depth", else ``others`` without `NOT_DEPTH`, sorted by number."""
     chosen = [path for path in paths if "depth" in path.stem.lower()]
     chosen = chosen or [path for path in others if not NOT_DEPTH.search(path.stem)]
 
@@ -168,18 +168,18 @@ def depth_named(paths: Sequence[Path], others: Sequence[Path]) -> tuple[Path, ..
 
 
 def png_kind(path: Path) -> tuple[int, int, int, int]:
-    """Return (width, height, bits, colour type) of a PNG. Raises UserError where it is no PNG, or too large."""
+    """Return (width, height, bits, colour type) of a PNG. Raises UserError if it is not a PNG, or too large."""
     with read_errors(f"{path}: cannot be read", LEGAL_PNG), path.open("rb") as file:
         head = file.read(26)
     if len(head) < 26 or head[:8] != PNG_SIGNATURE or head[12:16] != b"IHDR":
-        raise UserError(f"{path}: is no PNG, or is truncated", legal=LEGAL_PNG, fix="copy or export it again")
+        raise UserError(f"{path}: is not a PNG, or is truncated", legal=LEGAL_PNG, fix="copy or export it again")
     width, height, bits, kind = struct.unpack(">IIBB", head[16:26])
     refuse_pixels(str(path), width, height)
     return width, height, bits, kind
 
 
 def read_depth_png(path: Path) -> np.ndarray:
-    """Return the stored numbers (h, w) uint16. Raises UserError where the file is broken or not 16-bit grey."""
+    """Return the stored numbers (h, w) uint16. Raises UserError if the file is broken or not 16-bit grey."""
     _depth_size(path)
     content = bounded_bytes(path, PICTURE_BYTES)
     refuse_broken_png(str(path), content)

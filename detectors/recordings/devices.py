@@ -1,8 +1,8 @@
 """Recordings of cameras by their own programs: Azure Kinects (.mkv), iPhones and iPads (Stray Scanner, Record3D).
 
 k4arecorder writes tracks titled COLOR, DEPTH and IR (16-bit big-endian grey, depth in millimetres, 0 = none) and
-attaches the factory calibration. Phones store ARKit's depth, a confidence 0 to 2 of each pixel (0 is no return), the
-lens of the colour camera, and poses, by which the program warns of movement."""
+attaches the factory calibration. Phones store ARKit's depth, a confidence from 0 to 2 for each pixel (0 is no return),
+the lens of the colour camera, and poses; the program warns if these show movement."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ TITLES = ("DEPTH", "IR", "COLOR")
 LEGAL_MKV = "a recording of k4arecorder with its DEPTH track"
 SEGMENT_ID = bytes.fromhex("18538067")
 WAITING = 4
-"""Most captures held while their other pictures may still follow; the recorder interleaves tracks within one frame."""
+"""Most captures that wait for their other pictures; the recorder interleaves tracks within one frame."""
 
 
 def open_mkv(path: Path, given: Given) -> Recording:
-    """Open a recording with its own calibration, or the lens given. Raises UserError where it has no depth."""
+    """Open a recording with its own calibration, or with the given lens. Raises UserError if it has no depth."""
     _refuse_truncated(path)
     with _opened(path) as container:
         tracks = _tracks(container)
@@ -51,7 +51,7 @@ def open_mkv(path: Path, given: Given) -> Recording:
         for title in sizes:
             refuse_pixels(f"{path}: its track {title}", *sizes[title])
         width, height = sizes["DEPTH"]
-        # recorders of other makers (Orbbec's Femto) may leave the tag out; each mode has its own size
+        # recorders of other makers (Orbbec's Femto) may omit the tag; each mode has its own size
         stated = tracks["DEPTH"].metadata.get("K4A_DEPTH_MODE") or container.metadata.get("K4A_DEPTH_MODE")
         attached = [s for s in container.streams if s.type == "attachment" and "calib" in (s.name or "").lower()]
         calibration = bytes(attached[0].data) if attached else None
@@ -71,7 +71,7 @@ def open_mkv(path: Path, given: Given) -> Recording:
 
 
 def _frames(path: Path, scale_m: float, lens: Lens, colour: ColourCamera | None) -> Iterator[Frame]:
-    """Yield a frame a depth picture. Raises UserError where the file is truncated or cannot be decoded."""
+    """Yield one frame per depth picture. Raises UserError if the file is truncated or cannot be decoded."""
     slopes = lens.region_slopes(lens.whole)
     for number, pictures in enumerate(_captures(path, with_colour=colour is not None)):
         infrared = pictures.get("IR")
@@ -100,8 +100,7 @@ def colour_on_depth(z_m: np.ndarray, slopes: np.ndarray, colour: ColourCamera, p
 def _opened(path: Path) -> Any:
     import av
 
-    # Without these the decoder guesses the form by content: a playlist or a script called .mkv would open other files,
-    # and addresses.
+    # without these, the decoder guesses the format from the content: a playlist called .mkv would open addresses
     only = {"protocol_whitelist": "file", "format_whitelist": "matroska,webm"}
     with read_errors(f"{path}: cannot be opened as a recording", LEGAL_MKV):
         return av.open(f"file:{path}", format="matroska", options=only)
@@ -126,7 +125,7 @@ def _captures(path: Path, with_colour: bool) -> Iterator[dict[str, np.ndarray]]:
 
 
 def _pictures(path: Path, with_colour: bool) -> Iterator[tuple[str, float, float, np.ndarray]]:
-    """Yield (title, time in s, frame period in s, picture) in the file's order. Raises UserError where it breaks."""
+    """Yield (title, time in s, frame period in s, picture) in the file's order. Raises UserError if it is broken."""
     with _opened(path) as container:
         tracks = {title: s for title, s in _tracks(container).items() if with_colour or title != "COLOR"}
         title_of = {s.index: title for title, s in tracks.items()}
@@ -140,7 +139,7 @@ def _pictures(path: Path, with_colour: bool) -> Iterator[tuple[str, float, float
                 title = title_of[packet.stream.index]
                 for picture in packet.decode():
                     form = "rgb24" if title == "COLOR" else "gray16le"
-                    # The depth camera may be set to fire after the colour camera; both belong to one capture.
+                    # The depth camera may be set to expose after the colour camera; both belong to one capture.
                     shift_s = 0.0 if title == "COLOR" else delay_s
                     yield title, float(picture.time or 0.0) - shift_s, period_s, picture.to_ndarray(format=form)
         except (OSError, ValueError) as error:
@@ -166,8 +165,8 @@ def _refuse_truncated(path: Path) -> None:
 LEGAL_STRAY = "Stray Scanner's folder: depth/*.png, confidence/*.png, camera_matrix.csv, odometry.csv"
 LEGAL_R3D = "Record3D's .r3d: metadata and rgbd/*.depth"
 COLOUR_WIDTHS = (1920, 1280, 640, 3840)
-"""Widths of the pictures to which ARKit's lens may refer; all are 4 : 3, as its depth is."""
-BLUR_PX = 0.5  # motion over this much of a pixel spreads an edge further than the sensor itself does
+"""Widths of the pictures to which ARKit's lens may refer; all have a ratio of 4 : 3, like its depth."""
+BLUR_PX = 0.5  # motion by this much of a pixel blurs an edge more than the sensor does
 
 
 def _recording(
@@ -181,7 +180,7 @@ def _recording(
     scale_m: float,
     writer: str,
 ) -> Recording:
-    """Return the recording of either program. ``size``: width, height; ``poses``: places, quaternions, their source."""
+    """Return the recording of either program. ``size``: width, height. ``poses``: places, quaternions, their source."""
     lens, lens_files = lens_for(str(path), given, *size, scaled_lens)
     notes = () if lens_files or given.lens else (f"lens scaled from the colour pixels to {size[0]} x {size[1]}",)
     first_m = next(read()).z_m
@@ -214,7 +213,7 @@ def _scaled(name: str, k: np.ndarray, colour: tuple[int, int], size: tuple[int, 
 def _motion_warnings(
     places_m: np.ndarray, turns: np.ndarray, source: str, frames: slice | None, lens: Lens, median_m: float
 ) -> tuple[str, ...]:
-    """Warn where the selected poses (quaternions in ``turns``) differ by more than `BLUR_PX` on the target."""
+    """Warn if the selected poses (quaternions in ``turns``) differ by more than `BLUR_PX` on the target."""
     chosen = frames or slice(None)
     places_m, turns = places_m[chosen], turns[chosen]
     if len(places_m) < 2 or not np.isfinite([*places_m.ravel(), *turns.ravel()]).all():
@@ -280,7 +279,7 @@ def _table(path: Path) -> np.ndarray:
 
 
 def open_r3d(path: Path, given: Given) -> Recording:
-    """Open Record3D's .r3d. Raises UserError where it is broken or pyliblzfse, which unpacks its depth, is missing."""
+    """Open Record3D's .r3d. Raises UserError if it is broken, or if pyliblzfse, which unpacks its depth, is missing."""
     with _archive(path) as archive:
         if "metadata" not in archive.namelist() or not _depth_names(archive):
             held = ", ".join(archive.namelist()[:6]) or "nothing"
@@ -319,14 +318,14 @@ def _depth_names(archive: zipfile.ZipFile) -> list[str]:
 
 
 def _content(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
-    """Return an entry's bytes, no more than `files.TEXT_BYTES`: depth of an iPhone has 0.1 MB."""
+    """Return an entry's bytes, at most `files.TEXT_BYTES`: depth of an iPhone has 0.1 MB."""
     refuse_bytes(f"{path}: {name}", archive.getinfo(name).file_size, TEXT_BYTES)
     with read_errors(f"{path}: {name} cannot be read", LEGAL_R3D), archive.open(name) as stream:
         return stream.read(TEXT_BYTES)
 
 
 def _plane(path: Path, archive: zipfile.ZipFile, name: str, kind: str, size: tuple[int, int]) -> np.ndarray:
-    """Unpack an entry by Apple's LZFSE as (h, w) numbers. Raises UserError where it does not unpack to as many."""
+    """Unpack an entry by Apple's LZFSE into numbers (h, w). Raises UserError unless it gives exactly as many."""
     packed = _content(path, archive, name)
     try:
         import liblzfse  # type: ignore[import-not-found]

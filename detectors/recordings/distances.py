@@ -16,18 +16,18 @@ UNITS_M = {"mm": 1e-3, "m": 1.0, "cm": 1e-2, "um": 1e-6, "in": 0.0254, "tum": 1 
 LEGAL_UNITS = "mm, cm, m, um, in (inch), tum (5000 to the metre), or N/m for N to the metre (4000/m)"
 NEAREST_M, FARTHEST_M = 0.05, 20.0
 """Bounds of a plausible median distance: no time-of-flight camera works nearer or sees farther."""
-FARTHEST_ASIDE = 4.0  # times its z that the median point may lie off the axis: 76 degrees
+FARTHEST_ASIDE = 4.0  # largest ratio of the median point's distance from the axis to its z: 76 degrees
 RAYS_TELL = 3.0
-"""Ratio of bends that tells lengths along rays from z: 0.1 to 0.5 for real captures' z, up to 2 for a pipe's."""
+"""Ratio of bends that distinguishes lengths along rays from z: real captures' z has 0.1 to 0.5, a pipe's up to 2."""
 COMMON_STEPS_M = (1e-3, 2.5e-4, 2e-4, 1e-4)
 """Rounding steps that cameras store: 1 mm (Kinects), 0.25 mm (L515), 0.2 mm (TUM), 0.1 mm."""
 CAMERA_FRAME = "the camera's frame: x right, y down, z forward from the lens"
 TURNED_SHARE = 0.99
-"""Share of the points that must have z below 0 before they are turned: no camera measures behind itself."""
+"""Least share of points with z below 0 for which the cloud is turned: no camera measures behind itself."""
 
 
 def metres_per_unit(unit: str) -> float:
-    """Return metres in one stored unit. Raises UserError for a unit that is not known."""
+    """Return metres in one stored unit. Raises UserError for an unknown unit."""
     if unit in UNITS_M:
         return UNITS_M[unit]
     counted = re.fullmatch(r"(\d+(?:\.\d+)?)/m", unit)
@@ -42,7 +42,7 @@ def default_metres(dtype: np.dtype) -> float:
 
 
 def refuse_narrow(name: str, dtype: np.dtype) -> None:
-    """Raise UserError where the numbers cannot be distances: 8 bit, boolean, complex, text or objects."""
+    """Raise UserError if the numbers cannot be distances: 8 bit, boolean, complex, text or objects."""
     is_narrow = dtype.kind in "iu" and dtype.itemsize == 1
     if is_narrow or dtype.kind not in "iuf":
         what = "8-bit numbers, which is a picture or a mask" if is_narrow else f"{dtype}, not numbers"
@@ -54,8 +54,9 @@ def refuse_narrow(name: str, dtype: np.dtype) -> None:
 def frame_of(
     name: str, stored: np.ndarray, scale_m: float, rgb: np.ndarray | None = None, amplitude: np.ndarray | None = None
 ) -> Frame:
-    """Make a frame of stored depth (h, w) or points (h, w, 3) in units of ``scale_m`` metres. 0 and `no_return_codes`
-    mean no return. Depth that is negative throughout is turned. Raises UserError where most, not all, is negative."""
+    """Convert stored depth (h, w) or points (h, w, 3) in units of ``scale_m`` metres to a frame. 0 and
+    `no_return_codes` mean no return. Depth that is negative throughout is turned. Raises UserError if most, not all, is
+    negative."""
     stored_z = stored[..., 2] if stored.ndim == 3 else stored
     reason = np.zeros(stored_z.shape, np.uint8)
     reason[stored_z == 0] = Reason.NO_RETURN
@@ -95,10 +96,10 @@ FEW_CODES = 8
 
 
 def no_return_codes(stored: np.ndarray) -> tuple[float, ...]:
-    """Return the numbers among ``stored`` (n,), finite and not 0, that no surface explains: they mean "no return". Four
+    """Return the numbers among ``stored`` (n,), finite and not 0, that cannot be distances: they mean "no return". Four
     kinds: the largest number of the type (in metres, 65.535); a full scale of fewer bits (4095, 65534 ..) that many
-    pixels share, well beyond all others; at most `FEW_CODES` different numbers that lie `ISOLATED` times farther than
-    all others, or of integers as much nearer; at most three negative ones. Not found: a code amid the distances."""
+    pixels share, well beyond all others; at most `FEW_CODES` different numbers that are `ISOLATED` times farther than
+    all others or, for integers, nearer; at most three negative numbers. Codes amid distances are not found."""
     codes: list[float] = []
     is_integer = stored.dtype.kind in "iu"
     negative = stored[stored < 0]
@@ -118,7 +119,7 @@ def no_return_codes(stored: np.ndarray) -> tuple[float, ...]:
             break
         codes.append(float(top))
         rest = below
-    # An octave without a number lies between any two neighbours that differ four times: most frames need no sorting.
+    # Between neighbours that differ by a factor of four, an octave is empty: most frames need no sorting.
     if rest.size and not np.bincount((octaves := np.frexp(rest)[1]) - octaves.min()).all():
         different = np.unique(rest)
         ratios = different[1:] / different[:-1].astype(np.float64)
@@ -139,20 +140,20 @@ READINGS = {
     **{"cm": (0.003, 0.04), "um": (0.005, 0.01), "in": (0.0003, 0.01), "m": (0.0, 0.8)},
 }  # units and how common each is among integers and floating-point numbers: guesses that hardly move a decision
 NEAR_M = (0.8, 1.8)
-"""Middle and spread (a factor) of the distances at which targets are looked at: 95 % within 0.25 to 2.6 m."""
+"""Middle and spread (a factor) of the usual distances of targets: 95 % are within 0.25 to 2.6 m."""
 NEAR_LIMIT_M, FAR_FLOOR = 0.15, 0.05
-"""A distance above the first keeps at least the second as its part of the commonest distance's weight."""
+"""A distance above the first has at least the second as its share of the most common distance's weight."""
 SURE, LIKELY, SHOWN = 0.98, 0.75, 0.003
-"""Probabilities: no warning from the first on; the user must decide below the second; not listed below the third."""
+"""Probabilities: no warning from the first on; below the second, the user must decide; below the third, not listed."""
 MILLIMETRE_SIZES = {
     **{(640, 576): 4.5, (320, 288): 6.0, (512, 512): 3.5, (1024, 1024): 3.0, (512, 424): 8.0, (256, 192): 8.0}
 }  # image sizes of cameras that all store 1 mm and the median distance in metres that they can reach
 QUARTER_SIZES = {(1024, 768): 20.0, (640, 480): 2.0, (1280, 720): 2.0, (1920, 1080): 2.0}
-"""Image sizes of cameras with 0.25 mm (L515, Helios; colour to which the L515 is aligned), and the weight that adds."""
+"""Image sizes of cameras with 0.25 mm (L515, Helios; colour to which the L515 is aligned), and their added weight."""
 
 
 class Unit(NamedTuple):
-    """Metres in one stored number, and the origin of this unit. ``warning``: why to doubt it, "" for no doubt."""
+    """Metres in one stored number, and the ``origin`` of this unit. ``warning``: a reason for doubt, else ""."""
 
     scale_m: float
     origin: str
@@ -160,9 +161,9 @@ class Unit(NamedTuple):
 
 
 def scale_in(statements: dict[str, Any], median: float) -> float | None:
-    """Return metres in one stored number as names with values state it, None where they do not. Values are metres
-    (RealSense: 0.001), millimetres (BOP: 0.1), numbers to the metre (Open3D: 1000) or a unit's name; they are three
-    powers of ten apart, and the ``median`` stored number tells which it is."""
+    """Return metres in one stored number if names with values state it, else None. Values are metres (RealSense:
+    0.001), millimetres (BOP: 0.1), numbers to the metre (Open3D: 1000) or a unit's name. They differ by powers of 1000,
+    so the ``median`` stored number decides between them."""
     for key, value in statements.items():
         if re.sub("[^a-z]", "", str(key).lower()) not in UNIT_KEYS:
             continue
@@ -182,12 +183,12 @@ def scale_in(statements: dict[str, Any], median: float) -> float | None:
 
 
 def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int, int]) -> Unit:
-    """Decide the unit of numbers (n,) that nothing states; ``size``: width and height of the image.
+    """Return the unit of numbers (n,) if nothing states it. ``size``: width and height of the image.
 
-    Each of `READINGS` is weighed by how common it is and by how far it puts the nearest tenth of the points, which is
-    where targets are (`NEAR_M`). A common divisor of all numbers supports the unit in which they are whole
-    millimetres. Image sizes that only cameras with 1 mm have support that unit (`MILLIMETRE_SIZES`), and exclude it
-    beyond their reach. Raises UserError if no reading is clearly the likeliest, with the distance that each gives."""
+    Each of `READINGS` is weighted by how common it is and by the distance that it gives the nearest tenth of the
+    points, which usually holds the target (`NEAR_M`). A common divisor of all numbers supports the unit in which they
+    are whole millimetres. Image sizes that only cameras with 1 mm have support that unit (`MILLIMETRE_SIZES`), and
+    exclude it beyond their range. Raises UserError if no reading is clearly the most likely, with their distances."""
     near, median = (float(q) for q in np.quantile(stored[:: max(1, stored.size // 50_000)], (0.1, 0.5)))
     integers = usual_m == UNITS_M["mm"]
     divisor = int(np.gcd.reduce(stored.astype(np.int64))) if integers else 1
@@ -229,7 +230,7 @@ def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int,
 
 
 def rounding_step_m(z_m: np.ndarray) -> float:
-    """Return the coarsest common rounding step that all valid distances are multiples of; 0 where they follow none."""
+    """Return the coarsest common rounding step of which all valid distances are multiples; 0 if there is none."""
     values = z_m[np.isfinite(z_m)].astype(np.float64)
     for step_m in COMMON_STEPS_M:
         turns = values / step_m
@@ -253,7 +254,7 @@ def refuse_implausible(frame: Frame, scale_m: float) -> None:
 
 
 def refuse_far_aside(frame: Frame) -> None:
-    """Raise UserError where half of the points lie farther off the axis than in any camera's picture."""
+    """Raise UserError if half of the points are farther off the axis than in any camera's picture."""
     across_m = np.zeros(1) if frame.xy_m is None else np.hypot(*np.moveaxis(frame.xy_m, -1, 0))
     if (aside := float(np.nanmedian(across_m / frame.z_m))) > FARTHEST_ASIDE:
         what = f"{frame.name}: half of the points lie more than {math.degrees(math.atan(aside)):.0f} degrees"
@@ -262,10 +263,10 @@ def refuse_far_aside(frame: Frame) -> None:
 
 
 def ray_lengths_doubt(z_m: np.ndarray, slopes: np.ndarray) -> str:
-    """Return a sentence where ``z_m`` (h, w) looks like lengths along the rays of ``slopes`` (h, w, 2), else "".
+    """Return a sentence if ``z_m`` (h, w) looks like lengths along the rays of ``slopes`` (h, w, 2), else "".
 
-    Of a plane, 1/z is a plane over the slopes, whose bends over an eighth of the picture are noise; if z is a length
-    along the ray, that holds for 1/z times the ray's length at z = 1."""
+    For a plane, 1/z is a plane over the slopes, so its bends over an eighth of the picture are only noise. If z is a
+    length along the ray, that holds for 1/z times the ray's length at z = 1."""
     with np.errstate(invalid="ignore"):
         inverse = 1.0 / z_m.astype(np.float64)
         bends = [_bend(inverse), _bend(inverse * np.sqrt(1.0 + (slopes**2).sum(axis=-1)))]

@@ -17,7 +17,7 @@ from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, refuse_bytes, st
 from harness.vocabulary.geometry import Lens, OtherLens
 
 Mode = tuple[tuple[int, int], tuple[int, int], tuple[int, int]]
-"""A read-out of the sensor: the binned sensor, the crop's offset in it, and the image; (x, y) in pixels."""
+"""A readout of the sensor: the binned sensor, the crop's offset in it, and the image; (x, y) in pixels."""
 DEPTH_MODES: dict[str, Mode] = {
     "NFOV_2X2BINNED": ((512, 512), (96, 90), (320, 288)),
     "NFOV_UNBINNED": ((1024, 1024), (192, 180), (640, 576)),
@@ -56,12 +56,12 @@ def depth_lens(name: str, cameras: dict[str, Any], mode: str) -> Lens:
 
 
 def depth_mode_of_size(width: int, height: int) -> str | None:
-    """Return the depth mode whose image has this size, None where there is none."""
+    """Return the depth mode whose image has this size, None if there is none."""
     return next((name for name, (_, _, image) in DEPTH_MODES.items() if image == (width, height)), None)
 
 
 def colour_camera(name: str, cameras: dict[str, Any], width: int, height: int) -> ColourCamera | None:
-    """Return the colour camera in the mode of this image's size, None without. Raises UserError without a lens."""
+    """Return the colour camera in the mode of this image's size, None without one. Raises UserError without a lens."""
     if (width, height) not in COLOUR_SIZES:
         return None
     rows = width * 3 // 4  # the sensor is 4 : 3, and wider images are its middle
@@ -111,7 +111,7 @@ LEGAL_LENS = (
 FOUND_BESIDE = (
     *("intrinsic", "intrinsics", "camera_intrinsic", "camera_intrinsics", "camera", "camera_info", "calibration"),
     *("rtabmap_calib", "scene_camera", "depth_intrinsics", "intrinsic_depth", "transforms"),
-)  # stems of the files that are taken for the lens of the frames beside or below them
+)  # stems of the files that count as the lens of the frames beside or below them
 BARE_MATRICES = (
     *("intrinsics.txt", "intrinsic.txt", "camera-intrinsics.txt", "intrinsic_depth.txt", "K.txt", "cam_K.txt"),
     *("camera_intrinsics.txt", "camera_intrinsic.txt", "depth_intrinsics.txt"),
@@ -127,9 +127,9 @@ COEFFICIENTS = ("distortion", "distortion_coefficients", "D", "d", "coeffs", "di
 MODELS = ("distortion_model", "model", "camera_model")
 """Keys by which programs name focal lengths and centre, the matrix, the size, and the distortion."""
 FAR_OFF = 0.2
-"""Part of the image by which a principal point may lie off the middle before the lens is doubted."""
+"""Largest distance of a principal point from the middle, as a share of the image, without doubt about the lens."""
 NUMBER, MAX_MATRIX_TEXT = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", 2000
-NESTED = 3  # levels of mappings in a file in which a lens is looked for
+NESTED = 3  # levels of mappings in a file in which a lens is sought
 DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 LARGEST = 1e12  # largest number that a lens may state, in any unit
 KNOWN_MODELS = ("", "none", "pinhole", "plumb_bob", "brown_conrady", "rational_polynomial", "opencv")
@@ -145,8 +145,8 @@ def lens_for(
     hint: str = "",
 ) -> tuple[Lens, tuple[Path, ...]]:
     """Return the lens of depth images and the files that state it: --intrinsics, the named camera's, the capture's
-    ``own``, or the first file named like a lens in the folders ``beside``. Raises UserError where nobody states a lens
-    (``hint`` ends its advice), or that of other images."""
+    ``own``, or the first file named like a lens in the folders ``beside``. Raises UserError if no lens is stated
+    (``hint`` ends its advice), or only that of other images."""
     lens, file = given.lens, given.intrinsics
     if lens is None and file is None:
         lens = own()
@@ -170,8 +170,8 @@ def lens_for(
 
 
 def read_lens(path: Path, width: int, height: int) -> Lens:
-    """Return the lens in a file, for images of ``width`` x ``height``. Raises UserError where it is missing,
-    unreadable, of another image size, or of a lens model that is not known."""
+    """Return the lens in a file, for images of ``width`` x ``height``. Raises UserError if it is missing, unreadable,
+    of another image size, or of a lens model that is not known."""
     data = parsed_lens(path)
     if "CalibrationInformation" in data:
         mode = depth_mode_of_size(width, height)
@@ -210,7 +210,7 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
 
 
 def parsed_lens(path: Path) -> dict[str, Any]:
-    """Return the file's mapping; of bare numbers, these by name. Raises UserError where it is neither JSON nor YAML."""
+    """Return the file's mapping; bare numbers get names. Raises UserError if it is neither JSON nor YAML."""
     if not path.exists():
         raise UserError(f"{path}: no such file", legal=LEGAL_LENS)
     with read_errors(f"{path}: cannot be read", LEGAL_LENS, "give another file"):
@@ -224,10 +224,10 @@ def parsed_lens(path: Path) -> dict[str, Any]:
             return {"K": [numbers[row * i + j] for i in range(3) for j in range(3)]}
         try:
             if text.lstrip().startswith("{"):
-                data = strict_json(text, nan=True)  # `_number` names the key that is no number
+                data = strict_json(text, nan=True)  # `_number` names a key whose value is not a number
             else:
                 refuse_bytes(str(path), len(text), MAX_BYTES)
-                # OpenCV's first line, "%YAML:1.0", is no directive of YAML; its matrices are mappings under a tag
+                # OpenCV's first line, "%YAML:1.0", is not a YAML directive; its matrices are mappings under a tag
                 body = "\n".join("" if line.startswith("%YAML") else line for line in text.splitlines())
                 data = parse_yaml(body.replace("!!opencv-matrix", " " * 15), str(path)).data
         except json.JSONDecodeError as error:
@@ -250,8 +250,8 @@ def mappings(data: dict[str, Any], name: str = "", level: int = 0) -> Iterator[t
 
 
 def _the_lens(path: Path, data: dict[str, Any], size: tuple[int, int]) -> dict[str, Any]:
-    """Return the mapping in a file that holds the lens: of several different ones those of this image size count, then
-    those under a name with "depth". Raises UserError where there is none, or where several are left."""
+    """Return the mapping in a file that holds the lens: if several differ, those of this image size, then those with a
+    name that contains "depth". Raises UserError if there is none, or if several remain."""
     found = [pair for pair in mappings(data) if _matrix_key(pair[1]) or all(_named(pair[1], key) for key in SPELLINGS)]
     for fits in (lambda _, each: _size(each) == size, lambda name, _: "depth" in name.lower()):
         if len(found) > 1:
@@ -276,12 +276,12 @@ def _matrix_key(data: dict[str, Any]) -> str | None:
 
 
 def _size(data: dict[str, Any]) -> tuple[Any, Any] | None:
-    """Return width and height that a mapping states, None where it does not."""
+    """Return the width and height that a mapping states, None if it states none."""
     return next(((data[across], data[down]) for across, down in SIZES if across in data and down in data), None)
 
 
 def _focal_and_centre(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
-    """Return fx, fy, cx, cy from whichever of the known forms a mapping has."""
+    """Return fx, fy, cx, cy from any of the known forms of a mapping."""
     keys = [key for quantity in SPELLINGS if (key := _named(data, quantity)) is not None]
     if len(keys) == len(SPELLINGS):
         return tuple(_number(path, key, data[key]) for key in keys)

@@ -1,6 +1,6 @@
-"""ROS' messages: depth images and point clouds as frames (common_interfaces, REP 103 and 118).
+"""ROS messages: depth images and point clouds as frames (common_interfaces, REP 103 and 118).
 
-``compressedDepth``: twelve bytes (a form, two numbers of the quantisation), then a PNG or RVL (Wilson 2017)."""
+``compressedDepth``: twelve bytes (a format, two numbers of the quantisation), then a PNG or RVL (Wilson 2017)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CONFIG_BYTES = 12
 
 
 def encoding_of(message: Any) -> str:
-    """Return the encoding of a picture's numbers; of a compressed picture that of its content, and "" for colour."""
+    """Return the encoding of a picture's numbers: for a compressed picture that of its content, "" for colour."""
     if hasattr(message, "encoding"):
         return str(message.encoding)
     encoding, _, transport = str(message.format).partition(";")
@@ -34,7 +34,7 @@ def encoding_of(message: Any) -> str:
 
 
 def stored_depth(name: str, message: Any) -> np.ndarray:
-    """Return the stored numbers (h, w), uint16 or float32. Raises UserError where depth is missing or cut off."""
+    """Return the stored numbers (h, w), uint16 or float32. Raises UserError if depth is missing or truncated."""
     encoding = encoding_of(message)
     if encoding not in DEPTH_NUMBERS:
         what = encoding or getattr(message, "format", "")
@@ -47,7 +47,7 @@ def stored_depth(name: str, message: Any) -> np.ndarray:
 
 
 def _rows(name: str, message: Any, kind: np.dtype, row_bytes: int) -> np.ndarray:
-    """Return a (height, width) view of a message's data. Raises UserError where it is shorter than that needs."""
+    """Return a (height, width) view of a message's data. Raises UserError if the data are too short."""
     height, width = int(message.height), int(message.width)
     refuse_pixels(name, width, height)
     data = np.asarray(message.data, np.uint8)
@@ -77,7 +77,7 @@ def _unpacked(name: str, encoding: str, data: bytes) -> np.ndarray:
 
 
 def _rvl(name: str, content: bytes) -> np.ndarray:
-    """Unpack width and height, then runs of zeros and of differences in numbers of three bits a nibble."""
+    """Unpack width and height, then runs of zeros and differences, in numbers of three bits per nibble."""
     width, height = struct.unpack_from("<II", content.ljust(8, b"\0"))
     refuse_pixels(name, width, height)
     words = np.frombuffer(content, "<u4", (len(content) - 8) // 4, 8)
@@ -85,7 +85,7 @@ def _rvl(name: str, content: bytes) -> np.ndarray:
     last = np.flatnonzero(nibbles < 8)
     first = np.concatenate([[0], last[:-1] + 1]) if last.size else last
     place = np.arange(last[-1] + 1 if last.size else 0) - np.repeat(first, last - first + 1)
-    # more than seven nibbles are no number of this stream
+    # no number of this stream has more than seven nibbles
     parts = (nibbles[: place.size] & 7).astype(np.int64) << 3 * np.minimum(place, 10)
     numbers = np.add.reduceat(parts, first) if last.size else np.zeros(0, np.int64)
     filled = np.zeros(width * height, bool)
@@ -107,8 +107,8 @@ def _rvl(name: str, content: bytes) -> np.ndarray:
 
 
 def frame_of_message(name: str, message: Any, scale_m: float) -> Frame:
-    """Make a frame of a depth image, or of a PointCloud2, (1, n) without a grid; NaN means no return. Raises UserError
-    where x, y or z is missing, a field lies outside its point, or the data are shorter than the layout needs."""
+    """Convert a depth image or a PointCloud2 to a frame, (1, n) without a grid; NaN means no return. Raises UserError
+    if x, y or z is missing, a field lies outside its point, or the data are shorter than the layout needs."""
     if not hasattr(message, "point_step"):
         frame = frame_of(name, stored_depth(name, message), scale_m)
     else:

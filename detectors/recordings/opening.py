@@ -1,4 +1,4 @@
-"""Recognise the format of a capture, and open it."""
+"""Recognises the format of a capture, and opens it."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ LEGAL_FORMATS = (
 )
 FILES = {".mkv": open_mkv, ".r3d": open_r3d, **dict.fromkeys(LOADERS, open_arrays)}
 FILES |= dict.fromkeys((*BAG_SUFFIXES, ROS1_SUFFIX), open_bag)
-"""Suffixes of files of which each is a capture, and the function that opens it."""
+"""File suffixes for which one file is a capture, and the function that opens it."""
 ListOpener = Callable[[Sequence[Path], Given, str], Recording]
 LISTS: dict[str, ListOpener] = {".png": open_depth_list, **dict.fromkeys((*CLOUDS, *POINT_LISTS), open_clouds)}
-"""Suffixes of files of which several, all with the same suffix, form one capture."""
+"""File suffixes for which several files with the same suffix form one capture."""
 SAVE = "python -c \"import numpy, {}; numpy.save('depth.npy', {})\", then name depth.npy"
 PICTURE, HDF5 = SAVE.format("cv2", "cv2.imread('FILE', -1)"), SAVE.format("h5py", "h5py.File('FILE')['NAME'][:]")
 CONVERT = {
     ".exr": f"OPENCV_IO_ENABLE_OPENEXR=1 {PICTURE}",
     **dict.fromkeys((".h5", ".hdf5"), HDF5),
     **dict.fromkeys((".e57", ".las", ".laz", ".pcap", ".obj", ".stl", ".off"), "export its points as PLY"),
-}  # commands that turn files that are not read into files that are
-HELD = 6  # names of a folder's contents that a message lists
+}  # commands that convert unsupported files
+HELD = 6  # most names of a folder's contents in a message
 
 
 def open_capture(paths: Sequence[Path], *, unit: str | None = None, **statements: Any) -> Recording:
-    """Open a real capture as a source of frames; its first frame is read and checked. ``unit`` of the stored distances
-    (mm, m, cm, um, tum, N/m) where the format's usual one is wrong; the other ``statements`` are the fields of
+    """Open a real capture as a source of frames; its first frame is read and checked. ``unit``: of the stored distances
+    (mm, m, cm, um, tum, N/m), if the format's usual unit is wrong. The other ``statements`` are the fields of
     `recording.Given`. Raises UserError for every fault of the files."""
     paths = [Path(path) for path in paths]
     if not paths:
@@ -75,7 +75,7 @@ def open_capture(paths: Sequence[Path], *, unit: str | None = None, **statements
 
 
 def _unit_not_stated(recording: Recording) -> Unit:
-    """Find a unit that the format leaves open: of a file beside, of the named camera, or by the data."""
+    """Return a unit that the format leaves open: from a file beside the capture, the named camera, or the data."""
     found = (frame.z_m[np.isfinite(frame.z_m)].astype(np.float64) for frame in recording.selected())
     z_m = next((each for each in found if each.size), None)
     if z_m is None:

@@ -1,4 +1,4 @@
-"""A recording: the frames of a real capture behind the checks that all formats share."""
+"""A recording: the frames of a real capture with the checks that all formats share."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from harness.vocabulary.files import limited_memory
 from harness.vocabulary.geometry import Frame, Lens, Reason, Region
 
 ROUND_TRIP_PX = 0.1
-"""A pixel whose ray does not come back to it within this has no direction that the lens model can give."""
+"""If a pixel's ray does not return to it within this distance, the lens model has no direction for it."""
 NO_GRID = "the cloud has no pixel grid; it is treated as unorganised points"
 
 
 @contextmanager
 def read_errors(what: str, legal: str, fix: str = "copy or export it again") -> Iterator[None]:
-    """Turn a library's exception on a damaged file into a UserError that begins with ``what``; limit its memory."""
+    """Turn a library's exception on a damaged file into a UserError that begins with ``what``, and limit its memory."""
     try:
         with limited_memory():
             yield
@@ -38,9 +38,9 @@ def read_errors(what: str, legal: str, fix: str = "copy or export it again") -> 
 @dataclass(frozen=True)
 class Given:
     """The user's statements about a capture. ``scale_m``: metres in one stored unit, None for the format's usual one.
-    ``intrinsics``: a file with the depth pixels' lens, which counts before one that comes with the frames; ``lens``:
-    the same as a value. ``frames`` selects frames by number. ``topic`` of a ROS bag. ``array``: NAME or NAME:NUMBER in
-    a file of arrays. ``pitch`` of a height map's pixels (``0.5mm``). ``raw``: layout of bare numbers."""
+    ``intrinsics``: a file with the depth pixels' lens, preferred to one that comes with the frames. ``lens``: the same
+    as a value. ``frames``: selects frames by number. ``topic``: of a ROS bag. ``array``: NAME or NAME:NUMBER in a file
+    of arrays. ``pitch``: of a height map's pixels (``0.5mm``). ``raw``: layout of bare numbers."""
 
     scale_m: float | None = None
     intrinsics: Path | None = None
@@ -56,10 +56,10 @@ class Given:
 class Recording:
     """A real capture as a `harness.vocabulary.geometry.FrameSource`.
 
-    ``read`` yields the frames in order; each call starts again. ``shape``: (height, width). ``files``: all whose
-    content can change a number. ``scale_m``: metres in one stored unit, and ``unit_from`` its origin: "" where the
-    data shall decide. ``notes``: how the files were understood. ``warnings``: full sentences on what makes the
-    distances doubtful; every program shows them first. ``selection`` picks frames."""
+    ``read``: yields the frames in order; each call starts again. ``shape``: (height, width). ``scale_m``: metres in one
+    stored unit. ``files``: all files whose content can change a result. ``notes``: how the files were interpreted.
+    ``warnings``: full sentences on doubts about the distances; every program shows them first. ``selection``: picks
+    frames. ``unit_from``: origin of the unit; "" if the data decide."""
 
     name: str
     read: Callable[[], Iterator[Frame]]
@@ -107,7 +107,7 @@ class Recording:
         return islice(self.read(), chosen.start, chosen.stop, chosen.step)
 
     def frames(self) -> Iterator[Frame]:
-        """Yield the selected frames. Raises UserError on differing sizes, a wrong unit, or when no pixel is valid."""
+        """Yield the selected frames. Raises UserError for different sizes, a wrong unit, or if no pixel is valid."""
         count, judged = 0, False
         for frame in self.selected():
             count += 1
@@ -115,7 +115,7 @@ class Recording:
                 what = "pixels" if self.organised else "points"
                 sizes = [f"{w} x {h}" if h > 1 else str(w) for h, w in (frame.z_m.shape, self.shape)]
                 what = f"{frame.name}: {sizes[0]} {what}, but the first frame has {sizes[1]}"
-                raise UserError(what, legal="frames of one size", fix="run the differing frames on their own")
+                raise UserError(what, legal="frames of one size", fix="run the differing frames separately")
             if self.slopes is not None and frame.xy_m is None:
                 rayless = np.isnan(self.slopes[..., 0]) & (frame.reason == Reason.VALID)
                 if rayless.any():
@@ -130,12 +130,12 @@ class Recording:
             yield frame
         if not judged:
             fix = "check the selected frames, and that the target was within the camera's range"
-            raise UserError(f"{self.name}: not one valid pixel in {count} frame{'s' * (count != 1)}", fix=fix)
+            raise UserError(f"{self.name}: no valid pixel in {count} frame{'s' * (count != 1)}", fix=fix)
 
 
 @lru_cache(maxsize=2)
 def _returning_slopes(lens: Lens, region: Region) -> np.ndarray:
-    """Return the slopes of a region with NaN where the ray does not come back to its pixel."""
+    """Return the slopes of a region, NaN where the ray does not return to its pixel."""
     slopes = lens.region_slopes(region)
     if not any(lens.distortion):
         return slopes

@@ -1,18 +1,18 @@
-"""Registration by marks: matched by code or by distances, placed by weighted least squares; alone or jointly.
+"""Registration by marks, matched by code or by distances: weighted least squares for each view, or all views jointly.
 
-Where the program judges whether views belong together, `SHARED_M` allows for errors of range or lens in a single view.
-The covariance holds the noise, widened where the marks disagree by more than chance allows (Birge's ratio).
+To judge whether views belong together, `SHARED_M` allows for errors of range or lens in a single view. The covariance
+holds the noise, widened if the marks disagree by more than chance allows (Birge's ratio).
 
-The joint adjustment is a bundle adjustment (Triggs et al., 2000) with one smooth surface in place of many points. Its
+The joint adjustment is a bundle adjustment (Triggs et al., 2000) with one smooth surface instead of many points. Its
 unknowns are the poses of all views but the first, the surface z(x, y) (a cubic), the marks' places on it, and each
 view's own smooth error across it:
 
-z(T_v p) - S(x, y) - b_v(x, y) = noise for some 2000 target points p of each view v, and P (T_v c - M) = noise for each
-mark c of each view that is one of the reference's, in the surface's frame. Noise across is that of the sampling, with
-one independent value in 25 pixels; Tukey's weights keep holes out. b_v is the smooth error that all pixels of a view
-share (wiggling, multipath): a cubic, whose level and tilts cannot be told from the pose's. The scatter of its seven
-other terms between views gives their common deviation (by expectation maximisation), and so widens the three's too.
-Not modelled: errors of a view within the plane; a surface that no cubic follows; gross errors of marks."""
+z(T_v p) - S(x, y) - b_v(x, y) = noise for about 2000 target points p of each view v, and P (T_v c - M) = noise for each
+mark c of each view that is one of the reference's, in the surface's frame. Noise across the surface is that of the
+sampling, with one independent value in 25 pixels; Tukey's weights exclude holes. b_v is the smooth error that all
+pixels of a view share (wiggling, multipath): a cubic, whose level and tilts are indistinguishable from those of the
+pose. The scatter of its seven other terms between views gives their common deviation (by expectation maximisation),
+which also widens the level and tilts. Not modelled: errors within the plane; other surfaces; gross errors of marks."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ from detectors.views import PreparedView
 from harness.vocabulary.geometry import MM, invert, transform_points
 
 WIDEN_BELOW = 0.01
-"""Chance, below which the covariance is widened, that marks disagree so much by their noise alone."""
+"""Probability of so large a disagreement of marks by noise alone, below which the covariance is widened."""
 REFUSE_BELOW = 1e-4
-"""The same chance, with `SHARED_M` allowed for each mark and axis, below which the views do not fit together."""
+"""The same probability, with `SHARED_M` for each mark and axis, below which the views do not fit together."""
 
 
 def register_by_marks(reference: PreparedView, view: PreparedView) -> registered.Registration:
-    """Return the pose of a view relative to the reference, from their trusted marks; ``overlap`` stays NaN. Too few
-    marks, marks on a line, and marks that fit nowhere, badly or in several ways are its ``failure``; the transform is
-    then the best known, or else the guess, or else the identity."""
+    """Return the pose of a view relative to the reference, from their trusted marks; ``overlap`` stays NaN. Its
+    ``failure`` reports too few marks, marks on a line, and marks that fit nowhere, badly or in several ways; the
+    transform is then the best known, or else the guess, or else the identity."""
     guess = registered.guess_of(reference, view)
     ours, theirs, problem, notes = _matched(reference, view)
     if len(ours) < 3:
@@ -66,7 +66,7 @@ def register_by_marks(reference: PreparedView, view: PreparedView) -> registered
 
 def held_out_error_m(reference: PreparedView, view: PreparedView) -> float | None:
     """Return the root mean square distance (m) of each matched mark from its place by a registration with the others;
-    None where fewer than four marks match, or where leaving one out leaves the rest on a line."""
+    None if fewer than four marks match, or if leaving one out leaves the rest on a line."""
     ours, theirs, problem, _ = _matched(reference, view)
     if problem or len(ours) < 4:
         return None
@@ -83,7 +83,7 @@ def held_out_error_m(reference: PreparedView, view: PreparedView) -> float | Non
 def _matched(
     reference: PreparedView, view: PreparedView
 ) -> tuple[tuple[Mark, ...], tuple[Mark, ...], str, tuple[str, ...]]:
-    """Return trusted marks of both views that are pairs, the reason why they must not be used (or empty), and notes."""
+    """Return the pairs of trusted marks of both views, the reason why they must not be used (or ""), and notes."""
     problem = "; ".join(f"{each.view.name}: {each.marks.problem}" for each in (reference, view) if each.marks.problem)
     if problem:
         return (), (), problem, ()
@@ -113,8 +113,8 @@ POSE_TERMS = 3
 
 @dataclass(frozen=True)
 class ViewData:
-    """One view's part: thinned target points (n, 3) and marks in its camera frame, each with its index among the
-    reference's. ``noise_m``: of a point across the surface; ``sigma_m``: inflated as if points were independent."""
+    """One view's part: thinned target points (n, 3), and marks in its camera frame, each with its index among the
+    reference's. ``noise_m``: of a point across the surface. ``sigma_m``: inflated to make points independent."""
 
     points_m: np.ndarray
     marks: tuple[tuple[Mark, int], ...]
@@ -124,9 +124,9 @@ class ViewData:
 
 @dataclass(frozen=True)
 class JointState:
-    """Estimates: ``T`` (v, 4, 4) from the views to the surface's frame; ``surface`` (10,) and ``own`` (v, 10)
-    coefficients, metres; ``marks_m`` (m, 2) places in the plane. ``shared_m``: prior deviation of each term of ``own``.
-    ``half_m`` (2,) scales x, y to -1..1. Vectors of all unknowns hold poses of views 1.., surface, marks, own."""
+    """Estimates. ``T`` (v, 4, 4): from the views to the surface's frame. ``surface`` (10,) and ``own`` (v, 10):
+    coefficients, metres. ``marks_m`` (m, 2): places in the plane. ``shared_m``: prior deviation of each term of
+    ``own``. ``half_m`` (2,): scales x, y to -1..1. Vectors of all unknowns hold poses 1.., surface, marks, own."""
 
     T: np.ndarray
     surface: np.ndarray
@@ -199,8 +199,8 @@ class JointState:
 
 
 def register_jointly(views: Sequence[PreparedView]) -> list[registered.Registration]:
-    """Register views but the first to the first, from all views together. ``covariance``: each view's marginal;
-    ``residual_m``: across the surface, of the points that count. A view whose marks fail keeps that failure."""
+    """Register all views but the first to the first, jointly. ``covariance``: each view's marginal. ``residual_m``:
+    across the surface, of the points that count. A view whose marks fail keeps that failure."""
     found = [register_by_marks(views[0], view) for view in views[1:]]
     usable = [i for i, each in enumerate(found) if not each.failure]
     if usable:

@@ -1,15 +1,15 @@
 """Registration of clouds: iterative closest point, rigid coherent point drift, RGB-D odometry.
 
-ICP goes coarse to fine from the guess, point to point, as MATLAB's `pcregistericp` does by default; here pairs are
-limited in distance, MATLAB's are not.
+ICP goes from coarse to fine, starting at the guess, point to point, as MATLAB's `pcregistericp` does by default. Unlike
+MATLAB's, its pairs are limited in distance.
 
-Coherent point drift (Myronenko & Song, TPAMI 32:2262, 2010, figure 2), without scale: the moving cloud's points are
-centres of Gaussians of one width, with a uniform component for outliers, from which the fixed cloud is drawn. As in
-MATLAB's `pcregistercpd` both clouds are set to zero mean and the start is the width of all pairs; the clouds share one
-unit of length, and of the guess only the turn matters.
+Coherent point drift (Myronenko & Song, TPAMI 32:2262, 2010, figure 2), without scale: the fixed cloud is drawn from
+Gaussians of one width about the moving cloud's points, and a uniform component for outliers. As in MATLAB's
+`pcregistercpd`, both clouds are set to zero mean and the initial width is that of all pairs; the clouds share one unit
+of length, and only the rotation of the guess matters.
 
-Odometry (Open3D's hybrid term; Park, Zhou & Koltun, ICCV 2017) sets each view against the one before it, starting from
-no motion, by colour and depth together, so that errors add up. It gets only the target: on a turntable the room does
+Odometry (Open3D's hybrid term; Park, Zhou & Koltun, ICCV 2017) aligns each view with the one before it by colour and
+depth together, starting from no motion, so that errors add up. It uses only the target: on a turntable the room does
 not move with the target. No loop is closed, no map is kept."""
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from detectors.views import PreparedView
 from harness.vocabulary.geometry import MM, Lens, transform_points
 
 GUESS_ERROR_M, GUESS_ERROR_RAD = 10 * MM, np.deg2rad(3.0)
-"""Usual error of a nominal pose; the first pairs may lie twice as far apart as this moves the outermost point."""
+"""Usual error of a nominal pose; the first pairs may be twice as far apart as it moves the outermost point."""
 FINEST_PITCHES = 3.0
-"""Limit of the last stage: a mark's rim is known to a pixel in either view; noise and shared errors add one more."""
+"""Limit of the last stage: a mark's rim is known to a pixel in either view; noise and shared errors add a third."""
 STAGE_ITERATIONS, LEAST_CHANGE = 100, 1e-8
 """A stage ends after this many steps, or once the paired points' share and their distance (m) change by less."""
 CONVERGED_PITCHES = 0.05
@@ -77,7 +77,7 @@ def register_by_icp(reference: PreparedView, view: PreparedView, config: IcpRegi
 
 
 def stages_m(pitch_m: float, extent_m: float) -> tuple[float, ...]:
-    """Return the greatest distance of a pair in each stage: twice a guess's usual error, halved to three pitches."""
+    """Return each stage's largest distance of a pair: twice a guess's usual error, halved down to three pitches."""
     finest = FINEST_PITCHES * pitch_m
     limits = [max(2 * (GUESS_ERROR_M + GUESS_ERROR_RAD * extent_m), finest)]
     while limits[-1] > finest:
@@ -93,17 +93,17 @@ def _pairs(tree: Any, moved_m: np.ndarray, limit_m: float) -> tuple[np.ndarray, 
 
 
 def _covariance(tree: Any, moved_m: np.ndarray, limit_m: float, pitch_m: float) -> np.ndarray:
-    """(6, 6) covariance of the pose, as `Registration` means it, about the moved points' centroid: H^-1 S H^-1. H is
-    the cost's curvature with pairs found anew, by differences over one pitch (Bengtsson & Baerveldt, Robotics and
-    Autonomous Systems 44:29, 2003), because with pairs held fixed the inside of a flat mark would seem to resist
-    sliding. S is the scatter of the gradients, summed within cubes of 5 pixels whose errors are common. Not in it: that
-    the iteration may stop at one of many near minima. NaN where a motion costs nothing."""
+    """Return the covariance (6, 6) of the pose, as in `Registration`, about the moved points' centroid: H^-1 S H^-1. H
+    is the cost's curvature with new pairs, by differences over one pitch (Bengtsson & Baerveldt, Robotics and
+    Autonomous Systems 44:29, 2003); with fixed pairs, the inside of a flat mark would seem to resist sliding. S is the
+    scatter of the gradients, summed within cubes of 5 pixels whose errors are common. It ignores that the iteration may
+    stop at one of many near minima. NaN if a motion costs nothing."""
     arm = moved_m - moved_m.mean(axis=0)
     jacobian = registered.displacement_jacobian(arm, np.zeros(3))
     scores = np.einsum("nij,ni->nj", jacobian, _pairs(tree, moved_m, limit_m)[0])
 
     def half_cost(motion: np.ndarray) -> float:
-        # a point without a partner counts as if it were at the limit
+        # a point without a partner counts as one at the limit
         off, has = _pairs(tree, moved_m + jacobian @ motion, limit_m)
         return float(np.sum(off**2) + limit_m**2 * np.sum(~has)) / 2
 
@@ -128,9 +128,9 @@ PAIRS_AT_ONCE = 1 << 20  # pairs of points whose distances are held in memory
 
 @dataclass(frozen=True)
 class Drift:
-    """The result of coherent point drift. ``T_fixed_moving`` (4, 4); ``sigma_m``: the Gaussians' width; ``matched``:
-    expected number of fixed points that are not outliers; ``step_m``: how far the last iteration moved the points;
-    ``background``: a share, as `posterior_moments` takes it."""
+    """The result of coherent point drift. ``T_fixed_moving``: (4, 4). ``sigma_m``: the Gaussians' width. ``matched``:
+    expected number of fixed points that are not outliers. ``step_m``: how far the last iteration moved the points.
+    ``background``: a share, as in `posterior_moments`."""
 
     T_fixed_moving: np.ndarray
     sigma_m: float
@@ -186,7 +186,7 @@ def coherent_point_drift(
 
 def register_by_cpd(reference: PreparedView, view: PreparedView, config: CpdRegistration) -> registered.Registration:
     """Return the registration of a view to the reference by coherent point drift of their fiducial clouds or targets.
-    It fails at the limit of iterations only where its last step still moved the points."""
+    At the limit of iterations it fails only if its last step still moved the points."""
     fixed, moving, start, notes, few = registered.clouds_of(reference, view, config.points)
     if few:
         return registered.failed(view, "cpd", start, few, *notes)
@@ -204,11 +204,11 @@ def register_by_cpd(reference: PreparedView, view: PreparedView, config: CpdRegi
 
 
 def drift_covariance(fixed_m: np.ndarray, moved_m: np.ndarray, drift: Drift, pitch_m: float) -> np.ndarray:
-    """Return the (6, 6) covariance of the pose, as `Registration` means it, about the fixed cloud's centroid: H^-1 S
-    H^-1 with H the observed information (Louis, JRSS B 44:226, 1982) and S the scatter of the scores, summed within
-    cubes of 5 pixels whose errors are common (Liang & Zeger, Biometrika 73:13, 1986). The moving cloud's noise is taken
-    to be as large. Both are taken at a Gaussian width of no less than a pitch, below which the likelihood shows how two
-    grids of pixels beat. NaN where H is not positive definite."""
+    """Return the covariance (6, 6) of the pose, as in `Registration`, about the fixed cloud's centroid: H^-1 S H^-1. H
+    is the observed information (Louis, JRSS B 44:226, 1982); S is the scatter of the scores, summed within cubes of 5
+    pixels whose errors are common (Liang & Zeger, Biometrika 73:13, 1986). The moving cloud's noise is assumed equal.
+    The Gaussian width is at least a pitch, below which the likelihood shows the moire of two grids. NaN if H is not
+    positive definite."""
     centre = fixed_m.mean(axis=0)
     x = fixed_m - centre
     variance = max(drift.sigma_m, pitch_m) ** 2
@@ -232,7 +232,7 @@ def drift_covariance(fixed_m: np.ndarray, moved_m: np.ndarray, drift: Drift, pit
 def posterior_moments(
     fixed: np.ndarray, moving: np.ndarray, variance: float, background: float
 ) -> tuple[np.ndarray, float]:
-    """Return (n, 4, 4) posterior sums of (y, 1)(y, 1)' over the moving points y (m, 3) for each fixed point (n, 3); and
+    """Return posterior sums (n, 4, 4) of (y, 1)(y, 1)' over the moving points y (m, 3) for each fixed point (n, 3); and
     the negative sum of the log likelihood over fixed points, up to the Gaussians' factor. ``background``: the uniform
     component as in equation 6 of Myronenko & Song: (2 pi variance)^(3/2) w / (1 - w) m / n. The nearest component's
     weight is divided out, so that nothing underflows at w = 0."""
@@ -256,11 +256,11 @@ DRIFTS = "no covariance: that of Open3D's odometry counts its pairs and ignores 
 
 
 def register_by_odometry(views: Sequence[PreparedView]) -> list[registered.Registration]:
-    """Register views but the first to the first, in the order given: that of the walk. A view that odometry loses
-    (Open3D says so, or less than a tenth of the target's pixels pair) is a failure, and so is every view after it.
-    ``residual_m`` and ``covariance`` are NaN. Every view needs colour, a pixel grid and a lens."""
+    """Register all views but the first to the first, in the order given, which is that of the walk. A view that
+    odometry loses (according to Open3D, or with pairs for less than a tenth of the target's pixels) fails, and so does
+    every view after it. ``residual_m`` and ``covariance`` are NaN. Every view needs colour, a pixel grid and a lens."""
     T, lost, found = np.eye(4), "", []
-    # one pinhole for all: the first lens's focal lengths, and room for every target's points
+    # one pinhole camera for all: the first lens's focal lengths, and room for every target's points
     first = views[0].view.cloud.lens
     assert first is not None
     places = np.concatenate([view.points_m[:, :2] / view.points_m[:, 2:] for view in views]) * (first.fx, first.fy)
@@ -298,7 +298,7 @@ def _image(o3d: Any, view: PreparedView, canvas: Lens) -> Any:
     pixels = lens.project(np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1))
     u, v = (pixels - [cloud.region.col0, cloud.region.row0]).astype(np.float32).transpose(2, 0, 1)
     z = np.where(view.inside, cloud.points_m[..., 2], 0.0).astype(np.float32)
-    # depth is not interpolated, because a mean of target and background is neither
+    # depth is not interpolated: a mean of target and background is neither of them
     depth = cv2.remap(z, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
     colour = cv2.remap(cloud.rgb, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     images = (o3d.geometry.Image(np.ascontiguousarray(image)) for image in (colour, depth))

@@ -1,8 +1,8 @@
-"""Registration of views by the method that the settings name, and the judgement whether it can be trusted.
+"""Registers views by the method in the settings, and judges whether each registration can be trusted.
 
 Errors that a whole view shares (an offset, wiggling, the lens) show as a distance between registered views that noise
 does not explain. They widen the covariance and are noted; a view is refused only if they would blur the merged map by
-more than `BLUR_M`, or by more than a pixel where pixels are coarser."""
+more than `BLUR_M`, or by more than a pixel if pixels are coarser."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, invert, transform_points
 
 FALSE_ALARM_SIGMAS = 3.09
-"""Multiple of the residual's own scatter beyond which a view is refused; a good one is, once in a thousand."""
+"""A view is refused beyond this multiple of the residual's own scatter: a good view once in a thousand."""
 MEDIAN_SCATTER = 1.65
-"""Relative error of a standard deviation from the median, over that from the mean square: 1 / sqrt(0.37)."""
+"""Ratio of a standard deviation's relative error from the median to that from the mean square: 1 / sqrt(0.37)."""
 BLUR_M = 2.0 * MM
 """Distance between registered views that blurs a map too much: twice the noise of a single frame."""
 UNDETERMINED_PITCHES = 3.0
-"""A predicted error over the target of more pitches, and above `BLUR_M`, puts every point on a wrong pixel."""
+"""A larger predicted error over the target, in pitches, and above `BLUR_M`, puts every point on a wrong pixel."""
 MAX_JUMP_DEG, MAX_JUMP_M = 30.0, 0.1
 """Ten times the usual error of a nominal pose (some degrees, about 10 mm)."""
 UNJUDGED_AGREEMENT = ("nominal", "odometry")
-"""Methods that never look at the reference's surface: the distance that they leave is noted, not refused."""
+"""Methods that never use the reference's surface: their remaining distance is noted, not refused."""
 TRIMMED = 0.9
-"""Share of the fiducial points, nearest first, that must agree: a colour rule lets stray pixels through."""
+"""Share of the fiducial points, nearest first, that must agree: a colour rule also accepts stray pixels."""
 
 
 @dataclass(frozen=True)
 class Agreement:
     """Agreement of a registered view with the reference target. ``beside`` and ``overlap``: share of the view's target
-    points beside which the reference has a point within a pitch along the surface, at any distance across it, and at no
-    more than a pitch (or three sigma of noise). ``apart_m``: robust root mean square distance across the surfaces where
-    they lie beside each other. ``marks_m``: that of the fiducial points to the nearest of the reference, the farthest
-    tenth left out; NaN where either has fewer than three. ``noise_m`` and ``grids_m``: what noise, and two grids of one
-    pitch, explain of these; ``scatter`` and ``marks_scatter``: their relative errors, times `FALSE_ALARM_SIGMAS`."""
+    points with a reference point within a pitch along the surface, at any distance across it, and within a pitch (or
+    three sigma of noise) across it. ``apart_m``: robust root mean square distance across the surfaces where both exist.
+    ``marks_m``: that of the fiducial points to the nearest of the reference, without the farthest tenth; NaN if either
+    has fewer than three. ``noise_m``, ``grids_m``: distances that noise, and two grids of one pitch, explain.
+    ``scatter``, ``marks_scatter``: relative errors, times `FALSE_ALARM_SIGMAS`."""
 
     beside: float
     overlap: float
@@ -90,7 +90,7 @@ def _agreement(
 def judge(
     registration: registered.Registration, reference: PreparedView, view: PreparedView
 ) -> registered.Registration:
-    """Return the registration with its overlap and, where it is not to be trusted, a ``failure`` or note."""
+    """Return the registration with its overlap and, if it cannot be trusted, a ``failure`` or note."""
     T = registration.T_reference_view
     is_rigid = np.isfinite(T).all() and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-6)
     if not is_rigid or np.linalg.det(T[:3, :3]) < 0:
@@ -112,7 +112,7 @@ def judge(
     error_m, limit_m = float(np.hypot(within, across)), max(UNDETERMINED_PITCHES * ours.pitch_m, BLUR_M)
     undetermined, apart = "", _apart(agreement)
     if error_m > limit_m:
-        undetermined = "not determined: the points let the target slide or turn (they lie on a line, or the surface"
+        undetermined = "not determined: the points let the target slide or rotate (they lie on a line, or the surface"
         undetermined += (
             f" slides in itself); the predicted error over it is {error_m / MM:.1f} mm, which would blur the map"
         )
@@ -124,7 +124,7 @@ def judge(
 
 
 def _jump(registration: registered.Registration, reference: PreparedView, view: PreparedView) -> str:
-    """Return the reason why a pose is too far from its guess to be credible; empty where it is credible."""
+    """Return the reason why a pose is too far from its guess to be credible; empty if it is credible."""
     guess = registered.guess_of(reference, view)
     if guess is None:
         return ""
@@ -135,13 +135,13 @@ def _jump(registration: registered.Registration, reference: PreparedView, view: 
     if turn <= MAX_JUMP_DEG and shift <= MAX_JUMP_M:
         return ""
     credible = f"up to {MAX_JUMP_DEG:.0f} degrees and {MAX_JUMP_M / MM:.0f} mm are credible"
-    stands = f"stands {turn:.0f} degrees and {shift / MM:.0f} mm from its guess ({credible})"
+    stands = f"is {turn:.0f} degrees and {shift / MM:.0f} mm away from its guess ({credible})"
     return f"{stands}: marks matched wrongly, another target, or a wrong guess"
 
 
 def _apart(agreement: Agreement) -> str:
-    """Return the reason why surfaces or marks are too far apart to be merged; empty where they are not."""
-    # views may differ by their noise and BLUR_M, or by a pixel where that is larger
+    """Return the reason why surfaces or marks are too far apart to be merged; empty if they are not."""
+    # views may differ by their noise and BLUR_M, or by a pixel if that is larger
     blur = float(np.hypot(agreement.noise_m, max(BLUR_M, agreement.pitch_m)))
     limit = blur * (1 + agreement.scatter)
     marks_limit = float(np.hypot(blur, agreement.grids_m)) * (1 + agreement.marks_scatter)
@@ -159,9 +159,9 @@ def _apart(agreement: Agreement) -> str:
 def _widened(
     registration: registered.Registration, normal: np.ndarray, within: float, across: float, agreement: Agreement
 ) -> registered.Registration:
-    """Return the registration with a covariance that includes the errors that a whole view shares, and a note, where
-    the views show such errors. Their mean square, what neither noise nor the covariance explains of the distances, is
-    added to the shift, across the surface and within it. An offset of a whole view does not show."""
+    """Return the registration with a note and a covariance that includes the errors that a whole view shares, if the
+    views show such errors. Their mean square, which neither noise nor the covariance explains, is added to the shift,
+    across the surface and within it. An offset of a whole view does not show."""
 
     def beyond_m(measured_m: float, explained_m: float, scatter: float) -> float:
         beyond = measured_m > explained_m * (1 + scatter)
@@ -184,7 +184,7 @@ def _widened(
 
 def register(views: Sequence[PreparedView], config: AnyRegistration) -> tuple[registered.Registration, ...]:
     """Return one registration for each view; the first is that of the reference. A registration that cannot be trusted
-    has a ``failure``. Raises UserError where a view lacks an input of the method (colour, a pixel grid, a guess)."""
+    has a ``failure``. Raises UserError if a view lacks an input of the method (colour, a pixel grid, a guess)."""
     if not views:
         raise UserError("no views to register", legal="one or more views, the first being the reference")
     _check_views(views, config)
@@ -227,7 +227,7 @@ def _pair(reference: PreparedView, view: PreparedView, config: AnyRegistration) 
     elif config.method == "marks":
         found = register_by_marks(reference, view)
     else:
-        # nobody has stated how good the guess is
+        # the quality of the guess is unknown
         guess = registered.guess_of(reference, view)
         found = registered.Registration(view.view.name, "nominal", np.eye(4) if guess is None else guess)
     return replace(found, seconds=perf_counter() - started)

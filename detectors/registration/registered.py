@@ -15,20 +15,19 @@ from detectors.views import PreparedView
 from harness.vocabulary.geometry import MM, Cloud, invert, transform_points
 
 CLUSTER_PITCHES = 5.0
-"""Side of the cubes within which errors are taken to be common: that of the window of the widest depth filter."""
+"""Side of the cubes within which errors count as common: the window of the widest depth filter."""
 UNKNOWN_COVARIANCE = np.full((6, 6), np.nan)
-SLIDES = "not determined: the points can slide or turn without matching worse, as they can in a flat or smooth surface"
+SLIDES = "not determined: the points can slide or rotate without matching worse, as on a flat or smooth surface"
 
 
 @dataclass(frozen=True)
 class Registration:
-    """The pose of a view relative to the reference view. ``T_reference_view`` (4, 4), rigid, no scale. ``covariance``
-    (6, 6) of a small error (w, t): a point p of the reference frame is wrong by w x (p - ``centre_m``) + t, radians and
-    metres; NaN where the method has no estimate. It holds the noise of the method's points, not an error that a whole
-    view shares. ``residual_m``: root mean square of the minimised distances. ``overlap``: share of the view's target
-    points that lie within a pixel's pitch of the reference's target. ``failure``: why the view must not be merged;
-    empty where it may. ``pairs``: marks or points that were matched. ``seconds``: time taken (an equal share where
-    views are registered together)."""
+    """The pose of a view relative to the reference view. ``T_reference_view`` (4, 4): rigid, no scale. ``covariance``
+    (6, 6): of a small error (w, t), by which a point p of the reference frame is off by w x (p - ``centre_m``) + t,
+    radians and metres; NaN if the method has no estimate. It holds the noise of the method's points, not an error that
+    a whole view shares. ``residual_m``: root mean square of the minimised distances. ``overlap``: share of the view's
+    target points within a pixel's pitch of the reference's target. ``pairs``: marks or points that were matched.
+    ``seconds``: time taken (an equal share if joint). ``failure``: why the view must not be merged, else empty."""
 
     view: str
     method: str
@@ -57,7 +56,7 @@ def failed(view: PreparedView, method: str, T_guess: np.ndarray | None, failure:
 
 
 def guess_of(reference: PreparedView, view: PreparedView) -> np.ndarray | None:
-    """Return ``T_reference_view`` (4, 4) as implied by both guesses; the reference need not be the first view."""
+    """Return ``T_reference_view`` (4, 4) from both guesses; the reference need not be the first view."""
     ours, theirs = reference.view.T_reference_view_guess, view.view.T_reference_view_guess
     return None if ours is None or theirs is None else invert(ours) @ theirs
 
@@ -75,7 +74,7 @@ def displacement_jacobian(points_m: np.ndarray, centre_m: np.ndarray) -> np.ndar
 
 
 def moved_by(motion: np.ndarray, centre_m: np.ndarray) -> np.ndarray:
-    """Return the transform (4, 4) of a motion (w, t) about a centre (3,): a turn by the vector w, and a shift by t."""
+    """Return the transform (4, 4) of a motion (w, t) about a centre (3,): a rotation by the vector w, then a shift."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_rotvec(motion[:3]).as_matrix()
     T[:3, 3] = centre_m - T[:3, :3] @ centre_m + motion[3:]
@@ -93,9 +92,9 @@ def predicted_error_m(registration: Registration, points_m: np.ndarray, normal: 
 
 def clustered_sandwich(curvature: np.ndarray, scores: np.ndarray, points_m: np.ndarray, pitch_m: float) -> np.ndarray:
     """Return the covariance (6, 6) H^-1 S H^-1; S is the sum over cubes of points (n, 3) of the outer square of their
-    summed scores (n, 6). ``curvature`` H (6, 6) and ``scores`` belong to the same objective, in any unit. NaN where H
-    is not positive definite, or where there are too few cubes."""
-    # rotations and shifts compared at the points' own arm, so that definiteness does not depend on units
+    summed scores (n, 6). ``curvature`` H (6, 6) and ``scores`` belong to the same objective, in any unit. NaN if H is
+    not positive definite, or with too few cubes."""
+    # compare rotations and shifts at the points' own arm, so that definiteness does not depend on units
     arm = max(float(np.sqrt(np.sum(np.var(points_m, axis=0)))), 1e-12)
     unit = np.array([1 / arm] * 3 + [1.0] * 3)
     scaled = curvature * np.outer(unit, unit)
@@ -106,7 +105,7 @@ def clustered_sandwich(curvature: np.ndarray, scores: np.ndarray, points_m: np.n
     np.add.at(summed, which.ravel(), scores * unit)
     if len(summed) < 7 or not np.isfinite(values).all() or values[0] <= 1e-9 * max(values[-1], 0.0):
         return UNKNOWN_COVARIANCE.copy()
-    # the scores sum to zero at the optimum, which takes one cube's worth of scatter away
+    # the scores sum to zero at the optimum, which removes the scatter of one cube
     scatter = summed.T @ summed * len(summed) / (len(summed) - 1)
     inverse = (vectors / values) @ vectors.T
     covariance = inverse @ scatter @ inverse * np.outer(unit, unit)
@@ -114,22 +113,22 @@ def clustered_sandwich(curvature: np.ndarray, scores: np.ndarray, points_m: np.n
 
 
 NOISE_LAG = 6
-"""Pixels between the points of a second difference: beyond the widest depth filter, so that errors are independent."""
+"""Pixels between the points of a second difference: beyond the widest depth filter, errors are independent."""
 MIN_OVERLAP = 0.1
-"""Share of the view beside the reference's target below which nothing is left to judge the rest by."""
+"""Least share of the view beside the reference's target: with less, nothing can be judged."""
 MOVING_PITCHES = 0.5
-"""An iteration that still moves the target by more has not found its place."""
+"""An iteration whose last step moves the target by more has not converged."""
 MAX_POINTS = 10_000
-"""Most points of a cloud that is registered: the time of coherent point drift grows with the product."""
+"""Most points of a cloud to register: the time of coherent point drift grows with the product of both numbers."""
 THINNED_POINTS = 2000
 """Points on which overlap and agreement are judged: a share is then known to 1 %."""
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """One view's target, camera frame, metres. ``pitch_m``: median distance between neighbouring points, the longer way
-    of the grid. ``noise_m``: standard deviation of a point across the surface, fixed pattern included. ``centre_m``,
-    ``normal`` (3,): of the plane through the points, towards the camera. ``extent_m``: half the box' diagonal."""
+    """One view's target, camera frame, metres. ``pitch_m``: median distance between neighbouring points along the
+    coarser axis of the grid. ``noise_m``: standard deviation of a point across the surface, with the fixed pattern.
+    ``centre_m``, ``normal`` (3,): of the points' plane, towards the camera. ``extent_m``: half the box's diagonal."""
 
     pitch_m: float
     noise_m: float
@@ -169,9 +168,8 @@ def thinned(points_m: np.ndarray, most: int = THINNED_POINTS) -> np.ndarray:
 def clouds_of(
     reference: PreparedView, view: PreparedView, points: Literal["marks", "target"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, tuple[str, ...], str]:
-    """Return the points that registrations start from: those of the fiducials or of the whole target, of the reference
-    and of the view, each (n, 3) with at most `MAX_POINTS`; the guess (4, 4), a note where there is none, and the reason
-    why they cannot be registered, empty where they can."""
+    """Return the points to register, of the fiducials or of the whole target: the reference's and the view's, each (n,
+    3) with at most `MAX_POINTS`; the guess (4, 4); a note without one; and why they cannot be registered, else ""."""
     fixed, moving = (
         thinned(each.mark_points_m if points == "marks" else each.points_m, MAX_POINTS) for each in (reference, view)
     )
@@ -196,30 +194,30 @@ def local_normals(near_m: np.ndarray) -> np.ndarray:
 
 
 def _on_grid(cloud: Cloud, inside: np.ndarray) -> tuple[float, float]:
-    """Pitch and noise; NaN where too few neighbours are known."""
+    """Return pitch and noise; NaN if too few neighbours are known."""
     grid = np.where(inside[..., None], cloud.points_m, np.nan)
     steps, bends = [0.0], []
     for axis in (0, 1):
         step = np.diff(grid, axis=axis)
         step = step[np.isfinite(step[..., 2])]
         if len(step):
-            # the way along a tilted surface, from x and y and the median step in z: noise in z is no distance
+            # the distance along a tilted surface, from x and y and the median step in z, without noise in z
             lengths = np.linalg.norm(step[:, :2], axis=-1)
             steps.append(float(np.hypot(np.median(lengths), np.median(step[:, 2]))))
         z = np.moveaxis(grid[..., 2], axis, 0)
         bends.append((z[2 * NOISE_LAG :] - 2 * z[NOISE_LAG:-NOISE_LAG] + z[: -2 * NOISE_LAG]).ravel())
     values = np.concatenate(bends)
     values = values[np.isfinite(values)]
-    # fewer values say nothing; a second difference of white noise has sqrt(6) of its sigma
+    # fewer values do not suffice; a second difference of white noise has sqrt(6) of its sigma
     noise = sigma_of(values) / np.sqrt(6.0) if len(values) >= 100 else float("nan")
     return max(steps) or float("nan"), noise
 
 
 def _without_grid(points_m: np.ndarray) -> tuple[float, float]:
-    """Pitch, and noise by the distances of points to the plane through their 25 nearest; 0 where there are too few."""
+    """Return pitch, and noise by the distances of points to the plane through their 25 nearest; 0 if too few."""
     if len(points_m) < 2:
         return 0.0, 0.0
-    # neighbours along the surface: those in space would be chosen by their noise
+    # neighbours along the surface: in space, noise would select them
     arm = points_m - points_m.mean(axis=0)
     places = arm @ np.linalg.eigh(arm.T @ arm)[1][:, 1:]
     count = min(CORRELATED_PIXELS, len(points_m))
@@ -233,7 +231,7 @@ def _without_grid(points_m: np.ndarray) -> tuple[float, float]:
 
 
 def still_moving(step_m: float, pitch_m: float) -> str:
-    """Return the reason why an iteration whose last step moved the target by ``step_m`` failed; empty if it did not."""
+    """Return the reason why an iteration whose last step moved the target by ``step_m`` failed, else ""."""
     if step_m <= MOVING_PITCHES * pitch_m:
         return ""
     return f"did not converge: the last step still moved the target by {step_m / MM:.2f} mm"

@@ -132,8 +132,8 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
         return on_window(values, cloud.region, window, outside)
 
     damage = np.zeros(cloud.region.shape, np.uint16)
-    for one in truth:
-        damage.ravel()[known.outlines[one.id]] = one.id
+    for each in truth:
+        damage.ravel()[known.outlines[each.id]] = each.id
     intensity = np.zeros(damage.shape) if cloud.amplitude is None else np.nan_to_num(cloud.amplitude)
     arrays = {
         "points_m": put(cloud.points_m.astype(np.float32), np.nan),
@@ -167,13 +167,13 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
     for path, content in files.items():
         write_bytes(path, content, durable=False)
     camera, damages = sample.task.set_ups[0].camera, []
-    for one in truth:
+    for each in truth:
         own = np.zeros(damage.shape, bool)
-        own.ravel()[known.outlines[one.id]] = True
+        own.ravel()[known.outlines[each.id]] = True
         rows, columns = np.nonzero(own := put(own, False))
         box = [int(n) for n in (columns.min(), rows.min(), np.ptp(columns) + 1, np.ptp(rows) + 1)]
-        facts = {"pixels": len(rows), "bbox": box, "run_lengths": run_lengths(own), "line_m": one.line_m.tolist()}
-        damages.append({**one.to_row(), "seen_depth_mm": known.seen_depth_m[one.id] / MM, **facts})
+        facts = {"pixels": len(rows), "bbox": box, "run_lengths": run_lengths(own), "line_m": each.line_m.tolist()}
+        damages.append({**each.to_row(), "seen_depth_mm": known.seen_depth_m[each.id] / MM, **facts})
     facts_of_board = {
         "file_name": f"{sample.category}/{sample.split}/{sample.label}/rgb/{file}.png",
         "height": window.shape[0],

@@ -8,8 +8,8 @@ from detectors import load_detector
 from detectors.average import prefix_averages
 from harness.experiment.load import resolved_yaml
 from harness.experiment.schema import CaptureSource, Experiment, recording_of
+from harness.inspection.output import capture_facts, choice_by, choice_facts, pictures, print_warnings
 from harness.inspection.run import judged
-from harness.inspection.told import capture_facts, choice_by, choice_facts, pictures, print_warnings
 from harness.listing import point_to
 from harness.report.findings import write_findings
 from harness.tables.outputs import EXPERIMENT, PROVENANCE

@@ -116,7 +116,7 @@ class ClusterEngine:
         return self
 
     def __exit__(self, *error: object) -> None:
-        busy = [one.address for one in self._nodes.values() if one.bundles]
+        busy = [node.address for node in self._nodes.values() if node.bundles]
         if busy and self._client.status == "running":
 
             async def dropped() -> None:
@@ -129,7 +129,7 @@ class ClusterEngine:
     def room(self, stage: Stage) -> int:
         """Return the room for enough jobs to keep all nodes busy, with the next bundles ready."""
         each = 1 if stage == "renders" else WITH_NODE * self._bundle_size() + 1
-        return max(1, each * sum(one.facts.processes for one in self._nodes.values())) + 1 - self._out[stage]
+        return max(1, each * sum(node.facts.processes for node in self._nodes.values())) + 1 - self._out[stage]
 
     def submit(self, job: Job) -> None:
         """Take a job."""
@@ -152,7 +152,7 @@ class ClusterEngine:
     def _hand_out(self) -> None:
         """Send each node a bundle of trials, then a second one, and renders where it may render."""
         renders, trials = self._waiting["renders"], self._waiting["trials"]
-        some_offer = any(one.facts.offers_render and one.can_render for one in self._nodes.values())
+        some_offer = any(node.facts.offers_render and node.can_render for node in self._nodes.values())
         for most, to in product(range(WITH_NODE), list(self._nodes.values())):
             processes, offers = to.facts.processes, to.facts.offers_render
             # A node with one process does one thing at a time: trials first, because renders only make more of them;
@@ -225,11 +225,11 @@ class ClusterEngine:
         if number is None:
             self._examined(address, answer)
             return
-        one = self._nodes.get(address)
-        bundle = None if one is None else one.bundles.pop(number, None)
-        if one is None or bundle is None:
+        node = self._nodes.get(address)
+        bundle = None if node is None else node.bundles.pop(number, None)
+        if node is None or bundle is None:
             return  # the node was given up in the meantime
-        one.renders -= bundle.jobs[0].stage == "renders"
+        node.renders -= bundle.jobs[0].stage == "renders"
         if isinstance(answer, tuple):
             for job, ended in zip(bundle.jobs, answer, strict=True):
                 if job.stage == "trials":
@@ -273,8 +273,8 @@ class ClusterEngine:
 
     def _gone(self, address: str) -> None:
         """Give up a node and pass its jobs to others."""
-        one = self._nodes.pop(address, None)
-        for bundle in one.bundles.values() if one is not None else ():
+        node = self._nodes.pop(address, None)
+        for bundle in node.bundles.values() if node is not None else ():
             why = "its worker died: by hand, by the batch system, or by the system as memory ran out"
             self._lost(bundle.jobs, why, address)
 
@@ -298,7 +298,7 @@ class ClusterEngine:
             raise next(iter(self._refused.values()))
         if not self._nodes:
             lacking, fix = "worker", "start some with `dask worker ADDRESS --nthreads PROCESSES`"
-        elif self._waiting["renders"] and not any(one.can_render for one in self._nodes.values()):
+        elif self._waiting["renders"] and not any(node.can_render for node in self._nodes.values()):
             lacking = "worker that can render (with Mitsuba, Dr.Jit and trimesh as here)"
             fix = "install tofpod on the workers just as here"
         if lacking != self._lacking:

@@ -1,9 +1,9 @@
-"""A part before a camera, patch by patch: its noise there, how strongly damage shows, and how often it is found.
+"""A part in front of a camera, patch by patch: its noise, the signal of damage there, and how often damage is found.
 
-Noise at a place is the detector's unit of score there, in metres: a constant where it has one scale for the whole part,
-else what it takes from round about. How strongly damage shows, and how surely, is learnt from the detector's own scores
-on boards of the family in random poses as wide as those asked for. Not modelled: which way the undamaged part errs at
-a place (the unit's pattern, the surface's misfit), light of other parts, sizes in missing returns."""
+The noise at a place is the detector's unit of score there, in metres: constant if the detector has one scale for the
+whole part, else measured nearby. The signal of damage and its scatter are learned from the detector's own scores on
+boards of the family, in random poses as wide as those requested. Not modelled: the direction of the undamaged part's
+error at a place (the unit's pattern, the surface's misfit), light of other parts, sizes in missing returns."""
 
 from __future__ import annotations
 
@@ -31,19 +31,21 @@ from scenes.target.custom import BoardConfig, PoseConfig
 from scenes.target.drawn import DrawnTargetConfig
 from scenes.target.truth import Damage, face_of
 
-BOARDS, LOOKS = 40, 3  # Damaged boards to learn from, and averages in which each is inspected
-STEEPEST_DEG = 60.0  # Tilt about either axis of these boards, at most
-DRAWS, AROUND_PX, NEAR_PX = 2, 31, 15  # Averages for noise; sides of squares for the unit of score, for missing pixels
+BOARDS, LOOKS = 40, 3  # damaged boards to learn from, and averages in which each is inspected
+STEEPEST_DEG = 60.0  # largest tilt of these boards about either axis
+DRAWS, AROUND_PX, NEAR_PX = 2, 31, 15  # averages for noise; sides of squares for the unit of score, for missing pixels
 MOST_PATCHES = 3000
-SAME_MM = 1e-6  # Sizes that differ by less are one: then the size of damage is its depth
-ON_FACE_M = 5 * MM  # A patch is seen where the view's own z agrees with its z by this, or by two pixels along the slope
+SAME_MM = 1e-6  # sizes that differ by less are equal; if all are, the size of damage is its depth
+ON_FACE_M = (
+    5 * MM
+)  # a patch is visible if its z and the view's differ by less than this, or than two pixels along the slope
 
 Pose = tuple[float, float, float]  # Distance in metres, tilts of the part about its x and y in degrees
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """A set-up before a part: ``task`` with the threshold, what it finds, how it has ``seen`` patches by pose."""
+    """A set-up in front of a part. ``task``: has the threshold. ``found``: the signal's law. ``seen``: by pose."""
 
     point: Point
     task: PointTask
@@ -53,8 +55,8 @@ class Survey:
 
 
 def survey(experiment: Experiment, poses: Sequence[Pose], cache: Path, folder: Path, engine: JobEngine) -> list[Survey]:
-    """Return a survey for each set-up. Views and trials that are in ``cache`` and ``folder`` are not made again. Raises
-    UserError where a point has no threshold, and as `declared` and `findable` do."""
+    """Return a survey for each set-up. Views and trials in ``cache`` and ``folder`` are not made again. Raises
+    UserError if a point has no threshold, and as `declared` and `findable` do."""
     plan = SweepPlan(tuple(_widened(group, poses) for group in plan_of(experiment, cache, folder).groups))
     journal, scores = Journal(folder / "journal"), dict[tuple[str, int, int, str], list[float]]()
     with progress_display() as report:
@@ -70,27 +72,27 @@ def survey(experiment: Experiment, poses: Sequence[Pose], cache: Path, folder: P
         patches = patches_of(family.board)
         target, wholes = family.drawn("hole_free", 0), [_bare(batch) for batch in group.then]
         configs = [PoseConfig(distance_m=distance_m, tilt_x_deg=x, tilt_y_deg=y) for distance_m, x, y in poses]
-        placed = (target.model_copy(update={"pose": one}) for one in configs)
-        views = [batch_of(one, "hole_free", source, cache, 0) for one in placed]
+        placed = (target.model_copy(update={"pose": pose}) for pose in configs)
+        views = [batch_of(board, "hole_free", source, cache, 0) for board in placed]
         if lost := render_missing((job for batch in (*wholes, *views) for job in batch.renders), engine):
             raise UserError(f"a view could not be rendered: {lost[0].in_short}")
         for point in group.points:
             if point.digest not in outcome.thresholds:
-                why = next((one.in_short for one in outcome.failures), "no hole-free run ended")
+                why = next((failure.in_short for failure in outcome.failures), "no hole-free run ended")
                 raise UserError(f"{point.label or point.variant} has no threshold: {why}")
             task = point_task(point, outcome.thresholds[point.digest], group.learned.get(point.digest))
             boards = _each(_board_seen, zip(group.then, wholes, strict=True), (task, group.seed), engine)
-            some = _inspections([one for one in boards if one is not None], point, scores)
+            some = _inspections([each for each in boards if each is not None], point, scores)
             found = findable(some, outcome.thresholds[point.digest])
             blind = np.full(len(patches.areas_m2), np.inf)
             seen = _each(_part_seen, ((view,) for view in views), (task, group.seed, patches), engine)
-            seen = [Seen(blind, np.ones(len(blind)), np.ones(len(blind))) if one is None else one for one in seen]
+            seen = [Seen(blind, np.ones(len(blind)), np.ones(len(blind))) if each is None else each for each in seen]
             surveys.append(Survey(point, task, patches, found, dict(zip(poses, seen, strict=True))))
     return surveys
 
 
 def patches_of(board: BoardConfig) -> Patches:
-    """Return the face of a board in about `MOST_PATCHES` patches, square in plan."""
+    """Return the face of a board in about `MOST_PATCHES` patches that are square in plan."""
     sides_m = np.array([board.width_mm, board.height_mm]) * MM
     counts = np.maximum(np.rint(sides_m / np.sqrt(sides_m.prod() / MOST_PATCHES)), 2).astype(int)
     x, y = ((np.arange(n) + 0.5) * side / n - side / 2 for n, side in zip(counts.tolist(), sides_m, strict=True))
@@ -103,29 +105,29 @@ def patches_of(board: BoardConfig) -> Patches:
 
 
 def declared(config: ExperimentConfig) -> tuple[SimulatedSource, DrawnTargetConfig]:
-    """Return the source and the family of boards. Raises UserError where there is no study of these in single views."""
+    """Return the source and the family of boards. Raises UserError if there is no study of these in single views."""
     source = config.simulated
     if isinstance(source.target, DrawnTargetConfig) and config.study is not None and source.views is None:
         return source, source.target
     fix = "declare `study`, and `source.target: {name: drawn, damage: ..., board: ...}`, as experiments/pipe.yaml does"
-    raise UserError(f"{config.name}: is no study of drawn damage, each seen in a single view", fix=fix)
+    raise UserError(f"{config.name}: is not a study of drawn damage in single views", fix=fix)
 
 
 def refuse_size(config: ExperimentConfig, size_mm: float | None) -> None:
-    """Raise UserError for a size outside the range that is declared: of damage of one size in plan, of its depths."""
+    """Raise UserError for a size outside the declared range, that of depths if all sizes in plan are equal."""
     damage = declared(config)[1].damage
     low, high = damage.size_mm
     word = damage.size_of
     if high - low < SAME_MM and damage.depths_mm:
         word, (low, high) = "depth", damage.depths_mm
     if size_mm is not None and not low <= size_mm <= high:
-        fix = "change the damage's range in the experiment: nothing is said of sizes that are not inspected"
-        said = f"{size_mm:.3g} mm: {config.name} inspects no damage of that size"
-        raise UserError(said, legal=f"{low:.3g} to {high:.3g} mm ({word})", fix=fix)
+        fix = "change the damage's range in the experiment: sizes that are not inspected have no limit"
+        what = f"{size_mm:.3g} mm: {config.name} inspects no damage of that size"
+        raise UserError(what, legal=f"{low:.3g} to {high:.3g} mm ({word})", fix=fix)
 
 
 def _widened(group: Group, poses: Sequence[Pose]) -> Group:
-    """The group with damaged boards in poses that reach as far as those given, and as the face is bent."""
+    """Return the group with damaged boards in poses that reach as far as those given, and as the face is curved."""
     source, family = declared(group.points[0].config)
     bent_deg = float(np.degrees(np.arccos(patches_of(family.board).normals[:, 2].min())))
     tilt_deg = min(family.tilt_deg + bent_deg + max(max(abs(x), abs(y)) for _, x, y in poses), STEEPEST_DEG)
@@ -134,12 +136,12 @@ def _widened(group: Group, poses: Sequence[Pose]) -> Group:
     wide = {"tilt_deg": tilt_deg, "distance_m": (near_m + far_m) / 2, "distance_jitter_mm": jitter_mm}
     family, cache = family.model_copy(update=wide), group.then[0].renders[0].folder
     then = tuple(batch_of(family.drawn("damaged", n), "damaged", source, cache, n) for n in range(BOARDS))
-    often = [replace(one, config=one.config.model_copy(update={"repeats": LOOKS})) for one in group.points]
+    often = [replace(point, config=point.config.model_copy(update={"repeats": LOOKS})) for point in group.points]
     return replace(group, points=tuple(often), then=then)
 
 
 def _bare(batch: Batch) -> Batch:
-    """A damaged batch's board without its damage."""
+    """Return a damaged batch's board without its damage."""
     (job,), (ref,) = batch.renders, batch.set_ups
     job = replace(job, target=job.target.hole_free())
     ref = replace(ref, view_path=str(job.path), damaged=False)
@@ -149,7 +151,7 @@ def _bare(batch: Batch) -> Batch:
 def _each(
     act: Callable[..., Any], asked: Iterable[tuple[Batch, ...]], further: tuple[Any, ...], engine: JobEngine
 ) -> list[Any]:
-    """The values of a function of batches, None where its detector can judge nothing; a bug is raised."""
+    """Return the values of a function of batches, None if the detector cannot judge any board. A bug is raised."""
     jobs = [Job(str(n), "trials", act, (*some, *further)) for n, some in enumerate(asked)]
     ends = {job.name: ended for job, ended in carried_out(jobs, engine)}
     if bug := next((end.why for end in ends.values() if end.is_bug), None):
@@ -160,7 +162,7 @@ def _each(
 def _inspections(
     boards: Sequence[Any], point: Point, scores: Mapping[tuple[str, int, int, str], Sequence[float]]
 ) -> ScoredDamage:
-    """All inspections of the damages of boards (`_board_seen`)."""
+    """Return all inspections of the damages of boards (`_board_seen`)."""
     facts = list[tuple[float, ...]]()
     for number, damages in boards:
         for damage, seen in damages:
@@ -176,16 +178,16 @@ def _inspections(
 
 
 def _unit_m(batch: Batch, point: PointTask, seed: int) -> np.ndarray:
-    """The detector's unit of score (h, w) on a hole-free board, metres: residual over score, rms about each pixel;
-    larger where some pixels or averages are not judged, infinite where most are not."""
+    """Return the detector's unit of score (h, w) on a hole-free board, metres: residual over score, rms around each
+    pixel; larger if some pixels or averages are not judged, infinite if most are not."""
     fields = []
     for repeat in range(DRAWS):
         task = TrialTask(batch.before(repeat), seed, "hole_free", repeat, (point,), None, batch.board)
         evidence = detector_of(point.detector, point.settings_json, point.learned).analyse(cloud_of(task, point))
         known = np.isfinite(evidence.score)
-        fields.append([known, *(np.where(known, one**2, 0.0) for one in (evidence.residual_m, evidence.score))])
+        fields.append([known, *(np.where(known, image**2, 0.0) for image in (evidence.residual_m, evidence.score))])
     known, *squares = np.mean(fields, axis=0)
-    square, of_score = (ndimage.uniform_filter(one, AROUND_PX) for one in squares)
+    square, of_score = (ndimage.uniform_filter(image, AROUND_PX) for image in squares)
     judged = (known >= 0.5) & (square > 0) & (of_score > 0)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(judged, np.sqrt(square / of_score / ndimage.uniform_filter(known, NEAR_PX)), np.inf)
@@ -194,7 +196,7 @@ def _unit_m(batch: Batch, point: PointTask, seed: int) -> np.ndarray:
 def _board_seen(
     batch: Batch, whole: Batch, point: PointTask, seed: int
 ) -> tuple[int, list[tuple[Damage, tuple[float, float, float]]]]:
-    """A damaged board's number, and its damages with how each is seen (`Seen`) on the board that lacks them."""
+    """Return a damaged board's number, and its damages with the view of each (`Seen`) on the board without damage."""
     set_up, unit_m, found = load_set_up(batch.set_ups[0]), _unit_m(whole, point, seed), []
     for damage in set_up.truth:
         range_m = float(np.linalg.norm(damage.centre_camera_m))
@@ -205,7 +207,7 @@ def _board_seen(
 
 
 def _part_seen(view: Batch, point: PointTask, seed: int, patches: Patches) -> Seen:
-    """Return how the patches of an undamaged part are seen and judged."""
+    """Return the view and the noise of the patches of an undamaged part."""
     set_up = load_set_up(view.set_ups[0])
     deviation_m = _unit_m(view, point, seed)
     there = transform_points(set_up.T_camera_board, patches.points_m)
@@ -216,7 +218,7 @@ def _part_seen(view: Batch, point: PointTask, seed: int, patches: Patches) -> Se
     u, v = np.rint(lens.project(there)).astype(int).T - [[region.col0], [region.row0]]
     seen = camera.images(there) & (cosine > 0) & (u >= 0) & (v >= 0) & (u < region.shape[1]) & (v < region.shape[0])
     u, v = np.where(seen, u, 0), np.where(seen, v, 0)
-    # what stands before a patch has another z
+    # an object in front of a patch has another z
     slope = np.sqrt(1 / np.clip(cosine, 0.05, 1) ** 2 - 1)
     reach_m = np.maximum(ON_FACE_M, 2 * slope * range_m / min(lens.fx, lens.fy))
     seen &= np.abs(set_up.seen_z_m[v, u] - there[:, 2]) < reach_m

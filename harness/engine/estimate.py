@@ -19,7 +19,7 @@ from harness.engine.work import EngineOptions, Outcome
 from harness.experiment.schema import CaptureSource, Experiment
 from harness.tables.text import many
 
-PLAIN_EVERY_S = 10.0  # seconds between lines if there is no terminal: a sign of life in a log
+PLAIN_EVERY_S = 10.0  # seconds between progress lines in a log, if there is no terminal
 WINDOW_S = 60.0  # rates are those of the last minute, because set-ups differ in speed
 
 

@@ -37,7 +37,7 @@ def ideal_of_set_ups(plan: SweepPlan, engine: JobEngine, calls_per_m2: float) ->
     for group in plan.groups:
         batches = [batch for batch in group.then if batch.role == "damaged"]
         lost = render_missing((job for batch in batches for job in batch.renders), engine)
-        jobs = [Job(f"noise of board {one.board}", "trials", board_views, (one, group.points)) for one in batches]
+        jobs = [Job(f"noise of board {batch.board}", "trials", board_views, (batch, group.points)) for batch in batches]
         ends = {} if lost else {job.name: ended for job, ended in carried_out(jobs, engine)}
         if bug := next((end.why for end in ends.values() if end.is_bug), None):
             raise RuntimeError(bug)

@@ -36,9 +36,9 @@ from scenes.target.drawn import DrawnTargetConfig, Purpose
 from scenes.target.truth import truth_of
 
 MOST_HOLE_FREE, MOST_SETTING = 20, 5  # most undamaged averages that count false calls, and that set a threshold
-MOST_EMPTY = 200  # give up after so many placements in a row without a place for any damage
+MOST_EMPTY = 200  # give up after this many placements in a row without a place for any damage
 NORMAL_PX = 4  # half the side of the square of surface that determines the tangent plane
-TELLING_DEG = 5.0  # a warning follows if the judged rim is so much steeper than the places of damage
+TELLING_DEG = 5.0  # a warning follows if the judged rim is steeper than the places of damage by this angle
 VARIANT = "main"
 
 
@@ -166,7 +166,7 @@ class Scan:
         return ray * (middle @ normal) / (ray @ normal), normal
 
     def known(self, cloud: Cloud, target: TargetConfig) -> KnownCloud:
-        """Return a cloud of this scan with the truth of the damages put into it."""
+        """Return a cloud of this scan with the truth of the implanted damage."""
         truth = truth_of(target, self.T_camera_board)
         intact = self.judged & far_from(truth, self.places_m, INTACT_MARGIN_PX * self.pitch_m)
         of_truth = (target, truth, outlined(truth, self.places_m), self.places_m)
@@ -184,7 +184,7 @@ class Implanted:
     implants: tuple[Implant, ...]
 
     def cloud(self, group: slice) -> Cloud:
-        """Return the average of a group of the scan's frames after the damage is put into them."""
+        """Return the average of a group of the scan's frames with the damage implanted."""
         changed = []
         for number, frame in list(enumerate(self.scan.frames))[group]:
             z_m, reason = frame.z_m.copy(), frame.reason.copy()
@@ -268,7 +268,7 @@ def judge_scans(
     )  # fmt: skip
     detector = detector_of(judging.detector, judging.settings_json)
     camera_data = camera_of(unit_config(camera, scans[0].lens)[0]).to_data()
-    set_ups, files = [], [str(path) for one in scans for path in one.recording.files]
+    set_ups, files = [], [str(path) for scan in scans for path in scan.recording.files]
     for count in frames:
         holes, runs = (of[of["frames"] == count] for of in (tables.holes, tables.runs))
         set_ups.append(

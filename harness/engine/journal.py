@@ -58,12 +58,12 @@ class Journal:
         return sorted(key for key in self._known() if key.startswith(THRESHOLDS))
 
     def state(self, key: str) -> State | None:
-        """Return how a trial ended; None where there is no entry."""
+        """Return how a trial ended; None if there is no entry."""
         place = self._known().get(key)
         return None if place is None else place.state
 
     def read(self, key: str) -> Ended | None:
-        """Return the entry of a trial; None where there is none."""
+        """Return the entry of a trial; None if there is none."""
         place = self._known().get(key)
         if place is None:
             return None

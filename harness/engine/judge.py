@@ -1,4 +1,4 @@
-"""One detector on one cloud against the truth: rows of a run and each damage; further rows of a study's board."""
+"""Judges one detector on one cloud: rows for the run and for each damage, and further rows for a study's board."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from detectors import DETECTORS, load_detector
-from detectors.interface import Calibratable, Detection, Detector, Evidence, Measurement, ToldTheTruth, TrueDamage
+from detectors.interface import Calibratable, Detection, Detector, Evidence, Measurement, NeedsTruth, TrueDamage
 from detectors.masks import grown
 from detectors.missing import missing_returns, one_damage_once
 from detectors.noise import median_of, sigma_of
@@ -24,17 +24,17 @@ from scenes.target.truth import Damage
 
 Rows = dict[str, list[dict[str, Any]]]  # rows by table
 STUDY_TABLES = ("sites", "findings", "operating", "pixels")
-SMEARED_PX = 2  # Pixels by which an outline is grown before findings are laid over it: half of a camera's window
+SMEARED_PX = 2  # an outline is grown by half of a camera's window before detections are compared with it
 STEPS_PER_OCTAVE = 4
-FINDING_OCTAVES = (-2, 3)  # Other thresholds for findings: below, most of a noisy face is one finding
-PIXEL_OCTAVES = (-6, 4)  # Other thresholds for pixels, down to where a third of the undamaged face lies above
+FINDING_OCTAVES = (-2, 3)  # further thresholds for detections: below them, most of a noisy face is one detection
+PIXEL_OCTAVES = (-6, 4)  # further thresholds for pixels: a third of the undamaged face exceeds the lowest
 
 
 @dataclass(frozen=True)
 class JudgedCloud:
-    """One detector on one cloud. ``run``: its row; ``holes``: one row per damage. ``places_m`` (m, 2): findings on the
-    face; ``pairs``: index into ``known.truth`` -> index into ``detections``, on a hole-free board at those places.
-    ``overlap``: the rule by which findings were matched beside the hit radius."""
+    """The result of one detector on one cloud. ``run``: its row. ``holes``: a row per damage. ``places_m`` (m, 2): of
+    the detections on the face. ``pairs``: index into ``known.truth`` -> index into ``detections``; on a hole-free
+    board, at the places of left-out damage. ``overlap``: the rule of matching beside the hit radius."""
 
     run: dict[str, Any]
     holes: list[dict[str, Any]]
@@ -57,7 +57,7 @@ def judge(
     hole_free: bool,
     learned: str | None = None,
 ) -> JudgedCloud:
-    """Judge a detector on a cloud; without a threshold, find the quiet threshold only. ``learned``: a file."""
+    """Judge a detector on a cloud; without a threshold, only find the quiet threshold. ``learned``: path of a file."""
     cloud = known.cloud
     detector = detector_for(known, detector_name, settings_json, hole_free=hole_free, learned=learned)
     evidence = detector.analyse(cloud)
@@ -77,13 +77,13 @@ def judge(
     if threshold is None:
         return JudgedCloud(run, [], detector, evidence)
     detections = detector.find(cloud, evidence, threshold)
-    places_m = known.on_board(np.array([one.centre_m for one in detections]).reshape(-1, 3))
+    places_m = known.on_board(np.array([detection.centre_m for detection in detections]).reshape(-1, 3))
     pairs, parts = matched(known, detections, radius_m, overlap)
     of_damage = 0 if hole_free else len(pairs) + parts
     run |= {"detections": len(detections), "false_calls": len(detections) - of_damage}
     if hole_free:
         return JudgedCloud(run, [], detector, evidence, detections, places_m, pairs, overlap=overlap)
-    # what counts is measured, and the largest finding, to whose place the others are compared
+    # measure the hits, and the largest detection: the other places are given relative to it
     largest = max(range(len(detections)), key=lambda number: len(detections[number].pixels), default=-1)
     wanted = {*pairs.values(), largest} - {-1}
     measured = {number: detector.measure(cloud, evidence, detections[number]) for number in wanted}
@@ -96,10 +96,10 @@ def judge(
 def matched(
     known: KnownCloud, detections: Sequence[Detection], radius_m: float, overlap: float | None
 ) -> tuple[dict[int, int], int]:
-    """Return the findings that count for damages, {index of damage: index of finding}, one for each, nearest first; and
-    how many others are parts of a damage and so no false calls. A finding may count where its centre lies within the
-    radius of the damage's centre (of long damage its centre line), with an ``overlap`` also where this share of its
-    pixels lies on the damage, its outline grown by `SMEARED_PX`. Findings that overlap so beside it are parts."""
+    """Match detections to damages one to one, nearest first. Return the hits, {index of damage: index of detection},
+    and the number of other detections that are parts of a damage and so not false calls. A hit's centre lies within the
+    radius of the damage's centre (or centre line, if long), or, with an ``overlap``, at least this share of its pixels
+    lies on the damage, grown by `SMEARED_PX`. Other detections with this overlap are parts."""
     (found,) = _matched(known, [Findings.of(detections)], radius_m, overlap)
     return found
 
@@ -107,7 +107,7 @@ def matched(
 def _matched(
     known: KnownCloud, levels: Sequence[Findings], radius_m: float, overlap: float | None
 ) -> list[tuple[dict[int, int], int]]:
-    """`matched` of the findings at each of several thresholds."""
+    """Apply `matched` to the detections at each of several thresholds."""
     lines, areas = [damage.line_m for damage in known.truth], []
     if overlap is not None:
         outlines = [known.outlines[damage.id] for damage in known.truth]
@@ -116,7 +116,7 @@ def _matched(
 
 
 def smeared(outlines: Sequence[np.ndarray], shape: tuple[int, ...], *, grid: bool = True) -> list[np.ndarray]:
-    """Return masks (n,) of pixels for outlines of flat indices, grown by `SMEARED_PX` on a ``grid``."""
+    """Return a mask (n,) of pixels for each outline of flat indices, grown by `SMEARED_PX` on a ``grid``."""
     masks = []
     for outline in outlines:
         on = np.zeros(shape, bool)
@@ -133,8 +133,8 @@ def matched_places(
     radius_m: float,
     overlap: float | None,
 ) -> list[tuple[dict[int, int], int]]:
-    """Match as `matched` does: damages by their centre lines and masks ``areas`` (none without an ``overlap``), and the
-    findings at each of several thresholds, whose centres ``placed`` brings onto the face."""
+    """Match as `matched` does. ``lines_m``: centre lines of the damages. ``areas``: their masks (none without an
+    ``overlap``). ``placed``: maps centres onto the face. ``levels``: the detections at each of several thresholds."""
     places_m = placed(np.concatenate([found.centres_m for found in levels]))
     apart = np.array([from_line_m(line, places_m) for line in lines_m]).reshape(len(lines_m), len(places_m))
     matches, start = [], 0
@@ -154,7 +154,7 @@ def matched_places(
 
 @lru_cache(maxsize=32)
 def detector_of(name: str, settings_json: str, learned: str | None = None) -> Detector:
-    """Return a detector, with what it has learned where there is such a file."""
+    """Return a detector; if the file ``learned`` is given, with what it has learned."""
     detector = load_detector(name, json.loads(settings_json))
     if learned is None or not isinstance(detector, Calibratable):
         return detector
@@ -165,15 +165,15 @@ def detector_of(name: str, settings_json: str, learned: str | None = None) -> De
 def detector_for(
     known: KnownCloud, name: str, settings_json: str, *, hole_free: bool, learned: str | None = None
 ) -> Detector:
-    """Return the detector that is to see a cloud. A built-in one that asks for the truth gets it; no plug-in does."""
+    """Return the detector for a cloud. A built-in detector that needs the truth gets it; no plug-in does."""
     detector = detector_of(name, settings_json, learned)
-    if not (isinstance(detector, ToldTheTruth) and DETECTORS.offer(name).built_in):
+    if not (isinstance(detector, NeedsTruth) and DETECTORS.offer(name).built_in):
         return detector
     truth = (
         TrueDamage(known.centre_in_cloud_m(damage), damage.diameter_m, known.outlines[damage.id])
         for damage in known.truth
     )
-    return detector.told(() if hole_free else tuple(truth))
+    return detector.with_truth(() if hole_free else tuple(truth))
 
 
 def _place(damage: Damage) -> dict[str, Any]:
@@ -190,9 +190,9 @@ def _place(damage: Damage) -> dict[str, Any]:
 def _hole_row(
     known: KnownCloud, evidence: Evidence, damage: Damage, found: Measurement | None, largest: Measurement | None
 ) -> dict[str, Any]:
-    """The row of one damage, mm; positions as the thesis takes them, from the largest cluster."""
+    """Return the row of one damage, mm. As in the thesis, positions are relative to the largest cluster."""
     inside = known.outlines[damage.id]
-    # a cloud without a grid has no pixels that could lack a range
+    # only a pixel of a grid can lack a range
     seen_z = known.cloud.points_m.reshape(-1, 3)[inside, 2]
     missing = float((~np.isfinite(seen_z)).mean()) if known.cloud.organised else np.nan
     residual = evidence.residual_m.reshape(-1)[inside]
@@ -224,19 +224,19 @@ def _hole_row(
     row |= {"angle_deg": float(np.degrees(np.arctan2(y, x) + np.pi / 2) % 180 - 90)}
     row |= {f"{name}_mm": float(getattr(found, f"{name}_m")) / MM for name in names}
     for kind in kinds:
-        centre, reference = (getattr(one, f"{kind}_centre_m") for one in (found, largest))
+        centre, reference = (getattr(measured, f"{kind}_centre_m") for measured in (found, largest))
         row[f"{kind}_offset_mm"] = float(np.linalg.norm(centre - reference)) / MM
         row[f"{kind}_error_mm"] = float(np.linalg.norm(centre - known.centre_in_cloud_m(damage))) / MM
     return row | {"score": float(found.score), "points": int(found.points), "model_note": found.model_note}
 
 
 def study_rows(known: KnownCloud, judged: JudgedCloud, radius_m: float, *, hole_free: bool) -> Rows:
-    """Return the rows of one board by table (`STUDY_TABLES`, "runs", "holes"); of one that only sets a threshold, the
-    area and what stood out most. Findings without return stand in ``no_return`` and ``no_return_calls``."""
+    """Return the rows of one board by table (`STUDY_TABLES`, "runs", "holes"); a board that only sets a threshold has
+    its area and its highest score. Detections without return count in ``no_return`` and ``no_return_calls``."""
     score, threshold = judged.evidence.score, judged.run["threshold"]
     run = {**judged.run, "inspected_m2": known.area_m2(np.isfinite(score))}
     if np.isnan(threshold):
-        # the place on the board, and on the sensor, of the pixel with the highest score; NaN where it is on neither
+        # the place of the highest score on the board and on the sensor; NaN if it is not there
         x_m = y_m = u_px = v_px = np.nan
         if np.isfinite(score).any():
             loudest, cloud = int(np.nanargmax(score)), known.cloud
@@ -256,13 +256,13 @@ def study_rows(known: KnownCloud, judged: JudgedCloud, radius_m: float, *, hole_
         x_mm, y_mm = float(place[0]) / MM, float(place[1]) / MM
         of = {"score": float(detection.score), "hole": counts_for.get(number, "")}
         tables["findings"].append({"x_mm": x_mm, "y_mm": y_mm, **of})
-    if hole_free:  # places of left-out damage
+    if hole_free:  # the places where the damage was left out
         for i, (damage, signal) in enumerate(zip(known.truth, signals, strict=True)):
             tables["sites"].append(_place(damage) | {"detected": i in judged.pairs, "signal": signal})
         return tables
     for i, (row, signal) in enumerate(zip(judged.holes, signals, strict=True)):
         tables["holes"].append({**row, "signal": signal, "no_return": i in without_return})
-    # judged pixels of each damage and of the undamaged face, and how many of them lie above each threshold
+    # the number of judged pixels of each damage and of the undamaged face, and how many exceed each threshold
     thresholds, flat = grid(threshold, PIXEL_OCTAVES), score.ravel()
     parts = [(str(damage.id), known.outlines[damage.id]) for damage in known.truth]
     for name, pixels in (*parts, ("", np.flatnonzero(known.undamaged.ravel()))):
@@ -273,7 +273,7 @@ def study_rows(known: KnownCloud, judged: JudgedCloud, radius_m: float, *, hole_
 
 
 def grid(threshold: float, octaves: tuple[int, int]) -> np.ndarray:
-    """Return (n,) thresholds in equal ratios about the one in use; that alone where it is 0."""
+    """Return thresholds (n,) in equal ratios about the one in use; only that one if it is 0."""
     if not threshold > 0:
         return np.array([threshold])
     steps = np.arange(octaves[0] * STEPS_PER_OCTAVE, octaves[1] * STEPS_PER_OCTAVE + 1)
@@ -283,7 +283,8 @@ def grid(threshold: float, octaves: tuple[int, int]) -> np.ndarray:
 def _without_return(
     known: KnownCloud, judged: JudgedCloud, radius_m: float, *, hole_free: bool
 ) -> tuple[frozenset[int], int]:
-    """Damages (indices) that findings without return hit, and how many of these hit none and are no part by depth."""
+    """Return the indices of the damages that detections without return hit, and the number of false calls among these
+    detections: they hit no damage and are not part of a detection by depth."""
     tests = getattr(judged.detector, "tests_the_harness", False)
     missing = None if tests else missing_returns(known.cloud, judged.evidence)
     if missing is None or not missing.detections:
@@ -292,14 +293,14 @@ def _without_return(
     pairs = {} if hole_free else matched(known, found, radius_m, judged.overlap)[0]
     hits = {id(found[number]) for number in pairs.values()}
     alone = one_damage_once(known.cloud.valid.shape, judged.detections, found)
-    calls = sum(one.kind == "no return" and id(one) not in hits for one in alone)
+    calls = sum(each.kind == "no return" and id(each) not in hits for each in alone)
     return frozenset(pairs), calls
 
 
 def _operating(
     known: KnownCloud, judged: JudgedCloud, threshold: float, radius_m: float, *, hole_free: bool
 ) -> dict[str, list[Any]]:
-    """Lists over the grid of thresholds: numbers of findings and of hits."""
+    """Return lists over the grid of thresholds: the numbers of detections and of hits."""
     thresholds = grid(threshold, FINDING_OCTAVES).tolist()
     found = findings_at(judged.detector, known.cloud, judged.evidence, thresholds)
     hits = [0] * len(found)

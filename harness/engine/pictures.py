@@ -68,7 +68,7 @@ def _cloud_examples(group: Group, thresholds: Mapping[str, float]) -> list[Examp
         marks.append(HoleInView(str(damage.id), float(u - region.col0), float(v - region.row0), radius_px, *sizes_mm))
     examples = []
     for point in (point for found in by_variant.values() for point in (found[0], *found[1:][-1:])):
-        judged = _judged(task, point, max(one.frames for one in task.points))
+        judged = _judged(task, point, max(each.frames for each in task.points))
         example = ExampleCloud(
             frames=point.frames,
             variant=point.variant,
@@ -97,8 +97,7 @@ def _outline_px(set_up: SetUp, damage: Damage) -> np.ndarray:
 
 
 def _map_examples(group: Group, thresholds: Mapping[str, float]) -> list[MappedExample]:
-    """Return maps of the fewest views and of all, one for each merge, with the most frames and the last
-    registration."""
+    """Return maps of the fewest and of all views, one per merge, with the most frames and the last registration."""
     batch = group.damaged
     points = [point for point in group.points if point.digest in thresholds and point.config.mapping is not None]
     several = [point for point in points if (_mapping(point).views or len(batch.renders)) > 1]

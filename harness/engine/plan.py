@@ -110,7 +110,7 @@ class Group:
     def learners(self) -> tuple[Point, ...]:
         """The points whose detector learns."""
         pairs = ((point, point.config.detector) for point in self.points)
-        made = ((point, detector_of(one.name, canonical_json(one.settings))) for point, one in pairs)
+        made = ((point, detector_of(config.name, canonical_json(config.settings))) for point, config in pairs)
         return tuple(point for point, detector in made if isinstance(detector, Calibratable))
 
     @cached_property
@@ -165,7 +165,7 @@ class Group:
         points = [point for point in every if unjudged or given[point.digest] is not None]
         points = [point for point in points if point.digest not in without]
         learned = self.learned
-        tasks = {one.digest: point_task(one, given[one.digest], learned.get(one.digest)) for one in points}
+        tasks = {point.digest: point_task(point, given[point.digest], learned.get(point.digest)) for point in points}
         count = max((self.repeats(batch, point) for point in points), default=0)
         for repeat in range(count) if repeats is None else repeats:
             wanted = tuple(tasks[point.digest] for point in points if repeat < self.repeats(batch, point))
@@ -183,7 +183,7 @@ class Group:
             task.board,
             task.repeat,
             [ref.camera.unit_seed for ref in task.set_ups],
-            [[one.digest, one.variant, one.threshold, one.learned and Path(one.learned).name] for one in task.points],
+            [[p.digest, p.variant, p.threshold, p.learned and Path(p.learned).name] for p in task.points],
         ]
         number = task.repeat if task.board is None else task.board
         return f"{task.role}-{number:05d}-{digest(content)}"
@@ -327,5 +327,5 @@ def parts_of(plan: SweepPlan, shard: Shard) -> tuple[list[list[PlanPart]], list[
     first: list[list[PlanPart]] = []
     for number, group in enumerate(plan.groups):
         calibrating = (*group.learning, *group.first) if id(group) in wanted else ()
-        first.append([part for one in calibrating for part in cut(number, one, range(group.most_repeats(one)), True)])
+        first.append([part for b in calibrating for part in cut(number, b, range(group.most_repeats(b)), True)])
     return first, then

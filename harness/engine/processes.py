@@ -35,9 +35,9 @@ MOST_RENDERERS = 2  # processes that render; each needs 2 GB
 LOOKS_S = 1.0  # interval at which the driver checks the clock
 START_S = 300.0  # time for a process to load its modules: normally seconds, but longer from a network's disk
 DUMP_S = 0.3  # time for a hanging process to write its traceback; the signal handler needs a millisecond
-STOPPED_S = 2.0  # if a wait of `LOOKS_S` takes so much longer, the machine or process was suspended (Ctrl-Z)
+STOPPED_S = 2.0  # if a wait takes longer than `LOOKS_S` by this time, the machine or process was suspended (Ctrl-Z)
 IDLE_S: dict[Stage, float] = {"trials": 300.0, "renders": 10.0}  # idle processes end then; renderers hold 2 GB
-FALSE_STARTS = 3  # give up after so many processes in a row died before they could take a job
+FALSE_STARTS = 3  # give up after this many processes in a row died before they could take a job
 _STARTING = threading.Lock()
 CAN_FORK = "forkserver" in multiprocessing.get_all_start_methods()
 PROCESSES: Any = multiprocessing.get_context("forkserver" if CAN_FORK else "spawn")
@@ -48,7 +48,7 @@ if CAN_FORK:
 
 @dataclass(eq=False)
 class Answers:
-    """Queue for the ends of jobs, or for an error that ends all of them. ``is_dropped``: nobody reads it any more."""
+    """Queue for the ends of jobs, or for an error that ends all of them. ``is_dropped``: it is no longer read."""
 
     ended: queue.SimpleQueue[tuple[Job, Ended] | UserError] = field(default_factory=queue.SimpleQueue)
     is_dropped: bool = False
@@ -97,7 +97,7 @@ class LocalEngine:
         self.put(job, self._limits, self._answers)
 
     def ended(self) -> list[tuple[Job, Ended]]:
-        """Wait for jobs to end. Raises UserError where processes run other code or cannot start."""
+        """Wait for jobs to end. Raises UserError if processes run other code or cannot start."""
         found: list[tuple[Job, Ended]] = []
         while not found or not self._answers.ended.empty():
             answer = self._answers.ended.get()
@@ -121,13 +121,13 @@ class LocalEngine:
             self._state.notify_all()
 
     def drop(self, answers: Answers) -> None:
-        """End the jobs whose results nobody needs any more."""
+        """End the jobs whose results are no longer needed."""
         with self._state:
             answers.is_dropped = True
             for worker in self._workers:
                 if worker.holds is answers:
                     worker.strike()
-        answers.ended.put(UserError("nobody awaits these jobs any more"))
+        answers.ended.put(UserError("these jobs are no longer awaited"))
 
     def next_job(self, worker: _Worker) -> tuple[Job, Limits, Answers] | None:
         """Wait for a worker's next job; end its process if idle for long. Return None if there are no more jobs."""
@@ -175,7 +175,7 @@ class _Worker(threading.Thread):
             self.end()
         while self._process is None:
             if answers.is_dropped or self._engine.is_over:
-                return Ended("crashed", why="nobody awaits it any more")
+                return Ended("crashed", why="it is no longer awaited")
             self._start()
         with contextlib.suppress(OSError):  # a dead process does not answer either
             self._pipe.send((job, limits.memory_mb))
@@ -203,7 +203,7 @@ class _Worker(threading.Thread):
             if engine.false_starts >= FALSE_STARTS:
                 what = f"{FALSE_STARTS} worker processes in a row died as they started: {digest.why}"
                 fix = "run the same command again, with fewer --jobs if memory is short, or a higher --memory-limit"
-                raise UserError(what, legal="trials need about 1 GB of memory a process, renders 2 GB", fix=fix)
+                raise UserError(what, legal="about 1 GB of memory per process for trials, 2 GB for renders", fix=fix)
             return
         engine.false_starts = 0
         if digest != engine.digests.get(self.stage):

@@ -220,7 +220,7 @@ def _provenance(
         "trials": {"done": trials.done, "resumed": trials.found, "failed": trials.failed},
         "peak_mb": outcome.peak_mb,
         "warnings": [text for text in guesses if text],
-        "failures": [{name: getattr(one, name) for name in FAILURE} for one in outcome.failures[:MOST_FAILURES]],
+        "failures": [{name: getattr(each, name) for name in FAILURE} for each in outcome.failures[:MOST_FAILURES]],
         "failures_in_all": _counts(outcome),
     }
 
@@ -252,7 +252,7 @@ def record_of(
         hit_overlap=experiment.config.matching.overlap,
         false_calls_per_m2=None if calibrate is None else calibrate.false_calls_per_m2,
         provenance={key: provenance[key] for key in ("commit", "dirty", "versions", "seed", "command")},
-        set_ups=tuple(one for one in set_ups if one is not None),
+        set_ups=tuple(set_up for set_up in set_ups if set_up is not None),
     )
 
 
@@ -348,13 +348,13 @@ def without_limit(
     points: Iterable[Point], outcome: Outcome, failed: Mapping[str, list[Failure]], judged: Iterable[SetUpRecord]
 ) -> list[str]:
     """Return sentences on the points that are not among the ``judged`` set-ups, each with its most common failure."""
-    known, by_cause = {(one.variant, one.frames) for one in judged}, dict[str, list[str]]()
-    for point in (one for one in points if (one.variant, one.config.capture.frames) not in known):
-        own = [one for one in failed.get(point.digest, ()) if one.state != "skipped"]
-        causes = [one.in_short for one in own]
-        causes = causes or [one.in_short for one in outcome.failures if one.what == f"threshold of {point.label}"]
+    known, by_cause = {(set_up.variant, set_up.frames) for set_up in judged}, dict[str, list[str]]()
+    for point in (each for each in points if (each.variant, each.config.capture.frames) not in known):
+        own = [each for each in failed.get(point.digest, ()) if each.state != "skipped"]
+        causes = [each.in_short for each in own]
+        causes = causes or [each.in_short for each in outcome.failures if each.what == f"threshold of {point.label}"]
         why = Counter([*causes, "its trials did not finish"]).most_common(1)[0][0]
-        if own and all(one.state == "failed" and not one.is_bug for one in own):
+        if own and all(each.state == "failed" and not each.is_bug for each in own):
             why = f"the camera sees no part of the board that can be judged ({why})"
         by_cause.setdefault(why, []).append(in_words(point.label))
     return [f"no limit for {'; '.join(labels)}: {why}" for why, labels in by_cause.items()]

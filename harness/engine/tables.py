@@ -58,13 +58,13 @@ def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> t
 
         def joined(column: str) -> pd.DataFrame:
             there = ({column: part.pop(column)} if column in part else {} for part in own)
-            return pd.concat(pd.DataFrame(one, range(size)) for one, size in zip(there, sizes, strict=True))
+            return pd.concat(pd.DataFrame(column, range(size)) for column, size in zip(there, sizes, strict=True))
 
         if not own:
             return pd.DataFrame()
         order = {column: joined(column)[column].array for column in declared.order if column in names}
         places = pd.DataFrame(order).sort_values(list(order), kind="stable").index.to_numpy()
-        held = ((one, order[one] if one in order else joined(one)[one].array) for one in names)
+        held = ((column, order[column] if column in order else joined(column)[column].array) for column in names)
         return pd.DataFrame({name: values.take(places) for name, values in held}, copy=False)
 
     return trials.ResultTables(

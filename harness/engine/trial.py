@@ -35,7 +35,7 @@ from scenes.sensor.camera import CameraConfig, camera_of
 from scenes.sensor.source import SimulatedCapture, SimulatedUnit
 from scenes.sensor.unit import FrameTotals
 
-FEWEST_FRAMES = 20
+FEWEST_FRAMES = 10
 """Drawing fewer frames costs less than sorting a view's pixels. Results depend on the number only, not on the cost."""
 FLAT_ALBEDO = 0.6  # albedo of a flat field's plane: painted wood or paper, like the boards of the experiments
 MOST_DISTURBED = 0.5
@@ -64,7 +64,7 @@ def averages_of(
 
 @lru_cache(maxsize=4)
 def flat_field_of(camera: CameraConfig, config: FlatFieldConfig, seed: int) -> FlatField:
-    """Return a unit's flat field, measured on a plane across its axis. Raises UserError where no pixel has a range."""
+    """Return a unit's flat field, measured on a plane across its axis. Raises UserError if no pixel has a range."""
     facts = camera_of(camera)
     view = plane_view(facts, facts.nominal_lens.whole, config.distance_m, FLAT_ALBEDO)
     capture = SimulatedUnit(facts, camera, view).capture(config.frames, seed, "flat field")
@@ -80,15 +80,11 @@ def _at_once(capture: SimulatedCapture, counts: list[int], config: AverageConfig
     # noise of one frame, with rounding, as `detectors.average` estimates it
     noise_m = float(np.hypot(summer.noise_m, capture.z_step_m / np.sqrt(12)))
     left_out = _left_out(capture, summer, config, noise_m) if config.judge_frames else {}
-    sums: FrameTotals | None = None
+    steps = pairwise([0, *counts])
+    parts = [np.array([number for number in range(*step) if number not in left_out], int) for step in steps]
     clouds: dict[int, Cloud] = {}
-    for start, n in pairwise([0, *counts]):
-        frames = np.array([number for number in range(start, n) if number not in left_out])
-        totals = capture.totals(frames) if len(frames) else None
-        if totals is None and len(frames):
-            return {}
-        sums = sums + totals if sums and totals else sums or totals
-        cloud = _cloud(capture, sums, tuple(left for number, left in left_out.items() if number < n)) if sums else None
+    for n, totals in zip(counts, capture.totals(parts) or (), strict=False):
+        cloud = _cloud(capture, totals, tuple(left for number, left in left_out.items() if number < n))
         if cloud is not None and not (config.judge_frames and _disturbed(cloud, noise_m, config)):
             clouds[n] = cloud
     return clouds
@@ -108,7 +104,7 @@ def _left_out(capture: SimulatedCapture, summer: AtOnce, config: AverageConfig, 
 
 
 def _disturbed(cloud: Cloud, noise_m: float, config: AverageConfig) -> bool:
-    """Return whether so many pixels lose their range or change that frames may be left out."""
+    """Return whether enough pixels lose their range or change for frames to be left out."""
     judged = 2 * cloud.count > cloud.n_frames
     if not judged.any():
         return True
@@ -121,7 +117,7 @@ def _disturbed(cloud: Cloud, noise_m: float, config: AverageConfig) -> bool:
 
 
 def _cloud(capture: SimulatedCapture, totals: FrameTotals, left_out: tuple[LeftOut, ...]) -> Cloud | None:
-    """Return the average from sums over frames, as `detectors.average` computes it; None where no pixel has a range."""
+    """Return the average from sums over frames, as `detectors.average` computes it; None if no pixel has a range."""
     count = totals.count
     if not count.any():
         return None

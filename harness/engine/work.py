@@ -191,10 +191,10 @@ class Shard:
         """Return this shard's range of ``total`` items; the ranges of all shards cover each item exactly once."""
         return range((self.number - 1) * total // self.count, self.number * total // self.count)
 
-    def rotated(self, things: Sequence[T]) -> list[T]:
+    def rotated(self, items: Sequence[T]) -> list[T]:
         """Return all items, beginning at this shard's own starting point."""
-        start = self.part(len(things)).start
-        return [*things[start:], *things[:start]]
+        start = self.part(len(items)).start
+        return [*items[start:], *items[:start]]
 
 
 WHOLE = Shard()

@@ -1,8 +1,8 @@
-"""The atlas of limits: a90 of many set-ups as one smooth surface for each camera, kind of damage and detector, over
-distance, frames, depth and albedo; questions are answered from it, and those beyond what was computed are refused.
+"""The atlas of limits: for each camera, kind of damage and detector, a90 of many set-ups as a smooth surface over
+distance, frames, depth and albedo. It answers questions within the computed range and refuses others.
 
 The surface is a quadratic of ln a90 in the logarithms of the axes, by least squares weighted with each limit's own
-interval. Its error is stated: the root mean square of ln a90 at each set-up as the others predict it."""
+interval. Its stated error is the root mean square error of ln a90 at each set-up when the others predict it."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ AXES = {
 }
 """The axes of a surface, and the columns of the table of limits that hold their values."""
 UNKNOWN_VARIANCE = 0.25
-"""Variance of ln a90 where an interval has no positive lower end: a factor of 1.65 in either direction."""
+"""Variance of ln a90 if an interval has no positive lower end: a factor of 1.65 in either direction."""
 TOLERANCE = 1e-9
 
 
 class Outside(Exception):
-    """A question that the atlas does not answer; the text says why and what it does answer."""
+    """A question that the atlas cannot answer; the text gives the reason and the range of possible questions."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """a90 in mm with the ends of its interval at `CONFIDENCE`; all NaN where a set-up around has no limit.
-    ``largest_mm``: the largest size inspected; without a limit NaN, unless all set-ups around miss such damage too."""
+    """a90 in mm with the ends of its interval at `CONFIDENCE`; all NaN if a set-up around it has no limit.
+    ``largest_mm``: the largest size inspected; without a limit NaN, unless all set-ups around it miss it too."""
 
     a90_mm: float
     low_mm: float
@@ -53,10 +53,10 @@ class Answer:
 
 @dataclass(frozen=True)
 class LimitSurface:
-    """Limits of one camera, kind of damage and detector. ``grid``: the values that were computed on each axis;
-    ``nodes`` (n, k): the set-ups' places, axes in the order of ``grid``; ``largest_mm`` (n,): the largest size
-    inspected at each; ``known`` (n,): whether a limit was found; ``beyond`` (n,): whether it lies above all sizes.
-    ``damage``: declaration of the first set-up's, as JSON. ``error``: of ln a90, leaving each set-up out."""
+    """Limits of one camera, kind of damage and detector. ``grid``: the values that were computed on each axis.
+    ``nodes`` (n, k): the set-ups' places, axes in the order of ``grid``. ``largest_mm`` (n,): the largest size
+    inspected at each. ``known`` (n,): whether a limit was found. ``beyond`` (n,): whether it lies above all sizes.
+    ``damage``: declaration of the first set-up's damage, as JSON. ``error``: of ln a90, leaving each set-up out."""
 
     camera: str
     kind: str
@@ -74,7 +74,7 @@ class LimitSurface:
     error: float
 
     def at(self, **place: float) -> Answer:
-        """Return the limit at a place: a value for each axis of ``grid``. Raises Outside beyond what was computed."""
+        """Return the limit at a place: a value for each axis of ``grid``. Raises Outside beyond the computed range."""
         ends = {axis: values for axis, values in self.grid.items() if axis in place}
         for axis, values in ends.items():
             if not values[0] - TOLERANCE <= place[axis] <= values[-1] + TOLERANCE:
@@ -95,7 +95,7 @@ class LimitSurface:
         return Answer(a90, low, high, largest_mm)
 
     def _near(self, axis: int, value: float) -> np.ndarray:
-        """Return the nodes of the cell that holds a value: its neighbours on the axis, or those at the value itself."""
+        """Return the nodes of the cell that holds a value: at its neighbours on the axis, or at the value itself."""
         values = np.array(list(self.grid.values())[axis])
         low = values[values <= value + TOLERANCE].max()
         high = values[values >= value - TOLERANCE].min()
@@ -103,7 +103,7 @@ class LimitSurface:
 
 
 def surfaces_of(limits: pd.DataFrame) -> list[LimitSurface]:
-    """Return the surfaces of a table of `LIMITS` by camera, kind, detector. Raises KeyError where it lacks an axis."""
+    """Return the surfaces of a table of `LIMITS` by camera, kind and detector. Raises KeyError if it lacks an axis."""
     rows = limits.copy()
     damages = [json.loads(text) for text in rows[DAMAGE]]
     rows["kind"] = [damage["kind"] for damage in damages]
@@ -113,7 +113,7 @@ def surfaces_of(limits: pd.DataFrame) -> list[LimitSurface]:
     held = {axis: column for axis, column in AXES.items() if column in rows}
     rows = rows.rename(columns={column: axis for axis, column in held.items()})
     groups = [(group, group.iloc[0]) for _, group in rows.groupby([CAMERA, "kind", DETECTOR], sort=False)]
-    return [_surface(one[CAMERA], one["kind"], one[DETECTOR], group, list(held)) for group, one in groups]
+    return [_surface(key[CAMERA], key["kind"], key[DETECTOR], group, list(held)) for group, key in groups]
 
 
 def _surface(camera: str, kind: str, detector: str, rows: pd.DataFrame, axes: Sequence[str]) -> LimitSurface:
@@ -152,7 +152,7 @@ def _scaled(places: np.ndarray, grid: Sequence[Sequence[float]]) -> np.ndarray:
 
 
 def _terms(counts: Sequence[int], known: int) -> tuple[tuple[int, ...], ...]:
-    """Return products of axes: squares where an axis has three values, then products of two; few set-ups get none."""
+    """Return products of axes: squares of axes with three values, then products of two axes; few set-ups get none."""
     varied = [axis for axis, count in enumerate(counts) if count > 1]
     plane: list[tuple[int, ...]] = [(), *((axis,) for axis in varied)]
     further: list[tuple[int, ...]] = [(axis, axis) for axis in varied if counts[axis] > 2]

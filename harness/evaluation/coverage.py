@@ -1,10 +1,10 @@
-"""The smallest damage found nine times in ten at each patch of a part, and the poses that cover most of it.
+"""The smallest damage found with a probability of 90 % at each patch of a part, and the poses that cover most of it.
 
-The detector's score of damage, times its unit of score there, is the damage's signal, in metres. Its logarithm is
-linear in those of size and range and quadratic in the cosine of the angle of incidence, with a normal scatter that is
-proportional to a power of that cosine: obliquely seen damage is found less surely. Damage is found where its score
-exceeds the threshold, so the law gives POD at every size and place: MIL-HDBK-1823A's signal against size (appendix G),
-with the place beside the size. Not modelled: what else makes places of equal angle, range and unit of score differ."""
+The damage's signal, in metres, is the detector's score times its unit of score there. Its logarithm is linear in the
+logarithms of size and range and quadratic in the cosine of the angle of incidence. Its normal scatter is proportional
+to a power of that cosine, because detection at oblique incidence is less certain. Damage is found if its score exceeds
+the threshold, so the law gives POD at every size and place: MIL-HDBK-1823A's signal against size (appendix G), with the
+place beside the size. Not modelled: other differences between places of equal angle, range and unit of score."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from harness.evaluation.pod.statement import POD
 from harness.vocabulary.errors import UserError
 
 BEYOND_DEG = 3.0
-"""Angle by which a patch may be steeper than all damage that was inspected."""
+"""Largest angle by which a patch may be steeper than all inspected damage."""
 FAR = 1.5
-"""Ratio of score to threshold above which the score itself is ignored: the law is to hold near the threshold."""
+"""Ratio of score to threshold above which the score's value is ignored, so that the law holds near the threshold."""
 GROWTHS = np.linspace(0.0, 4.0, 17)
 """Powers of 1 / cosine with which the scatter may grow."""
 LOOSE = 2.0
-"""Ratio of the sizes found nine times in ten and half of the time from which limits are called rough."""
+"""Limits count as rough above this ratio of the sizes found with probabilities of 90 % and 50 %."""
 FEWEST = 20
-"""Number of damages without which nothing is learnt."""
+"""Fewest damages from which the law is fitted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,14 +38,14 @@ class Patches:
     normals: np.ndarray
     areas_m2: np.ndarray
 
-    def share(self, some: np.ndarray) -> float:
-        """Return the share of the area that belongs to ``some`` (n,) bool of the patches."""
-        return float(self.areas_m2[some].sum() / self.areas_m2.sum())
+    def share(self, chosen: np.ndarray) -> float:
+        """Return the share of the area that the patches ``chosen`` (n,) bool cover."""
+        return float(self.areas_m2[chosen].sum() / self.areas_m2.sum())
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Places, (n,): noise ``deviation_m``, infinite where not judged; ``cosine`` of incidence, ``range_m``."""
+    """View of places, (n,): noise ``deviation_m``, infinite if not judged; ``cosine`` of incidence; ``range_m``."""
 
     deviation_m: np.ndarray
     cosine: np.ndarray
@@ -54,9 +54,9 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class ScoredDamage:
-    """Inspections of damage, (n,) each: the ``damage``'s number, its ``size_mm`` of what ``size_of`` names, how it is
-    ``seen``, and its ``score``: the lowest threshold at which it is found no more, NaN where it was missed at the
-    threshold in use, infinite where it was found by missing returns alone."""
+    """Inspections of damage, (n,) each. ``damage``: its number. ``size_mm``: the size that ``size_of`` names. ``seen``:
+    its view. ``score``: the lowest threshold at which it is no longer found; NaN if it was missed at the threshold in
+    use, infinite if only missing returns found it."""
 
     size_of: str
     damage: np.ndarray
@@ -67,9 +67,9 @@ class ScoredDamage:
 
 @dataclass(frozen=True, eq=False)
 class Findable:
-    """Law of the signal: ``coefficients`` of `_design`; ``scatter`` of its logarithm where it is seen frontally, which
-    grows with 1 / cosine to the power ``growth``; at the median angle ``ratio`` of the sizes found nine times in ten
-    and half of the time. ``steepest``: least cosine inspected. ``damages``: number learnt from."""
+    """Law of the signal. ``coefficients``: of `_design`. ``scatter``: of the signal's logarithm in a frontal view; it
+    grows with 1 / cosine to the power ``growth``. ``ratio``: of the sizes found with 90 % and 50 % at the median angle.
+    ``steepest``: least cosine inspected. ``damages``: number in the fit."""
 
     size_of: str
     coefficients: np.ndarray
@@ -82,8 +82,8 @@ class Findable:
     damages: int
 
     @property
-    def said(self) -> str:
-        """Return what was learnt, in a sentence."""
+    def statement(self) -> str:
+        """The law in a sentence."""
         return (
             f"Learnt from {self.damages} damages: the detector's signal is proportional to the {self.size_of} to the "
             f"power {self.coefficients[1]:.2g}, and scatters by {100 * self.scatter:.0f} % where the face is seen "
@@ -93,7 +93,7 @@ class Findable:
 
     @property
     def doubt(self) -> str:
-        """Return why the limits are rough; empty where size, angle and distance decide well what is found."""
+        """The reason why the limits are rough; empty if size, angle and distance predict detection well."""
         doubts = []
         if self.growth == GROWTHS[-1]:
             doubts.append(
@@ -109,8 +109,8 @@ class Findable:
         return ". Also, ".join(doubts)
 
     def limits_mm(self, seen: Seen) -> np.ndarray:
-        """Return a90 (n,) of places, at least the smallest size inspected; infinite where it is above the largest; NaN
-        where nothing is judged, and where the angle is steeper than all inspected."""
+        """Return a90 (n,) of places: at least the smallest size inspected, infinite above the largest; NaN where
+        nothing is judged or the angle is steeper than all inspected angles."""
         cosine = np.maximum(seen.cosine, self.steepest)
         others = _design(np.ones(len(cosine)), cosine, seen.range_m) @ self.coefficients
         needed = np.log(self.threshold * seen.deviation_m) + special.ndtri(POD) * self.scatter / cosine**self.growth
@@ -121,26 +121,26 @@ class Findable:
 
 
 def _design(size_mm: np.ndarray, cosine: np.ndarray, range_m: np.ndarray) -> np.ndarray:
-    """Return (n, 5): the terms in which the logarithm of the signal is linear."""
+    """Return the terms (n, 5) in which the logarithm of the signal is linear."""
     return np.column_stack([np.ones(len(size_mm)), np.log(size_mm), cosine, cosine**2, np.log(range_m)])
 
 
-def findable(some: ScoredDamage, threshold: float) -> Findable:
-    """Learn from the inspections of damage where the detector judges. Raises UserError where these do not suffice."""
-    judged = np.isfinite(some.seen.deviation_m) & (some.seen.cosine > 0)
-    damages, of = len(np.unique(some.damage[judged])), len(np.unique(some.damage))
+def findable(scored: ScoredDamage, threshold: float) -> Findable:
+    """Fit the law to inspections of damage where the detector judges. Raises UserError if these do not suffice."""
+    judged = np.isfinite(scored.seen.deviation_m) & (scored.seen.cosine > 0)
+    damages, total = len(np.unique(scored.damage[judged])), len(np.unique(scored.damage))
     if damages < FEWEST:
         fix = "check the detector's crop, and the sizes of the damage"
-        raise UserError(f"only {damages} of {of} damages were judged: no limit can be learnt", fix=fix)
-    size_mm, cosine, score = some.size_mm[judged], some.seen.cosine[judged], some.score[judged]
-    design = _design(size_mm, cosine, some.seen.range_m[judged])
+        raise UserError(f"only {damages} of {total} damages were judged: no limit can be learnt", fix=fix)
+    size_mm, cosine, score = scored.size_mm[judged], scored.seen.cosine[judged], scored.score[judged]
+    design = _design(size_mm, cosine, scored.seen.range_m[judged])
     below, found = np.isnan(score), np.sort(score[score > threshold])
     far = max(FAR * threshold, *found[np.isfinite(found)][:FEWEST])
     above = score > far
-    signal = np.log(np.minimum(np.where(below, threshold, score), far) * some.seen.deviation_m[judged])
+    signal = np.log(np.minimum(np.where(below, threshold, score), far) * scored.seen.deviation_m[judged])
 
     def fitted(growth: float) -> tuple[float, CensoredFit]:
-        """Return the log-likelihood with a scatter proportional to cosine^-growth, and the fit of rows over that."""
+        """Return the log-likelihood with a scatter proportional to cosine^-growth, and the fit to weighted rows."""
         weight = cosine**growth
         fit = fit_censored(design * weight[:, None], signal * weight, below, above)
         return fit.log_likelihood + float(np.log(weight[~(below | above)]).sum()), fit
@@ -149,21 +149,21 @@ def findable(some: ScoredDamage, threshold: float) -> Findable:
     best = int(np.nanargmax([value for value, _ in fits]))
     growth, (coefficients, scatter, _, _) = float(GROWTHS[best]), fits[best][1]
     if coefficients[1] <= 0:
-        said = f"what is found does not follow the {some.size_of} of the damage: no limit can be learnt"
-        raise UserError(said, fix="ask for fewer or less tilted poses, or run a study in the pose wanted")
+        what = f"what is found does not follow the {scored.size_of} of the damage: no limit can be learnt"
+        raise UserError(what, fix="ask for fewer or less tilted poses, or run a study in the pose wanted")
     ratio = np.exp(special.ndtri(POD) * scatter / np.median(cosine) ** growth / coefficients[1])
     sizes_mm = (float(size_mm.min()), float(size_mm.max()))
     law = (coefficients, scatter, growth, float(ratio), threshold)
-    return Findable(some.size_of, *law, sizes_mm, float(cosine.min()), damages)
+    return Findable(scored.size_of, *law, sizes_mm, float(cosine.min()), damages)
 
 
 def in_turn(patches: Patches, found: Sequence[np.ndarray], given: int, further: int) -> list[tuple[int, float, float]]:
-    """Return the first ``given`` of some poses, in which damage is ``found`` on patches (n,) bool, then up to
-    ``further`` of the others, ever the one that adds most: each pose's place among them, the share of the area that it
-    adds to those before it, and the share that all cover until then."""
+    """Return the first ``given`` poses, then up to ``further`` others, always the one that adds most. ``found``: by
+    pose, the patches (n,) bool on which damage is found. A row has the pose's index, the share of the area that it
+    adds, and the share that all poses so far cover."""
     covered, rows = np.zeros(len(patches.areas_m2), bool), list[tuple[int, float, float]]()
     for turn in range(given + further):
-        gains = [patches.share(some & ~covered) for some in found]
+        gains = [patches.share(each & ~covered) for each in found]
         best = turn if turn < given else int(np.argmax(gains))
         if turn >= given and gains[best] <= 0:
             break

@@ -23,7 +23,7 @@ RESAMPLES = 2000
 
 @dataclass(frozen=True)
 class Interval:
-    """A closed interval; both ends NaN where the data cannot support one."""
+    """A closed interval; both ends are NaN if the data cannot support one."""
 
     low: float
     high: float
@@ -34,19 +34,19 @@ class Interval:
         return not (np.isnan(self.low) or np.isnan(self.high))
 
     def above(self, value: float) -> bool:
-        """Return whether the whole interval lies above ``value``; False where unknown."""
+        """Return whether the whole interval lies above ``value``; False if it is unknown."""
         return bool(self.low > value)
 
     def below(self, value: float) -> bool:
-        """Return whether the whole interval lies below ``value``; False where unknown."""
+        """Return whether the whole interval lies below ``value``; False if it is unknown."""
         return bool(self.high < value)
 
     def over(self, value: float) -> bool | None:
-        """Return whether the estimated quantity certainly exceeds ``value``; None where the interval includes both."""
+        """Return whether the estimated quantity certainly exceeds ``value``; None if the interval includes both."""
         return True if self.low > value else False if self.high <= value else None
 
     def within(self, low: float, high: float) -> bool:
-        """Return whether the whole interval lies in [low, high]; False where unknown."""
+        """Return whether the whole interval lies in [low, high]; False if it is unknown."""
         return bool(self.low >= low and self.high <= high)
 
 
@@ -54,14 +54,14 @@ UNKNOWN = Interval(np.nan, np.nan)
 
 
 def wilson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Return Wilson's score interval of a proportion, element by element: (low, high), NaN where ``trials`` is 0.
-    Coverage is near nominal on average over the proportion; `clopper_pearson` is never below nominal and wider."""
+    """Return Wilson's score interval of a proportion, element by element: (low, high), NaN where ``trials`` is 0. Its
+    average coverage over the proportion is near nominal; `clopper_pearson` is never below nominal and wider."""
     k, n = np.broadcast_arrays(np.asarray(successes, float), np.asarray(trials, float))
     z2 = special.ndtri(UPPER) ** 2
     with np.errstate(invalid="ignore", divide="ignore"):
         centre = (k + z2 / 2) / (n + z2)
         half = np.sqrt(z2) / (n + z2) * np.sqrt(k * (n - k) / n + z2 / 4)
-    # rounding would leave 1e-17 where the end is exactly 0 or 1
+    # rounding would give 1e-17 instead of exactly 0 or 1
     low, high = np.where(k == 0, 0.0, centre - half), np.where(k == n, 1.0, centre + half)
     return np.where(n > 0, low, np.nan), np.where(n > 0, high, np.nan)
 
@@ -75,7 +75,7 @@ def clopper_pearson(successes: ArrayLike, trials: ArrayLike) -> tuple[np.ndarray
 
 
 def poisson_rate(count: ArrayLike, exposure: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Return Garwood's exact interval of a Poisson rate, ``count`` in ``exposure`` (runs, areas), NaN where 0."""
+    """Return Garwood's exact interval of a Poisson rate: ``count`` in ``exposure``, NaN where that is 0."""
     k, time = np.broadcast_arrays(np.asarray(count, float), np.asarray(exposure, float))
     low = np.where(k == 0, 0.0, special.gammaincinv(k, 1 - UPPER))
     high = special.gammaincinv(k + 1, UPPER)
@@ -105,8 +105,8 @@ def mean_difference(first: ArrayLike, second: ArrayLike) -> Interval:
 
 
 def standardised_bias(bias: float, std: float, n: int) -> Interval:
-    """Interval of bias / standard deviation (an effect size) from ``n`` normal values, by the large-sample variance
-    1/n + d^2/(2n) (Hedges and Olkin 1985). Exact (0 or infinite) where they do not vary; unknown below two values."""
+    """Return the interval of bias / standard deviation (an effect size) from ``n`` normal values, by the large-sample
+    variance 1/n + d^2/(2n) (Hedges and Olkin 1985). Exact if they do not vary; unknown below two values."""
     if n < 2 or not (np.isfinite(bias) and np.isfinite(std)):
         return UNKNOWN
     if std == 0:
@@ -118,8 +118,8 @@ def standardised_bias(bias: float, std: float, n: int) -> Interval:
 
 
 def bootstrap(statistic: Callable[[np.ndarray], np.ndarray], n: int, *, resamples: int = RESAMPLES) -> Interval:
-    """Percentile bootstrap over ``n`` exchangeable units (repeats, or blocks of pixels), the same draws every time.
-    ``statistic`` maps indices (resamples, n) to values (resamples,); NaN are left out, as in `percentiles`."""
+    """Return the percentile bootstrap over ``n`` exchangeable units (repeats, or blocks of pixels), with the same draws
+    every time. ``statistic`` maps indices (resamples, n) to values (resamples,); NaN are left out."""
     if n < 2:
         return UNKNOWN
     indices = np.random.default_rng(0).integers(0, n, size=(resamples, n))
@@ -127,8 +127,8 @@ def bootstrap(statistic: Callable[[np.ndarray], np.ndarray], n: int, *, resample
 
 
 def percentiles(draws: np.ndarray, confidence: float = CONFIDENCE) -> Interval:
-    """Central interval of bootstrap draws (B,); infinite ends stay. NaN draws (such as differences of two infinities)
-    are left out, and where they are more than half the interval is unknown."""
+    """Return the central interval of bootstrap draws (B,); infinite ends remain. NaN draws (such as differences of two
+    infinities) are left out; if they are more than half, the interval is unknown."""
     known = draws[~np.isnan(draws)]
     if len(known) < 2 or len(known) < 0.5 * len(draws):
         return UNKNOWN
@@ -137,7 +137,7 @@ def percentiles(draws: np.ndarray, confidence: float = CONFIDENCE) -> Interval:
 
 
 SITES_PER_TARGET = 3
-"""Least number of unflawed sites for each flawed one, by MIL-HDBK-1823A."""
+"""Fewest unflawed sites per flawed one, by MIL-HDBK-1823A."""
 
 
 @dataclass(frozen=True)
@@ -151,17 +151,17 @@ class FalseCallRate:
 
 
 def false_call_rate(calls: int, area_m2: float) -> FalseCallRate:
-    """State the rate of ``calls`` false calls on ``area_m2`` of unflawed surface as a Poisson count; limits exact."""
+    """Return the rate of ``calls`` false calls on ``area_m2`` of unflawed surface, a Poisson count; exact limits."""
     if calls < 0 or not area_m2 > 0:
-        raise UserError(f"{calls} false calls on {area_m2:g} m2", legal="no fewer than 0 calls, an area above 0")
+        raise UserError(f"{calls} false calls on {area_m2:g} m2", legal="0 calls or more, an area above 0")
     low, high = poisson_rate(calls, area_m2)
     return FalseCallRate(calls / area_m2, Interval(float(low), float(high)), calls, area_m2)
 
 
 @dataclass(frozen=True)
 class Threshold:
-    """A score's threshold: findings *above* ``value`` are calls (-inf: every finding is). ``rate_per_m2``: false calls
-    to expect on new runs; ``upper_per_m2``: bound of the true rate at one-sided ``confidence``."""
+    """A threshold of scores: findings *above* ``value`` are calls (-inf: every finding is). ``rate_per_m2``: expected
+    false calls on new runs. ``upper_per_m2``: bound on the true rate at one-sided ``confidence``."""
 
     value: float
     rate_per_m2: float
@@ -174,10 +174,10 @@ class Threshold:
 def threshold_for_rate(
     highest_scores_per_run: ArrayLike, area_m2: float, rate_per_m2: float, confidence: float = 0.95
 ) -> Threshold:
-    """Choose the lowest observed score whose false-call rate is at most the one wanted, from hole-free runs of
-    ``area_m2`` each. ``highest_scores_per_run`` (runs,), -inf without finding. Calls are a Poisson process; a new run's
-    score lies above the (k + 1)-th highest of n with probability (k + 1) / (n + 1), the true one is Beta(k + 1, n - k)
-    distributed (Wilks 1941). Judge on other runs. UserError where the runs are too few."""
+    """Return the lowest observed score whose rate of false calls is at most the wanted rate, from hole-free runs of
+    ``area_m2`` each. ``highest_scores_per_run`` (runs,): -inf without a finding. Calls are a Poisson process. A new
+    run's score exceeds the (k + 1)-th highest of n with probability (k + 1) / (n + 1); the true rate is Beta(k + 1, n -
+    k) distributed (Wilks 1941). Use other runs for judging. Raises UserError if the runs are too few."""
     scores = np.asarray(highest_scores_per_run, float).ravel()
     if not (area_m2 > 0 and rate_per_m2 > 0):
         raise UserError(f"area {area_m2:g} m2, wanted rate {rate_per_m2:g} per m2", legal="both above 0")

@@ -1,8 +1,8 @@
-"""Maps of several views beside a single view on the same repeats, and the errors of registrations.
+"""Maps of several views compared with a single view on the same repeats, and the errors of registrations.
 
-The same frames feed both maps of a comparison, so that differences are paired; intervals are over repeats, which vary
-noise and pose. Errors of registrations are target registration errors (Fitzpatrick, West and Maurer 1998) of places on
-the board, against the truth and against what the method itself predicts."""
+Both maps of a comparison use the same frames, so differences are paired; intervals are over repeats, which vary noise
+and pose. Errors of registrations are target registration errors (Fitzpatrick, West and Maurer 1998) of places on the
+board: the true error, and the one that the method predicts."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from harness.tables.trials import ResultTables
 from harness.vocabulary.path_names import value_text
 
 VIEWS, REGISTRATION, MERGE = "mapping.views", "mapping.registration.method", "mapping.merge.kind"
-"""The axes of a study of maps that have a meaning of their own here."""
+"""Axes with a special meaning in studies of maps."""
 CAMERA_UNIT = "source.camera.unit_seed"
 MANY = 50
-"""Number of frames a view at which maps are compared, where they have as many."""
+"""Number of frames per view at which maps are compared, if they have as many."""
 THESIS_REGISTRATION, THESIS_MERGE = "cpd", "grid"
 LARGE_MM = 25.4 * 3 / 8
-"""Diameter from which two views are said to size better than a single view."""
+"""Diameter from which two views are claimed to measure sizes better than one view."""
 FEWEST_BOTH = 2
-"""Number of repeats in which a hole must be measured in both maps to be compared."""
+"""Fewest repeats in which both maps must measure a hole to compare it."""
 
 
 @dataclass(frozen=True)
 class MapSetUp:
-    """One set-up or variation. ``views``: 0 for "all" without a finished run; ``registration``, ``merge``: empty where
-    no axis tells; ``place``: the other axes' values as text; ``reference``: the set-up of a variation, or ""."""
+    """One set-up or variation. ``views``: 0 for "all" without a finished run. ``registration``, ``merge``: empty if no
+    axis states them. ``place``: the other axes' values as text. ``reference``: the set-up of a variation, or ""."""
 
     variant: str
     views: int
@@ -47,7 +47,7 @@ class MapSetUp:
 
 
 def maps_of(tables: ResultTables) -> list[MapSetUp]:
-    """List all set-ups and variations in the table's order. For "all views" the number comes from the runs."""
+    """Return all set-ups and variations in the table's order. For "all views", the runs give the number."""
     others = [str(path) for path in tables.axes["path"] if path not in (VIEWS, REGISTRATION, MERGE)]
     runs, seen = tables.runs, dict[Any, Any]()
     if not runs.empty and "views_used" in runs:
@@ -70,9 +70,9 @@ def maps_of(tables: ResultTables) -> list[MapSetUp]:
 
 
 def compare_maps(tables: ResultTables, summary: pd.DataFrame) -> pd.DataFrame:
-    """Return rows of `compare_set_ups` for all that have a map, with the fields of `MapSetUp`; over runs on the damaged
-    board mean ``views_left_out``, median ``seconds_map``, and the surface noise's deviation ``surface_std_mm``."""
-    maps = pd.DataFrame([asdict(one) for one in maps_of(tables)])
+    """Return the rows of `compare_set_ups` for all set-ups with a map, and the fields of `MapSetUp`. Over runs on the
+    damaged board: mean ``views_left_out``, median ``seconds_map``, and the noise's deviation ``surface_std_mm``."""
+    maps = pd.DataFrame([asdict(each) for each in maps_of(tables)])
     compared = compare_set_ups(tables, summary, [str(name) for name in maps["variant"]], half_sizes=False)
     if compared.empty:
         return compared
@@ -85,7 +85,7 @@ def compare_maps(tables: ResultTables, summary: pd.DataFrame) -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class Change:
-    """A mean difference (second less first), with its interval over ``n`` repeats."""
+    """A mean difference (second minus first), with its interval over ``n`` repeats."""
 
     mean: float
     interval: Interval
@@ -98,7 +98,7 @@ class Change:
 
 
 def change_of(differences: np.ndarray) -> Change:
-    """Average differences of repeats, NaN left out, with Student's interval; it is unknown below two."""
+    """Return the mean difference over repeats, without NaN, and Student's interval, unknown below two repeats."""
     known = differences[np.isfinite(differences)]
     if len(known) < 2:
         return Change(np.nan, UNKNOWN, 0)
@@ -108,15 +108,15 @@ def change_of(differences: np.ndarray) -> Change:
 
 @dataclass(frozen=True)
 class SizeErrors:
-    """Change (second less first) of |measured - true diameter| in mm of holes that both of two maps measure. ``holes``
-    (h,) names and ``diameters_mm`` (h,), ascending; ``differences_mm`` (repeats, h), NaN where one lacks it."""
+    """Change (second minus first) of |measured - true diameter|, mm, of holes that both maps measure. ``holes`` (h,):
+    names. ``diameters_mm`` (h,): ascending. ``differences_mm`` (repeats, h): NaN where a map lacks the hole."""
 
     holes: tuple[str, ...]
     diameters_mm: np.ndarray
     differences_mm: np.ndarray
 
     def change(self, of: np.ndarray | None = None) -> Change:
-        """Average over the holes ``of`` (h,) bool: the mean over repeats of each repeat's mean difference."""
+        """Return the mean over repeats of the mean difference over the holes ``of`` (h,) bool."""
         chosen = self.differences_mm if of is None else self.differences_mm[:, of]
         there = np.isfinite(chosen)
         with np.errstate(invalid="ignore"):
@@ -124,7 +124,7 @@ class SizeErrors:
 
 
 def size_errors(first: pd.DataFrame, second: pd.DataFrame, measure: Measure = "extent") -> SizeErrors:
-    """Pair the table of holes' rows of two maps, each of one set-up and one number of frames; see `FEWEST_BOTH`."""
+    """Pair the rows of two maps in the table of holes, each of one set-up and number of frames; see `FEWEST_BOTH`."""
 
     def errors(rows: pd.DataFrame) -> pd.DataFrame:
         error = (rows[f"{measure}_diameter_mm"] - rows["true_diameter_mm"]).abs()
@@ -138,8 +138,7 @@ def size_errors(first: pd.DataFrame, second: pd.DataFrame, measure: Measure = "e
 
 
 def run_ratio(first: pd.DataFrame, second: pd.DataFrame, column: str) -> Change:
-    """Return the paired change of the natural logarithm of a column of the table of runs on the damaged board; its
-    ``exp`` is a ratio."""
+    """Return the paired change of a column's logarithm over runs on the damaged board; its ``exp`` is a ratio."""
     return change_of(np.log((_by_repeat(second)[column] / _by_repeat(first)[column]).to_numpy(float)))
 
 
@@ -149,7 +148,7 @@ def _by_repeat(runs: pd.DataFrame) -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class Map:
-    """One map of the experiment: a set-up or variation with one number of frames a view."""
+    """One map of the experiment: a set-up or variation with one number of frames per view."""
 
     variant: str
     frames: int
@@ -158,8 +157,8 @@ class Map:
 
 @dataclass(frozen=True)
 class MapCase:
-    """The maps of one place: those of one value of every axis but views, registration and merging. ``summary``: of
-    `harness.evaluation.summary.summarise_holes`; ``without_unit``: the place but for the camera's unit."""
+    """The maps of one place: one value of every axis except views, registration and merging. ``summary``: of
+    `harness.evaluation.summary.summarise_holes`. ``without_unit``: the place without the camera's unit."""
 
     tables: ResultTables
     summary: pd.DataFrame
@@ -170,28 +169,28 @@ class MapCase:
     @property
     def set_ups(self) -> list[MapSetUp]:
         """Maps of set-ups, without variations."""
-        return [one for one in self.maps if not one.is_variation]
+        return [each for each in self.maps if not each.is_variation]
 
     def variant(self, views: int, registration: str, merge: str) -> str | None:
-        """Name the set-up. All registrations of a single view are the same, so that any of them serves."""
-        alike = [one for one in self.set_ups if (one.views, one.merge) == (views, merge)]
-        named = [one for one in alike if one.registration == registration]
+        """Return the name of the set-up. All registrations of a single view are the same, so any of them will do."""
+        alike = [each for each in self.set_ups if (each.views, each.merge) == (views, merge)]
+        named = [each for each in alike if each.registration == registration]
         chosen = named or (alike if views == 1 else [])
         return chosen[0].variant if chosen else None
 
     def frames(self, variant: str) -> list[int]:
-        """List the numbers of frames with which this variant was finished, ascending."""
+        """Return the numbers of frames with which this variant was finished, ascending."""
         return sorted(int(n) for n in self.summary["frames"][self.summary["variant"] == variant].unique())
 
     def common_frames(self, *variants: str | None) -> int | None:
-        """Choose `MANY` where all of them have it, else the most that all have; None where one is missing."""
+        """Return `MANY` if all variants have it, else the most that all have; None if a variant is missing."""
         if any(variant is None for variant in variants):
             return None
         shared = set.intersection(*(set(self.frames(variant)) for variant in variants if variant is not None))
         return MANY if MANY in shared else max(shared, default=None)
 
     def named(self, views: int, registration: str, merge: str, frames: int | None = None) -> Map | None:
-        """Find the map of that name with so many frames, by default those that `common_frames` chooses."""
+        """Return the map of that name with this number of frames (default: that of `common_frames`), if any."""
         variant = self.variant(views, registration, merge)
         chosen = self.common_frames(variant) if frames is None else frames
         if variant is None or chosen is None or chosen not in self.frames(variant):
@@ -199,48 +198,49 @@ class MapCase:
         return Map(variant, chosen, views)
 
     def single(self, frames: int | None = None) -> Map | None:
-        """Find the map of a single view, by the thesis' merging where that was tried."""
-        merges = [THESIS_MERGE, *(one.merge for one in self.set_ups)]
+        """Return the map of a single view, by the thesis' merging if that was tried."""
+        merges = [THESIS_MERGE, *(each.merge for each in self.set_ups)]
         singles = (self.named(1, THESIS_REGISTRATION, merge, frames) for merge in dict.fromkeys(merges))
-        return next((one for one in singles if one is not None), None)
+        return next((each for each in singles if each is not None), None)
 
-    def holes(self, one: Map) -> pd.DataFrame:
+    def holes(self, chosen: Map) -> pd.DataFrame:
         """Return the rows of one map in the table of holes."""
-        return _rows(with_columns(self.tables.holes), one)
+        return _rows(with_columns(self.tables.holes), chosen)
 
-    def runs(self, one: Map) -> pd.DataFrame:
+    def runs(self, chosen: Map) -> pd.DataFrame:
         """Return the rows of one map in the table of runs."""
-        return _rows(self.tables.runs, one)
+        return _rows(self.tables.runs, chosen)
 
-    def status(self, one: Map) -> dict[str, HoleState]:
+    def status(self, chosen: Map) -> dict[str, HoleState]:
         """Return the state of each hole."""
-        return found_holes(self.summary, one.variant, one.frames)
+        return found_holes(self.summary, chosen.variant, chosen.frames)
 
     def registrations(self, frames: int) -> pd.DataFrame:
-        """Return the registrations of the set-ups with so many frames."""
+        """Return the registrations of the set-ups with this number of frames."""
         rows = self.tables.registrations
-        return rows[(rows["frames"] == frames) & rows["variant"].isin([one.variant for one in self.set_ups])]
+        return rows[(rows["frames"] == frames) & rows["variant"].isin([each.variant for each in self.set_ups])]
 
 
-def _rows(table: pd.DataFrame, one: Map) -> pd.DataFrame:
-    return table[(table["variant"] == one.variant) & (table["frames"] == one.frames)]
+def _rows(table: pd.DataFrame, chosen: Map) -> pd.DataFrame:
+    return table[(table["variant"] == chosen.variant) & (table["frames"] == chosen.frames)]
 
 
 def map_cases(tables: ResultTables, summary: pd.DataFrame) -> list[MapCase]:
     """Make one case for each place, in the order of the set-ups."""
     maps = maps_of(tables)
-    places = dict.fromkeys(one.place for one in maps if not one.is_variation)
+    places = dict.fromkeys(each.place for each in maps if not each.is_variation)
     alike = tables.variants.assign(**{CAMERA_UNIT: ""}) if CAMERA_UNIT in tables.variants else tables.variants
-    without = {one.variant: one.place for one in maps_of(replace(tables, variants=alike))}
-    groups = ((place, [one for one in maps if one.place == place]) for place in places)
+    without = {each.variant: each.place for each in maps_of(replace(tables, variants=alike))}
+    groups = ((place, [each for each in maps if each.place == place]) for place in places)
     return [MapCase(tables, summary, group, place, without[group[0].variant]) for place, group in groups]
 
 
 @dataclass(frozen=True)
 class AgainstOne:
-    """Several merged views against the first of them alone on the same repeats. ``large``, ``small``: change of |size
-    error| in mm over the holes from `LARGE_MM` on and below; ``threshold``: of the calibrated one in mm; ``noise``: of
-    the logarithm of the surface noise. ``lost``, ``gained``: holes found by the one, by the several views alone."""
+    """Several merged views compared with the first view on the same repeats. ``large``, ``small``: change of |size
+    error| in mm over the holes from `LARGE_MM` and below. ``threshold``: change of the calibrated threshold in mm.
+    ``noise``: of the logarithm of the surface noise. ``lost``, ``gained``: holes found only by the single view, and
+    only by the several views."""
 
     frames: int
     sizes: SizeErrors
@@ -253,15 +253,15 @@ class AgainstOne:
 
 
 def against_one(case: MapCase, registration: str, merge: str) -> AgainstOne | None:
-    """Compare two views with the most frames that both have (`MapCase.common_frames`); None where a map is missing."""
+    """Compare two views with the most frames that both have (`MapCase.common_frames`); None if a map is missing."""
     frames = case.common_frames(*(case.variant(views, registration, merge) for views in (1, 2)))
     if frames is None:
         return None
-    one, several = (case.named(n, registration, merge, frames) for n in (1, 2))
-    assert one is not None and several is not None
-    sizes = size_errors(case.holes(one), case.holes(several))
+    single, several = (case.named(n, registration, merge, frames) for n in (1, 2))
+    assert single is not None and several is not None
+    sizes = size_errors(case.holes(single), case.holes(several))
     large = sizes.diameters_mm >= LARGE_MM - 1e-9
-    states, runs = (case.status(one), case.status(several)), (case.runs(one), case.runs(several))
+    states, runs = (case.status(single), case.status(several)), (case.runs(single), case.runs(several))
     lost, gained = (
         tuple(hole for hole, state in here.items() if state == "found" and there.get(hole) == "missed")
         for here, there in (states, states[::-1])
@@ -272,17 +272,17 @@ def against_one(case: MapCase, registration: str, merge: str) -> AgainstOne | No
 
 
 def label_of(registration: str, merge: str, place: str = "") -> str:
-    """Name a way to make a map: ``cpd, grid``."""
+    """Return the name of a way to make a map: ``cpd, grid``."""
     return ", ".join(part for part in (registration, merge, place) if part) or "as declared"
 
 
 def frames_text(frames: int) -> str:
-    """Write ``50 frames a view``."""
+    """Return ``50 frames a view``."""
     return f"{frames} frame{'s' if frames > 1 else ''} a view"
 
 
 def span(interval: Interval, digits: int = 2) -> str:
-    """Write ``0.10 to 0.20``, or that it is unknown."""
+    """Return ``0.10 to 0.20``, or that the interval is unknown."""
     if not interval.known:
         return "interval unknown"
     low, high = (round(end, digits) + 0.0 for end in (interval.low, interval.high))  # + 0.0 turns -0.0 into 0.0
@@ -290,13 +290,13 @@ def span(interval: Interval, digits: int = 2) -> str:
 
 
 def change_text(change: Change, unit: str = " mm") -> str:
-    """Write ``+0.12 mm (0.05 to 0.19)``."""
+    """Return ``+0.12 mm (0.05 to 0.19)``."""
     known = np.isfinite(change.mean)
     return f"{round(change.mean, 2) + 0.0:+.2f}{unit} ({span(change.interval)})" if known else "not compared"
 
 
 def ratio_text(change: Change) -> str:
-    """Write a change of a logarithm as a factor: ``× 0.61 (0.60 to 0.62)``."""
+    """Return a change of a logarithm as a factor: ``× 0.61 (0.60 to 0.62)``."""
     if not np.isfinite(change.mean):
         return "not compared"
     return f"× {np.exp(change.mean):.2f} ({span(Interval(*np.exp([change.interval.low, change.interval.high])))})"
@@ -304,13 +304,13 @@ def ratio_text(change: Change) -> str:
 
 PARTS = ("in_plane", "across")
 UNIT = ["frames", "repeat", "role"]
-"""The columns of one draw of noise and of nominal poses, which intervals resample."""
+"""The columns that identify one draw of noise and of nominal poses, which intervals resample."""
 MOST_REASONS = 3
 
 
 def of_map(registrations: pd.DataFrame, method: str, views: int) -> pd.DataFrame:
-    """Select the registrations that a map of so many views rests on: those of exactly ``views`` first, else of the
-    nearest, since a method that registers each view by itself gives the same for any number of views."""
+    """Return the registrations behind a map of this number of views: those of exactly ``views``, else of the nearest
+    number, since a method that registers each view alone gives the same result for any number."""
     rows = registrations[(registrations["method"] == method) & (registrations["view"] < views)]
     if VIEWS not in rows:
         return rows
@@ -321,16 +321,16 @@ def of_map(registrations: pd.DataFrame, method: str, views: int) -> pd.DataFrame
 
 
 def summarise_registrations(registrations: pd.DataFrame) -> pd.DataFrame:
-    """Make one row per method and number of frames: numbers, failures, and the errors of those that did not fail. For
-    both `PARTS` median, root mean square, the predicted one (of the covariances) and the ``_ratio`` of actual to
-    predicted (1: honest, above 1: too sure) with a bootstrap over repeats; ``guess_mm``: of the starting guess."""
+    """Return one row per method and number of frames: numbers, failures, and the errors of those that did not fail. For
+    both `PARTS`: median, root mean square, the value that covariances predict, and the ``_ratio`` of actual to
+    predicted (1: honest, above 1: too sure) with a bootstrap over repeats. ``guess_mm``: error of the initial guess."""
     groups = registrations.groupby(["method", "frames"], sort=False)
     rows = [{"method": method, "frames": frames} | _summary(part) for (method, frames), part in groups]
     return pd.DataFrame(rows)
 
 
 def by_views(registrations: pd.DataFrame, counts: Sequence[int]) -> pd.DataFrame:
-    """Summarise registrations by method and frames for each number of views, which the column ``views`` tells."""
+    """Summarise registrations by method and frames for each number of views, given in the column ``views``."""
     parts = []
     for method in dict.fromkeys(registrations["method"]):
         for views in counts:
@@ -341,19 +341,19 @@ def by_views(registrations: pd.DataFrame, counts: Sequence[int]) -> pd.DataFrame
 
 
 def trusted(registrations: pd.DataFrame) -> pd.DataFrame:
-    """Select those that did not fail."""
+    """Return the registrations that did not fail."""
     return registrations[registrations["failure"] == ""]
 
 
 def per_pair(registrations: pd.DataFrame, column: str) -> pd.Series:
-    """Root mean square over the repeats of each view, paired with the first one, of the registrations that did not
-    fail. Repeats of a pair share its geometry and the fixed pattern, so that they are no further pairs."""
+    """Return the root mean square over the repeats of each pair of a view and the first view, for registrations that
+    did not fail. Repeats of a pair share its geometry and the fixed pattern, so they are not further pairs."""
     rows = trusted(registrations)
     return (rows[column] ** 2).groupby(rows["view"]).mean().pow(0.5)
 
 
 def paired_ratio(first: pd.DataFrame, second: pd.DataFrame, column: str) -> tuple[float, float, float, int]:
-    """Geometric mean over pairs of views of second / first by `per_pair`, Student's interval, number; NaN below two."""
+    """Return the geometric mean of second / first over pairs of views, Student's interval, number; NaN below two."""
     both = per_pair(first, column).to_frame("first").join(per_pair(second, column).rename("second"), how="inner")
     both = both[(both > 0).all(axis=1)]
     if len(both) < 2:
@@ -391,7 +391,7 @@ def _summary(part: pd.DataFrame) -> dict[str, Any]:
 
 
 def _ratio(sums: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """Ratios (draws,) of actual to predicted root mean square; ``sums`` (n, 2) of squares in each unit of `UNIT`."""
+    """Return the ratios (draws,) of actual to predicted root mean square. ``sums`` (n, 2): of squares by `UNIT`."""
     total = sums[chosen].sum(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(np.sqrt(total[:, 0] / total[:, 1]))

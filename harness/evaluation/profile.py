@@ -12,13 +12,13 @@ FEWEST_PIXELS = 12
 FEWEST_VALID = 0.5
 """Least share of valid pixels inside the outline: fewer may show only one side of the hole."""
 CLEARLY = 0.8
-"""A shape fits clearly better when its rms misfit is at most this share of the other's (fixed beforehand)."""
+"""A shape fits clearly better if its rms misfit is at most this share of the other's (fixed beforehand)."""
 
 
 @dataclass(frozen=True)
 class HoleInView:
-    """The truth of one round damage on the cloud's pixel grid: centre ``u_px``, ``v_px`` (column, row; 0, 0 = centre of
-    the first pixel), ``radius_px`` of its outline, ``depth_mm`` below the face, NaN or infinite without a floor."""
+    """The true place of one round damage on the cloud's pixel grid. ``u_px``, ``v_px``: centre (column, row; 0, 0 is
+    the centre of the first pixel). ``radius_px``: of its outline. ``depth_mm``: NaN or infinite without a floor."""
 
     hole: str
     u_px: float
@@ -31,8 +31,8 @@ class HoleInView:
 @dataclass(frozen=True)
 class ExampleCloud:
     """One averaged cloud of one variant, on its pixel grid (h, w). ``residual_mm``: distance behind (+) or before (-)
-    the fitted surface, NaN where none; ``detected`` bool: pixels of the detector's clusters; ``inside`` bool: of the
-    crop; ``truth``: the holes on it; ``z_truth_mm``: true z on each pixel's central ray, NaN where it meets nothing."""
+    the fitted surface, NaN if unknown. ``detected`` bool: pixels of the detector's clusters. ``inside`` bool: of the
+    crop. ``truth``: its holes. ``z_truth_mm``: true z on each pixel's central ray, NaN where it meets nothing."""
 
     frames: int
     variant: str
@@ -45,8 +45,8 @@ class ExampleCloud:
 
 @dataclass(frozen=True)
 class HoleShape:
-    """Root mean square misfits in mm of shapes scaled in depth to what is inside a hole's outline: a flat floor, and
-    the hemisphere on the same rim. ``true_*``: the same of the true geometry, a control."""
+    """Root mean square misfits in mm of two shapes, scaled in depth to the residual inside a hole's outline: a flat
+    floor, and a hemisphere on the same rim. ``true_*``: the same for the true geometry, as a control."""
 
     hole: str
     pixels: int
@@ -64,16 +64,16 @@ class HoleShape:
 
 
 def relative_radius(cloud: ExampleCloud, hole: HoleInView) -> np.ndarray:
-    """(h, w): distance from the hole's centre over its radius, in the image plane. Not modelled: foreshortening; a tilt
-    of the board by t squeezes one direction by cos t (1.5 % at 10 degrees)."""
+    """Return the distance (h, w) from the hole's centre over its radius, in the image plane. Not modelled:
+    foreshortening (a tilt by t shortens one direction by cos t: 1.5 % at 10 degrees)."""
     v, u = np.indices(cloud.residual_mm.shape)
     return np.hypot(u - hole.u_px, v - hole.v_px) / hole.radius_px
 
 
 def true_residual_mm(cloud: ExampleCloud, hole: HoleInView) -> np.ndarray:
-    """(h, w): true z minus the undamaged face's, continued over the hole by a quadratic through its surroundings. The
-    surroundings are the board's pixels from 1.2 to 3 radii (at least 4 pixels wide) that lie in no other hole. NaN
-    everywhere where there are too few of them for six coefficients."""
+    """Return true z minus the undamaged face's (h, w). The face is continued over the hole by a quadratic through the
+    board's pixels at 1.2 to 3 radii (at least 4 pixels wide) that lie in no other hole. NaN everywhere if these are too
+    few for six coefficients."""
     v, u = np.indices(cloud.residual_mm.shape)
     outer = max(3 * hole.radius_px, 1.2 * hole.radius_px + 4)
     face = cloud.inside & np.isfinite(cloud.z_truth_mm) & (np.hypot(u - hole.u_px, v - hole.v_px) <= outer)
@@ -88,7 +88,7 @@ def true_residual_mm(cloud: ExampleCloud, hole: HoleInView) -> np.ndarray:
 
 
 def hole_shape(cloud: ExampleCloud, hole: HoleInView) -> HoleShape | None:
-    """Fit both shapes to the measured residual inside the outline; None where too few of its pixels are valid."""
+    """Fit both shapes to the measured residual inside the outline; None if too few of its pixels are valid."""
     radius = relative_radius(cloud, hole)
     outline = radius < 1
     valid = outline & np.isfinite(cloud.residual_mm)
@@ -103,18 +103,18 @@ def hole_shape(cloud: ExampleCloud, hole: HoleInView) -> HoleShape | None:
 
 
 def hole_shapes(cloud: ExampleCloud) -> list[HoleShape]:
-    """The shapes of all holes large and valid enough, smallest first."""
+    """Return the shapes of all holes that are large and valid enough, smallest first."""
     shapes = (hole_shape(cloud, hole) for hole in sorted(cloud.truth, key=lambda hole: hole.diameter_mm))
     return [shape for shape in shapes if shape is not None]
 
 
 def bowl(rho: np.ndarray) -> np.ndarray:
-    """Depth of a hemisphere on the rim over its greatest depth, at ``rho`` radii from the axis; 0 outside the rim."""
+    """Return a hemisphere's depth over its greatest depth, at ``rho`` radii from the axis; 0 outside the rim."""
     return np.sqrt(np.clip(1 - np.asarray(rho, float) ** 2, 0, None))
 
 
 def _misfit(depth: np.ndarray, shape: np.ndarray) -> float:
-    """Root mean square of depth less the least-squares multiple of ``shape``; NaN without data."""
+    """Return the root mean square of depth minus the least-squares multiple of ``shape``; NaN without data."""
     if depth.size == 0 or not shape.any():
         return float("nan")
     return float(np.sqrt(np.mean((depth - (depth @ shape / (shape @ shape)) * shape) ** 2)))

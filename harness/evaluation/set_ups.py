@@ -1,5 +1,5 @@
-"""Set-ups of one experiment side by side: each one's smallest hole and measures, its camera, and each switch's cost.
-The smallest hole that a set-up finds is stated as a step on its ladder of sizes, and as the size found in half of the
+"""Compares the set-ups of one experiment: each one's smallest hole, measures and camera, and the cost of each effect.
+The smallest hole that a set-up finds is given as a step on its ladder of sizes, and as the size found in half of the
 trials: a point on a monotone curve through the rates, not a probability of detection in the sense of the handbooks."""
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ RESAMPLES = 1000
 """Draws of the bootstrap: its 2.5 % quantile is the 25th smallest, stable to about 5 % of the interval's width."""
 HALF = 0.5
 LIMIT_RULE = (
-    "The detection limit is the smallest true diameter from which on every hole as large or larger counts as found. "
+    "The detection limit is the smallest true diameter for which every hole as large or larger counts as found. "
     "The 50 % size is where the detection rate, made monotone in the diameter by isotonic regression and interpolated "
     "linearly between sizes, reaches one half; its 95 % interval is a bootstrap over the holes of each size (where "
     "there are several) and over the repeats."
@@ -33,14 +33,14 @@ LIMIT_RULE = (
 
 @dataclass(frozen=True)
 class Ladder:
-    """Detections of one set-up: ``diameters_mm`` (h,) of the holes, ascending; ``detected`` (repeats, h) bool."""
+    """Detections of one set-up. ``diameters_mm`` (h,): of the holes, ascending. ``detected``: (repeats, h) bool."""
 
     diameters_mm: np.ndarray
     detected: np.ndarray
 
     @cached_property
     def half_mm(self) -> float:
-        """The 50 % size; the ladder's least size where that is found more often than not, infinity where none is."""
+        """The 50 % size; the least size if it is found more often than not, infinity if no size is."""
         repeats, holes = self.detected.shape
         return float(self._half_sizes(np.ones((1, repeats)), np.ones((1, holes)))[0])
 
@@ -51,7 +51,7 @@ class Ladder:
 
     @cached_property
     def half_draws_mm(self) -> np.ndarray:
-        """(`RESAMPLES`,) 50 % sizes of the two-way bootstrap, drawn alike for ladders of the same holes and repeats."""
+        """The 50 % sizes (`RESAMPLES`,) of the two-way bootstrap, drawn alike for equal holes and repeats."""
         rng = np.random.default_rng(0)
         repeats, holes = self.detected.shape
         of_repeats = rng.multinomial(repeats, np.full(repeats, 1 / repeats), RESAMPLES)
@@ -62,7 +62,7 @@ class Ladder:
         return self._half_sizes(of_repeats, of_holes)
 
     def _half_sizes(self, of_repeats: np.ndarray, of_holes: np.ndarray) -> np.ndarray:
-        """(n,) 50 % sizes, repeats (n, repeats) and holes (n, h) weighted by how often they were drawn."""
+        """Return 50 % sizes (n,), with repeats (n, repeats) and holes (n, h) weighted by how often they were drawn."""
         by_hole = of_repeats @ self.detected / of_repeats.sum(axis=1, keepdims=True) * of_holes
         sizes, starts = np.unique(self.diameters_mm, return_index=True)
         hits, drawn = (np.add.reduceat(of, starts, axis=1) for of in (by_hole, of_holes))
@@ -70,7 +70,7 @@ class Ladder:
 
 
 def ladder_of(holes: pd.DataFrame) -> Ladder:
-    """Make the ladder of the table of holes' rows of one set-up and one number of frames."""
+    """Return the ladder of the rows of one set-up and one number of frames in the table of holes."""
     table = holes.pivot(index="repeat", columns="hole", values="detected").astype(bool)
     sizes = holes.groupby("hole")["true_diameter_mm"].first()
     order = sorted(table.columns, key=lambda hole: (sizes[hole], str(hole)))
@@ -78,14 +78,14 @@ def ladder_of(holes: pd.DataFrame) -> Ladder:
 
 
 def found_limit_mm(summary: pd.DataFrame) -> float:
-    """Find the limit by `LIMIT_RULE` in summary rows of one set-up and frames; NaN where the largest hole is missed."""
-    missed = summary["true_diameter_mm"][summary["status"] != "found"].max()  # NaN where there is none
+    """Return the limit by `LIMIT_RULE` from rows of one set-up and frames; NaN if it misses the largest hole."""
+    missed = summary["true_diameter_mm"][summary["status"] != "found"].max()  # NaN if there is none
     return float(summary["true_diameter_mm"][~(summary["true_diameter_mm"] <= missed)].min())
 
 
 def half_size(sizes_mm: np.ndarray, rates: np.ndarray) -> np.ndarray:
-    """Find (n,) where rates (n, s), made monotone, first reach one half: by linear interpolation between sizes, in mm.
-    The least size where its rate does already, infinity where none does."""
+    """Return the sizes (n,) in mm at which monotone rates (n, s) first reach one half, interpolated linearly; the least
+    size if its rate does already, infinity if none does."""
     monotone = np.array([isotonic_regression(row).x for row in np.asarray(rates, float)])
     reached = monotone >= HALF - 1e-12
     last = np.argmax(reached, axis=1)
@@ -97,17 +97,17 @@ def half_size(sizes_mm: np.ndarray, rates: np.ndarray) -> np.ndarray:
 
 
 def set_ups_of(tables: ResultTables) -> list[str]:
-    """List the labels of the experiment's set-ups, variations left out, in their order."""
+    """Return the labels of the experiment's set-ups in their order, without variations."""
     return [str(name) for name in tables.variants["variant"][~tables.variants["is_variation"].astype(bool)]]
 
 
 def compare_set_ups(
     tables: ResultTables, summary: pd.DataFrame, variants: list[str], *, half_sizes: bool = True
 ) -> pd.DataFrame:
-    """Make one row per (variant, frames) that was finished, variants in the given order, with the axes' columns.
-    ``half_*``, of set-ups alone, need ``half_sizes``, a bootstrap; for each measure ``<measure>_*`` of all single
-    diameters of found holes against the truth, ``<measure>_place_*`` of distances from the largest hole (none where
-    several are); noise of the averaged z on probe pixels, and means over hole-free runs of ``tables.noise``."""
+    """Return one row per finished (variant, frames), variants in the given order, with the axes' columns. ``half_*``:
+    only for set-ups, and with ``half_sizes``, as they need a bootstrap. ``<measure>_*``: for each measure, of all
+    single diameters of found holes against the truth. ``<measure>_place_*``: of distances from the largest hole (none
+    if several are largest). Also: noise of averaged z on probes, means over hole-free runs of ``tables.noise``."""
     summary, halved = summary[summary["variant"].isin(variants)], set_ups_of(tables) if half_sizes else []
     groups = summary.groupby(KEYS, sort=False)
     table = pd.DataFrame([_row(tables, part, variant in halved) for (variant, _), part in groups])
@@ -120,7 +120,7 @@ def compare_set_ups(
     for part in (noise, calls):
         table = table.merge(part, "left", KEYS)
     table = table.rename(columns={"temporal_rms_mm": "temporal_mm", "surface_noise_mm": "surface_mm"})
-    if len(tables.noise):  # empty for maps, whose pixels are no camera's
+    if len(tables.noise):  # empty for maps: their pixels are not those of a camera
         columns = [name for name in tables.noise.columns if name not in ("repeat", *tables.axes["path"])]
         table = table.merge(tables.noise[columns].groupby(KEYS, as_index=False).mean(), "left", KEYS)
     order = {variant: place for place, variant in enumerate(variants)}
@@ -128,7 +128,7 @@ def compare_set_ups(
 
 
 def _row(tables: ResultTables, part: pd.DataFrame, half_sizes: bool) -> dict[str, Any]:
-    """Describe the holes of one set-up at one number of frames; ``part``: their summary rows."""
+    """Return a summary of the holes of one set-up at one number of frames, from its summary rows ``part``."""
     first = part.iloc[0]
     trials = tables.holes[(tables.holes["variant"] == first["variant"]) & (tables.holes["frames"] == first["frames"])]
     found = list(part["hole"][part["status"] == "found"])
@@ -148,7 +148,7 @@ def _row(tables: ResultTables, part: pd.DataFrame, half_sizes: bool) -> dict[str
         row |= {"half_mm": ladder.half_mm, "half_low_mm": interval.low, "half_high_mm": interval.high}
     of_found = trials[trials["hole"].isin(found)]
     largest = int((part["true_diameter_mm"] == part["true_diameter_mm"].max()).sum())
-    # The largest hole is where distances count from; of several as large, any may be the largest cluster.
+    # Distances count from the largest hole; if several are largest, any may be the largest cluster.
     away = of_found[(of_found["true_offset_mm"] > 0) & (largest == 1)]
     for measure in MEASURES:
         size = of_found[f"{measure}_diameter_mm"] - of_found["true_diameter_mm"]
@@ -161,7 +161,7 @@ def _row(tables: ResultTables, part: pd.DataFrame, half_sizes: bool) -> dict[str
 
 
 def effect_costs(tables: ResultTables) -> pd.DataFrame:
-    """Return the table of effects: the cost of each switch alone (nothing else on) and last (all others on), and of all
+    """Return the table of effects: the cost of each effect alone (nothing else on) and last (all others on), and of all
     together, for each place on the experiment's other axes and number of frames. Costs are paired changes of the 50 %
     size; those of set-ups that were not finished with the same repeats are left out."""
     set_ups = tables.variants[tables.variants["switches"] != ""]
@@ -175,8 +175,8 @@ def effect_costs(tables: ResultTables) -> pd.DataFrame:
         by_switches = {frozenset(name for name, is_on in of.items() if is_on): name for name, of in switches.items()}
         everything = max(by_switches, key=len)
         effects = [(name.replace("_", " "), frozenset([name])) for name in switches[by_switches[everything]]]
-        wanted = [(effect, "nothing", nothing, one) for effect, one in effects]
-        wanted += [(effect, "all others", everything - one, everything) for effect, one in effects]
+        wanted = [(effect, "nothing", nothing, alone) for effect, alone in effects]
+        wanted += [(effect, "all others", everything - alone, everything) for effect, alone in effects]
         wanted.append(("all", "nothing", nothing, everything))
         holes = tables.holes[tables.holes["variant"].isin(by_switches.values())]
         for frames, rows in holes.groupby("frames"):
@@ -189,8 +189,8 @@ def effect_costs(tables: ResultTables) -> pd.DataFrame:
 
 
 def _cost(ladders: Mapping[frozenset[str], Ladder], off: frozenset[str], on: frozenset[str]) -> dict[str, Any]:
-    """The paired difference of two set-ups with its interval, and whether both sizes lie on the ladder, so that it is
-    no mere bound; empty where either was not finished, or not with the same repeats."""
+    """Return the paired difference of two set-ups with its interval, and whether both sizes lie on the ladder (else it
+    is only a bound); empty if either was not finished, or not with the same repeats."""
     if off not in ladders or on not in ladders or ladders[off].detected.shape != ladders[on].detected.shape:
         return {}
     before, after = ladders[off], ladders[on]

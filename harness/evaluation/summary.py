@@ -19,7 +19,7 @@ HoleState = Literal["found", "missed", "undecided"]
 Measure = Literal["extent", "model"]
 
 MAIN = "main"
-"""The variant that the experiment declares; every other one changes a fact that the thesis leaves open."""
+"""The variant that the experiment declares; all others change a fact that the thesis leaves open."""
 FOUND_RULE = (
     "A hole counts as found when the 95 % Wilson interval of its detection rate over the repeats lies above 0.5, "
     "as missed when it lies below, and as undecided otherwise."
@@ -31,16 +31,16 @@ TRUTH_COLUMNS = [column.name for column in TRUTH]
 
 
 def by_hole(names: pd.Series) -> pd.Series:
-    """Sort key: holes by number where they have one ("2" before "11"), the others after them by name."""
+    """Return a sort key: holes by number if they have one ("2" before "11"), then the others by name."""
     return names.map(lambda name: (0, int(name), "") if str(name).isdecimal() else (1, 0, str(name)))
 
 
 def summarise_holes(holes: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFrame:
-    """Make one row per (variant, frames, hole): counts, rates, sizes and positions, each with its interval. ``axes``:
-    columns to be carried along. ``status`` is by `FOUND_RULE`; ``extent_`` is the thesis' measure, ``model_`` the
-    fit's, whose depth bias is against ``seen_depth_mm`` (behind a through-hole one sees farther);
-    ``model_diameter_covered``: share of fits within 1.96 standard errors.
-    Means are over the detected trials only: a hole detected in few trials shows the sizes of its lucky trials."""
+    """Return one row per (variant, frames, hole): counts, rates, sizes and positions, each with its interval. ``axes``:
+    columns to keep. ``status`` is by `FOUND_RULE`. ``extent_``: the thesis' measure. ``model_``: of the fit; its bias
+    of depth is relative to ``seen_depth_mm`` (behind a through-hole the backing is visible).
+    ``model_diameter_covered``: share of fits within 1.96 standard errors. Means are over detected trials only: the
+    sizes of a hole detected in few trials are those of its lucky trials."""
     holes = with_columns(holes)
     groups = holes.groupby(GROUP, sort=False)
     out = groups[[*axes, *TRUTH_COLUMNS]].first()
@@ -58,27 +58,27 @@ def summarise_holes(holes: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFra
 
 
 def with_columns(holes: pd.DataFrame) -> pd.DataFrame:
-    """The table of holes, with its columns where it came without any because no trial on the damaged board ended."""
+    """Return the table of holes, with its columns even if no trial on the damaged board ended."""
     return holes if "hole" in holes else holes.reindex(columns=[column.name for column in TRIALS.columns])
 
 
 def found_rule(trials: int) -> str:
-    """Return `FOUND_RULE`, with a remark where the trials are too few to call any hole found."""
+    """Return `FOUND_RULE`, with a remark if the trials are too few to call any hole found."""
     if trials >= FEWEST_TRIALS:
         return FOUND_RULE
     return f"{FOUND_RULE} {trials} repeats are too few for either: at least {FEWEST_TRIALS} are needed."
 
 
 def found_holes(summary: pd.DataFrame, variant: str, frames: int) -> dict[str, HoleState]:
-    """Each hole's status by `FOUND_RULE`, in the holes' order; empty where the variant lacks these frames."""
+    """Return each hole's status by `FOUND_RULE`, in the holes' order; empty if the variant lacks these frames."""
     rows = summary[(summary["variant"] == variant) & (summary["frames"] == frames)]
     return dict(zip(rows["hole"], rows["status"], strict=True))
 
 
 def false_calls(runs: pd.DataFrame) -> pd.DataFrame:
-    """One row per (variant, frames, role): runs, false calls, their rate per run with Garwood's Poisson interval.
-    Counts only runs that were judged at a threshold: hole-free runs that set it (their threshold is NaN) are told by
-    ``quiet_runs`` and ``quiet_highest``, the highest of their quiet thresholds, instead."""
+    """Return one row per (variant, frames, role): runs, false calls, and their rate per run with Garwood's Poisson
+    interval. Only runs judged at a threshold count. For hole-free runs that set it (their threshold is NaN),
+    ``quiet_runs`` is their number and ``quiet_highest`` the highest of their quiet thresholds."""
     keys = ["variant", "frames"]
     judged = runs[runs["threshold"].notna()].assign(threshold_mm=lambda r: r["threshold"] * r["scale_mm"])
     counts, means = {"runs": ("repeat", "size"), "false_calls": ("false_calls", "sum")}, ("threshold", "threshold_mm")
@@ -93,7 +93,7 @@ def false_calls(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def _measured(groups: Any, truth: pd.DataFrame, measure: Measure) -> pd.DataFrame:
-    """Means, standard deviations and biases of one measure's diameters and offsets."""
+    """Return means, standard deviations and biases of one measure's diameters and offsets."""
     diameter, offset = groups[f"{measure}_diameter_mm"], groups[f"{measure}_offset_mm"]
     out = diameter.agg(measured="count", diameter_mean_mm="mean", diameter_std_mm="std")
     out["bias_mm"] = out["diameter_mean_mm"] - truth["true_diameter_mm"]
@@ -105,7 +105,7 @@ def _measured(groups: Any, truth: pd.DataFrame, measure: Measure) -> pd.DataFram
 
 
 def _fitted(holes: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
-    """Depth, which only the model gives, and the standard errors that each fit states, compared with the truth."""
+    """Return depths, which only the model gives, and each fit's stated standard errors, compared with the truth."""
     miss = (holes["model_diameter_mm"] - holes["true_diameter_mm"]).abs() / holes["model_diameter_se_mm"]
     covered = (miss <= 1.96).astype(float).where(miss.notna())
     columns = {"model_diameter_se_mean_mm": ("model_diameter_se_mm", "mean")}
@@ -118,7 +118,7 @@ def _fitted(holes: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
 
 
 def _order(column: pd.Series) -> pd.Series:
-    """Sort key of one group column: the main variant first, holes by number, frames as numbers."""
+    """Return a sort key of one group column: the main variant first, holes by number, frames as numbers."""
     if column.name == "hole":
         return by_hole(column)
     if column.name == "variant":
@@ -128,7 +128,7 @@ def _order(column: pd.Series) -> pd.Series:
 
 
 def hole_list(names: Iterable[str]) -> str:
-    """Hole names as text, runs of numbers joined: ``4–7, 9``; ``none``."""
+    """Return hole names as text, runs of numbers joined: ``4–7, 9``; ``none``."""
     all_names = [str(name) for name in names]
     numbered = sorted(int(name) for name in all_names if name.isdecimal())
     runs = [[number for _, number in run] for _, run in groupby(enumerate(numbered), lambda at: at[1] - at[0])]
@@ -138,7 +138,7 @@ def hole_list(names: Iterable[str]) -> str:
 
 BLOCKS = 40
 """Blocks of neighbouring probe pixels that the bootstrap resamples: a camera's filter correlates neighbours, so pixels
-are not exchangeable; contiguous blocks far larger than the filter nearly are. 40 of them carry a quantile."""
+are not exchangeable, but contiguous blocks far larger than the filter nearly are. 40 give a quantile."""
 COLUMNS = ["variant", "frames", "pixels", "repeats", "temporal_rms_mm", "offset_mm", "pattern_mm"]
 COLUMNS += ["systematic_mm", "displacement_mm", "total_rms_mm"]
 
@@ -158,10 +158,11 @@ class NoiseLaw:
 
 
 def noise_against_frames(probes: pd.DataFrame) -> pd.DataFrame:
-    """Make one row per (variant, frames): root mean squares over the probe pixels, in mm. ``temporal``: deviation over
-    repeats. ``offset``: mean error. ``pattern``: deviation over pixels of the mean error, less what few repeats leave
-    in it. ``systematic``: both together. ``displacement``: deviation over repeats of the whole cloud, in no other
-    column. ``guide``: the shortest average's temporal noise falling as 1/sqrt(N). Pixels without a value are out."""
+    """Return one row per (variant, frames): root mean squares over the probe pixels, in mm. ``temporal``: deviation
+    over repeats. ``offset``: mean error. ``pattern``: deviation over pixels of the mean error, minus the remaining
+    noise of few repeats. ``systematic``: offset and pattern. ``displacement``: deviation over repeats of the whole
+    cloud, in no other column. ``guide``: the shortest average's temporal noise, falling as 1/sqrt(N). Pixels without a
+    value are out."""
     rows = []
     for (variant, frames), part in probes.groupby(["variant", "frames"], sort=False):
         moments = _moments(part)
@@ -180,8 +181,8 @@ def noise_against_frames(probes: pd.DataFrame) -> pd.DataFrame:
 
 
 def fit_floor(frames: Sequence[int] | np.ndarray, total_rms_mm: Sequence[float] | np.ndarray) -> float:
-    """Return the error that no averaging removes, in mm, of ``total^2 = white^2 / N + floor^2``: least squares with
-    both parts non-negative, weighted to equal relative error. NaN below two different numbers of frames."""
+    """Return the error that averaging cannot remove, in mm, of ``total^2 = white^2 / N + floor^2``: least squares with
+    both parts non-negative, weighted for equal relative error. NaN below two different numbers of frames."""
     n, total2 = np.asarray(frames, float), np.asarray(total_rms_mm, float) ** 2
     usable = np.isfinite(total2) & (total2 > 0)
     if len(np.unique(n[usable])) < 2:
@@ -192,7 +193,7 @@ def fit_floor(frames: Sequence[int] | np.ndarray, total_rms_mm: Sequence[float] 
 
 
 def noise_law(probes: pd.DataFrame, variant: str) -> NoiseLaw | None:
-    """Fit the exponent of the temporal noise and the change of the systematic error, with block-bootstrap intervals, of
+    """Fit the exponent of the temporal noise and the change of the systematic error, with block-bootstrap intervals, to
     pixels that have a value at every number of frames. None below two of either, or without temporal noise."""
     rows = probes[probes["variant"] == variant]
     frames = np.array(sorted(rows["frames"].unique()), float)
@@ -202,7 +203,7 @@ def noise_law(probes: pd.DataFrame, variant: str) -> NoiseLaw | None:
     present = usable.groupby("pixel")["frames"].nunique()
     common = present.index[present == len(frames)].sort_values()
     parts = [usable[usable["frames"] == n].set_index("pixel").loc[common] for n in frames]
-    stacked = np.stack([_moments(part) for part in parts], axis=1)  # (pixels, frames, 4), pixels that have all
+    stacked = np.stack([_moments(part) for part in parts], axis=1)  # (pixels, frames, 4), only pixels that have all
     pixels = len(stacked)
     if pixels < 2 or not (stacked[..., 0].mean(axis=0) > 0).all():
         return None
@@ -218,7 +219,7 @@ def noise_law(probes: pd.DataFrame, variant: str) -> NoiseLaw | None:
         return (0.5 * np.log(means(indices)[..., 0]) @ x) / (x @ x)
 
     def ratio(indices: np.ndarray) -> np.ndarray:
-        """Systematic error of the longest over the shortest average; NaN where the latter is 0."""
+        """Return the systematic error of the longest over the shortest average; NaN if the latter is 0."""
         mean = means(indices)
         systematic = np.sqrt(mean[..., 1] ** 2 + _pattern_variance(mean, pixels))
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -231,13 +232,13 @@ def noise_law(probes: pd.DataFrame, variant: str) -> NoiseLaw | None:
 
 
 def _moments(part: pd.DataFrame) -> np.ndarray:
-    """(pixels, 4): temporal variance, mean error, its square, temporal variance left in the mean error."""
+    """Return (pixels, 4): temporal variance, mean error, its square, temporal variance left in the mean error."""
     error, variance = part["mean_error_mm"].to_numpy(float), part["temporal_std_mm"].to_numpy(float) ** 2
     moments = np.stack([variance, error, error**2, variance / part["repeats"].to_numpy(float)], axis=-1)
     return moments[np.isfinite(moments).all(axis=1)]
 
 
 def _pattern_variance(mean: np.ndarray, pixels: int) -> np.ndarray:
-    """Variance over pixels of the mean error, less the leftover temporal variance, from means of `_moments`."""
+    """Return the variance over pixels of the mean error, minus leftover temporal variance, from means of `_moments`."""
     unbiased = (mean[..., 2] - mean[..., 1] ** 2) * (pixels / max(pixels - 1, 1))
     return np.maximum(unbiased - mean[..., 3], 0.0)

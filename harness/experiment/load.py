@@ -63,7 +63,7 @@ def _quick(data: Any) -> list[str]:
     overrides += ["sensitivity=null"] if shape.get(data, ("sensitivity",)) else []
     own = "threshold.calibrate"
     for path in ("repeats", f"{own}.repeats", "study.boards", "study.hole_free_boards", f"{own}.boards"):
-        number = shape.get(data, path.split("."))
+        number = shape.get(data, tuple(path.split(".")))
         if isinstance(number, int):
             fewer = min(number, 5) if path.endswith("repeats") else -(-number // 3)
             overrides.append(f"{path}={fewer}")

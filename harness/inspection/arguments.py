@@ -1,4 +1,4 @@
-"""Converts the arguments of `harness.detect` to a detector, settings of the mapping, captures and stated poses."""
+"""The arguments of `harness.detect` as settings: a detector, the merging of views, captures, stated poses."""
 
 from __future__ import annotations
 
@@ -26,52 +26,52 @@ MARKS = ("colour", "red", "coded")
 WHOLE_CAPTURES = (".mcap", ".db3", ".mkv", ".npy", ".npz", ".mat", ".tif", ".tiff", ".pfm")
 DEFAULT_FALSE_CALLS = 1.0  # expected false calls in the capture
 DEFAULT_DETECTOR = "matched"
-PREFIX = "mapping."  # start of the --set keys for merging views; all other keys belong to the detector
+PREFIX = "mapping."  # prefix of the --set keys for merging views; all other keys are the detector's
 STATED_SURFACE = ("surface=", "surface.degree", "surface.method", "surface.drop")
-"""Settings that state a polynomial; without them, the evidence decides the shape of the surface."""
+"""Settings that state a polynomial: without them, the surface's shape is chosen by evidence."""
 LEGAL_CROP = "auto, none, box:x0,x1,y0,y1,z0,z1 (mm, camera frame), polygon:u,v,u,v,u,v.. (pixels)"
 
 
-READING = ("unit", "topic", "array", "pitch", "raw")  # options that `open_capture` accepts unchanged
+READING = ("unit", "topic", "array", "pitch", "raw")  # options that `open_capture` takes as they are
 
 
 def add_reading(add: Callable[..., Any]) -> None:
-    """Add the options that control how captures are read; ``add`` is ``add_argument`` of a parser or a group."""
+    """Add the options for reading captures with ``add_argument`` of a parser or group."""
     add("--unit", help="unit of stored distances: mm, m, cm, um, in, tum (5000/m) or N/m; default: from the data")
     add("--intrinsics", metavar="FILE|CAMERA", help="lens of the depth pixels: a file, or a camera (nominal lens)")
     add("--topic", help="topic of a ROS bag with depth images or clouds (default: the only one)")
     add("--array", metavar="NAME[:NUMBER]", help="name of the array in a .npz, .mat or .npy, and number of the map")
     add("--pitch", metavar="LENGTH", help="the array is a height map with this distance between pixels, such as 0.5mm")
-    add("--raw", metavar="LAYOUT", help="layout of raw numbers: WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]], 640x480:u2")
+    add("--raw", metavar="LAYOUT", help="layout of bare numbers: WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]], 640x480:u2")
 
 
 def reading_of(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the values of `add_reading`'s options for `opened`, without the lens."""
+    """Return the values of `add_reading`'s options except the lens, for `opened`."""
     return {name: getattr(options, name) for name in READING}
 
 
 def refuse_misfits(arguments: argparse.Namespace, paths: list[Path]) -> None:
-    """Raise UserError for arguments that suit only several views with one capture, or the reverse."""
+    """Raise UserError for arguments of several views with one capture, and vice versa."""
     several = f"--register {'|'.join(METHODS)}"
     if arguments.register is None:
         given = [name for name in ("merge", "marks", "poses") if getattr(arguments, name) is not None]
         given += [f"set {assignment}" for assignment in arguments.set if assignment.startswith(PREFIX)]
         if given:
-            what = f"--{given[0]}: applies to several views, but without --register all PATHs are one capture"
+            what = f"--{given[0]}: concerns several views, but without --register all PATHs are one capture"
             raise UserError(what, legal=several)
         whole = [path for path in paths if path.is_dir() or path.suffix.lower() in WHOLE_CAPTURES]
         if len(paths) > 1 and whole:
-            fix = f"run each capture alone, or register them as views of one target: {several}"
-            raise UserError(f"{len(paths)} PATHs, but {whole[0]} is a complete capture", fix=fix)
+            fix = f"run each separately, or register them as views of one target: {several}"
+            raise UserError(f"{len(paths)} PATHs, but {whole[0]} is a whole capture", fix=fix)
         return
     if len(paths) < 2:
         fix = "name the other views, or leave out --register"
         raise UserError(f"{len(paths)} view cannot be registered: there is no other view", fix=fix)
     refuse_repeats(paths)
     if arguments.register == "nominal" and arguments.poses is None:
-        raise UserError("--register nominal needs the poses of the views", fix="give --poses FILE")
+        raise UserError("--register nominal uses the stated poses, and none are stated", fix="give --poses FILE")
     if arguments.quiet_capture is not None:
-        what = "--quiet-capture is a single cloud, whose noise differs from that of several merged views"
+        what = "--quiet-capture is one cloud, and its noise differs from that of a cloud merged from several views"
         raise UserError(what, fix="use --threshold with a value at which undamaged views have no finding")
 
 
@@ -81,7 +81,7 @@ def refuse_repeats(paths: Sequence[Path]) -> None:
     for path, place in zip(paths, places, strict=True):
         if places.count(place) > 1:
             legal = "captures from different places, each named once"
-            raise UserError(f"{path}: is named twice, so that the noise would be underestimated", legal=legal)
+            raise UserError(f"{path}: is named twice; counting the same noise twice would understate it", legal=legal)
 
 
 def detector_of(
@@ -96,11 +96,11 @@ def detector_of(
         # with several views, --crop and --target belong to the mapping
         settings["crop"] = crop_from_text(crop, arguments.target if crop == arguments.crop else None)
     elif arguments.target is not None:
-        raise UserError(f"--target {arguments.target}: the detector {arguments.detector} has no crop setting")
+        raise UserError(f"--target {arguments.target}: detector {arguments.detector} has no crop for it")
     reference = getattr(arguments, "reference", None)
     if reference is not None:
         if "surface" not in known.model_fields:
-            raise UserError(f"--reference {reference}: the detector {arguments.detector} has no surface setting")
+            raise UserError(f"--reference {reference}: detector {arguments.detector} has no surface setting")
         settings["surface"] = {"shape": "mesh", "reference": {"file": str(reference)}}
     elif "surface" in known.model_fields and not any(each.startswith(STATED_SURFACE) for each in assignments):
         settings["surface"] = {"shape": "auto"}
@@ -111,7 +111,7 @@ def detector_of(
 
 
 def mapping_of(arguments: argparse.Namespace) -> MappingConfig:
-    """Return the settings for merging views into one cloud. Raises a single UserError with every problem."""
+    """Return the settings that merge views into one cloud. Raises UserError with every problem at once."""
     from detectors.mapping.settings import MappingConfig
     from harness.vocabulary.declaration.diagnose import settings_of
 
@@ -128,10 +128,10 @@ def mapping_of(arguments: argparse.Namespace) -> MappingConfig:
 
 
 def crop_from_text(text: str, target: int | None = None) -> dict[str, Any]:
-    """Return the declaration of a crop from text, with the candidate of an automatic crop. Raises UserError."""
+    """Return the crop's declaration from text, with the number of the automatic crop's candidate. Raises UserError."""
     kind, _, values = text.partition(":")
     if target is not None and text != "auto":
-        what = f"--target {target}: selects a target of --crop auto, but the crop is --crop {text}"
+        what = f"--target {target}: chooses among the surfaces of --crop auto, but --crop {text} is another crop"
         raise UserError(what, fix="leave out one of the two")
     try:
         numbers = [float(value) for value in values.split(",")] if values else []
@@ -142,7 +142,7 @@ def crop_from_text(text: str, target: int | None = None) -> dict[str, Any]:
         return {"kind": kind} if target is None else {"kind": kind, "target": target}
     if kind == "box" and len(numbers) == 6:
         if not all(low < high for low, high in pairs):
-            what = f"--crop {text}: a lower bound is not below its upper bound"
+            what = f"--crop {text}: a lower bound is not below the upper one"
             raise UserError(what, legal=LEGAL_CROP, fix="state the smaller bound of each axis first")
         return {"kind": "box", "x_mm": pairs[0], "y_mm": pairs[1], "z_mm": pairs[2], "range_max_m": None}
     if kind == "polygon" and len(numbers) >= 6 and len(numbers) % 2 == 0:
@@ -151,7 +151,7 @@ def crop_from_text(text: str, target: int | None = None) -> dict[str, Any]:
 
 
 def assign(settings: dict[str, Any], assignment: str) -> None:
-    """Put a KEY=VALUE into nested settings; the value is parsed as JSON if possible, else text. Raises UserError."""
+    """Put one KEY=VALUE into nested settings; the value is JSON if possible, else text. UserError without one."""
     path, equals, text = assignment.partition("=")
     if not (path and equals):
         raise UserError(f"--set {assignment}: has no value", legal="KEY=VALUE, for instance surface.degree=5")
@@ -168,7 +168,7 @@ def assign(settings: dict[str, Any], assignment: str) -> None:
 
 
 def opened(paths: Sequence[Path], intrinsics: str | None, lens: Lens | None = None, **reading: Any) -> Recording:
-    """Open a capture. ``intrinsics`` is a file or a camera; ``reading`` holds options of `open_capture`."""
+    """Open a capture. ``intrinsics``: a file or a camera; ``reading``: options of `open_capture`."""
     from detectors.recordings import open_capture
 
     file = None if intrinsics is None else Path(intrinsics)
@@ -185,17 +185,17 @@ def opened(paths: Sequence[Path], intrinsics: str | None, lens: Lens | None = No
 
 POSES_KEY = "T_reference_view"  # key of the list in a file of `harness.export`, beside the file's version
 LEGAL_POSES = (
-    "JSON: a list of 4x4 matrices (metres, last row 0 0 0 1) from each view to a common frame, alone or"
-    f" under the key {POSES_KEY}; or a line"
-    " `timestamp tx ty tz qx qy qz qw` for each view"
+    "JSON: a list with a 4x4 matrix (metres, last row 0 0 0 1) for each view, all to one common frame, bare or"
+    f" under the key {POSES_KEY}; or lines of"
+    " `timestamp tx ty tz qx qy qz qw`, one for each view"
 )
-RIGID_WITHIN = 1e-4  # tolerance of R R' = 1 and of the quaternion's length: files of poses have at least four digits
-FARTHEST_M = 100.0  # Largest distance between two views of a target; poses in millimetres exceed it
+RIGID_WITHIN = 1e-4  # tolerance of R R' = 1 and of the quaternion's length: poses are written with four digits and more
+FARTHEST_M = 100.0  # Largest distance of two views of one target: poses in millimetres lie beyond
 
 
 def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
-    """Return ``T_first_view`` (4, 4) of each view, the identity for the first, from poses to any common frame. Raises
-    UserError if the file cannot be read, has another number of poses, or holds a pose that is not rigid or too far."""
+    """Return ``T_first_view`` (4, 4) of each view, the first the identity, from poses to any common frame. Raises
+    UserError if the file cannot be read, has another number of poses, or one that is not rigid or too far."""
     import numpy as np
 
     from harness.vocabulary.geometry import invert
@@ -207,7 +207,7 @@ def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
         why = f"cannot be read ({error.strerror})" if isinstance(error, OSError) else f"holds no poses ({error})"
         raise UserError(f"{path}: {why}", legal=LEGAL_POSES) from error
     if len(poses) != count:
-        fix = "keep one pose for each PATH, in the same order (one line per view of a sequence's groundtruth.txt)"
+        fix = "keep one pose for each PATH, in the same order (one line per view for groundtruth.txt of a sequence)"
         raise UserError(f"{path}: {len(poses)} poses for {count} views", legal=LEGAL_POSES, fix=fix)
     from_first = [np.eye(4)]
     for number, pose in enumerate(poses):
@@ -220,14 +220,14 @@ def read_poses(path: Path, count: int) -> tuple[np.ndarray, ...]:
             with np.errstate(over="ignore", invalid="ignore"):
                 from_first.append(invert(poses[0]) @ pose)
                 distance_m = float(np.linalg.norm(from_first[-1][:3, 3]))
-            if not distance_m <= FARTHEST_M:  # also true for NaN, which numbers near the largest give
+            if not distance_m <= FARTHEST_M:  # or NaN, where numbers are near the largest
                 what = f"{path}: pose {number} is {distance_m:.4g} m from pose 0 (up to {FARTHEST_M:g} m)"
                 raise UserError(what, fix="write translations in metres, not millimetres")
     return tuple(from_first)
 
 
 def _from_json(path: Path, text: str) -> list[np.ndarray]:
-    """Parse a list of matrices, alone or in an object by `harness.export` (with a version) or by hand (without)."""
+    """Parse a list of matrices: bare, in an object from `harness.export`, or in one without a version."""
     import numpy as np
 
     data = strict_json(text)

@@ -166,7 +166,7 @@ def seen_on(gauge: Gauge, judged: Judged, detector: str, threshold: float) -> Ga
         rows += own
         calls += beside
     if not rows:
-        why = found.problem or f"{len(by_code)} codes are read, and no board has three of them"
+        why = found.problem or f"{len(by_code)} codes were read, but no board has three of them"
         fix = "show the whole board, closer to the camera, in the image that is recorded with the depth"
         raise UserError(f"--gauge: no board is recognised: {why}", fix=fix)
     return GaugeSeen(tuple(rows), calls, tuple(warnings), tuple(notes))

@@ -1,4 +1,4 @@
-"""The steps of `harness.detect`: a capture, or several views that are merged into one cloud, is judged and reported."""
+"""The steps of `harness.detect`: one capture, or several views merged into one cloud, judged and reported alike."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from detectors.noise import REACH_FRAMES, noise_reach_px
 from detectors.null import each_object_once, own_threshold
 from detectors.views import PreparedView, View
 from harness.inspection import arguments as cli
-from harness.inspection import told
+from harness.inspection import output
 from harness.inspection.gauge import HITS_AND_MISSES, GaugeSeen, read_gauge, seen_on
 from harness.report.findings import Judged, write_findings
 from harness.tables.outputs import GAUGE_ROWS
@@ -44,13 +44,15 @@ if TYPE_CHECKING:
     from detectors.recordings import Recording
     from detectors.registration.registered import Registration
 
-DEFAULT_K = 5.0  # Fallback threshold in robust standard deviations, which 0.6 of a million normal pixels exceed
-FAINT_CALLS = 0.05  # Least expected number of false calls as strong as a finding by which noise explains the finding
-THRESHOLDS = ("threshold", "quiet_capture", "false_calls")  # arguments that each set the threshold
+DEFAULT_K = (
+    5.0  # robust standard deviations, if the capture sets no threshold; 0.6 of a million normal pixels lie beyond
+)
+FAINT_CALLS = 0.05  # noise explains a finding if at least this many false calls of its score are expected
+THRESHOLDS = ("threshold", "quiet_capture", "false_calls")  # arguments of which each sets the threshold
 
 
 def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: float) -> Judged:
-    """Find damage beyond a threshold and missing returns, each damage and object once, and measure them."""
+    """Find damage above a threshold and missing returns, each damage and each object once, and measure them."""
     missing = missing_returns(cloud, evidence)
     unseen = () if missing is None else missing.detections
     searched = detector.find(cloud, evidence, threshold)
@@ -58,28 +60,28 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
 
     def measure(each: Detection) -> Measurement:
         if each.kind == "object":
-            return measure_extents(cloud, each, "an object lies on the target, which the model of a hole does not fit")
+            return measure_extents(cloud, each, "an object that lies on the target: no model of a hole fits it")
         return (measure_missing if each.kind == "no return" else detector.measure)(cloud, evidence, each)
 
     return Judged(cloud, evidence, found, tuple(map(measure, found)), missing)
 
 
 def analysed(detector: Detector, cloud: Cloud) -> Evidence:
-    """Return the detector's evidence, with a warning if the stated surface does not fit the target."""
+    """Return the detector's evidence, with a warning if it fitted a stated surface that does not fit."""
     evidence = detector.analyse(cloud)
     doubt = "" if "misfit_share" in evidence.notes else misfit(cloud, evidence.residual_m, "the stated surface")
     return replace(evidence, warnings=(*evidence.warnings, doubt)) if doubt else evidence
 
 
 OPEN_MM, FILTER_PX = 75.0, 3.0
-"""Depth beyond which a hole shows the background, and the least width of a filter that hides its rim."""
+"""Depth beyond which a hole shows objects far behind it; least width of a filter that hides its rim."""
 
 
 def refuse_thresholds(arguments: argparse.Namespace) -> None:
-    """Raise UserError if several arguments set the threshold, or if its value is not legal."""
+    """Raise UserError if several arguments set the threshold, or its value is not legal."""
     given = [f"--{name.replace('_', '-')}" for name in THRESHOLDS if getattr(arguments, name) is not None]
     if len(given) > 1:
-        raise UserError(f"{' and '.join(given)} set the threshold", fix="give only one of them")
+        raise UserError(f"{' and '.join(given)} set the threshold", fix="give one of them")
     for name, value in (("threshold", arguments.threshold), ("false-calls", arguments.false_calls)):
         if value is not None and not 0 < value < float("inf"):
             raise UserError(f"--{name} {value:g}", legal="a number above 0")
@@ -92,9 +94,9 @@ def threshold_of(
     evidence: Evidence,
     quiet: Callable[[], tuple[float, str]],
 ) -> tuple[float, str, Evidence]:
-    """Return the threshold, its origin, and the evidence to search. The threshold is given, or calibrated on a quiet
-    capture (by ``quiet``), or the detector's own, or set by the capture's peaks towards the camera, which may exclude a
-    rim that cannot be judged. If those peaks are not reliable, it is a fallback with warnings."""
+    """Return the threshold, its origin, and the evidence to search with it. The threshold is given, calibrated on a
+    quiet capture (by ``quiet``), the detector's own, or from the capture's peaks towards the camera, which may leave
+    out a rim that cannot be judged; if these cannot be trusted, it is a fallback with warnings."""
     if arguments.threshold is not None:
         return arguments.threshold, "given", evidence
     if arguments.quiet_capture is not None:
@@ -108,14 +110,14 @@ def threshold_of(
     notes = {**evidence.notes, "own_null": {name: getattr(own, name) for name in names}}
     peaks = f"{own.peaks} peaks towards the camera"
     if own.objects:
-        peaks += f"; expect more next to objects, tags and edges in the image ({own.objects} places)"
+        peaks += f"; expect more beside objects, tags and edges in the picture ({own.objects} places)"
     if not cloud.organised:
-        peaks += "; objects on the target were not searched for"
+        peaks += "; objects on the target were not sought"
     if own.rim_pixels:
         peaks += f"; {own.rim_pixels} pixels along the rim are mixed with the background and are not judged"
     if own.doubts:
         k = max(DEFAULT_K, own.threshold) if math.isfinite(own.threshold) else DEFAULT_K
-        warnings = tuple(f"the capture cannot set its own threshold, so {k:.3g} is used: {why}" for why in own.doubts)
+        warnings = tuple(f"the capture cannot set its own threshold, {k:.3g} is used: {why}" for why in own.doubts)
         origin = f"a fallback, {k:.3g} units of score: the number of false calls is unknown; {peaks}"
         return k, origin, replace(own.evidence, notes=notes, warnings=(*evidence.warnings, *warnings))
     expected, low, high = map(_calls, (own.expected, own.low, own.high))
@@ -124,7 +126,7 @@ def threshold_of(
 
 
 def with_faint_warning(judged: Judged, threshold: float) -> Judged:
-    """Add a warning if noise explains more findings than the expected false calls, in a capture that set its own
+    """Add a warning if noise explains more of the findings than the expected false calls, in a capture that set its own
     threshold. The logarithm of the number of false calls is assumed to fall with the square of the score, as for normal
     noise, through the peaks above the floor and the upper 95 % bound of the number expected at the threshold."""
     null = judged.evidence.notes.get("own_null", {"threshold": None})
@@ -137,14 +139,14 @@ def with_faint_warning(judged: Judged, threshold: float) -> Judged:
         return judged
     which = f"{len(faint)} of {len(judged.findings)} findings ({', '.join(faint)})"
     calls = f"{_calls(null['expected'])} false calls are expected, with scores up to about {sure:.2g}"
-    warning = f"{which} are so faint that they may be noise: {calls}"
+    warning = f"{which} are so faint that noise explains them: {calls}"
     evidence = replace(judged.evidence, warnings=(*judged.evidence.warnings, warning))
     return replace(judged, evidence=evidence)
 
 
 def with_size_warnings(judged: Judged) -> Judged:
-    """Add a warning for findings that reach the rim of the judged area, since a part of them was not seen, and for
-    holes that show the background, since the camera's filter (as wide as the noise's reach) blurs their rim."""
+    """Add warnings if findings reach the rim of the judged area, because the rest of them was not seen, and if distant
+    surfaces show through holes: the camera's filter, as wide as the noise's reach, then draws them over the rim."""
     cloud = judged.cloud
     if not cloud.organised:
         return judged
@@ -156,8 +158,8 @@ def with_size_warnings(judged: Judged) -> Judged:
     open_ = [str(each.id) for each in judged.findings if each.kind == "no return" or each.depth_mm > OPEN_MM]
     if open_ and cloud.noise_reach_px >= FILTER_PX:
         most_mm = cloud.noise_reach_px * float(np.nanmedian(np.abs(np.diff(cloud.points_m[..., 0], axis=1)))) / MM
-        far = f"holes that show the far background or nothing ({', '.join(open_)}) may be up to {most_mm:.2g} mm"
-        doubts.append(f"{far} wider than stated, because the camera's filter mixes their rim into them")
+        far = f"holes that show what lies far behind, or nothing ({', '.join(open_)}), may be up to {most_mm:.2g} mm"
+        doubts.append(f"{far} wider than stated: the camera's filter mixes their rim into them")
     return replace(judged, evidence=replace(judged.evidence, warnings=(*judged.evidence.warnings, *doubts)))
 
 
@@ -165,12 +167,12 @@ def _calls(expected: float) -> str:
     return f"{expected:.1f}" if expected >= 0.1 else f"{expected:.1g}" if expected >= 1e-4 else "0"
 
 
-START_FROM_MARKS = ("icp", "cpd")  # methods that need a start; `joint` finds one, `odometry` goes from view to view
+START_FROM_MARKS = ("icp", "cpd")  # methods that need a start; `joint` finds its own, `odometry` goes view to view
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """The results of a run. ``mapped`` is None for a single capture; ``registrations`` is for registrations.json."""
+    """The results of a run. ``mapped``: None for one capture. ``registrations``: data of registrations.json."""
 
     arguments: argparse.Namespace
     recordings: list[Recording]
@@ -187,13 +189,13 @@ class Inspection:
 
     @property
     def cell_m(self) -> float | None:
-        """The side length of a map's cells; None if the cloud is not a map."""
+        """The side of a map's cells, None if the cloud is not a map."""
         surface_map = self.mapped.merged.surface_map if self.mapped else None
         return surface_map.cell_m if surface_map else None
 
 
 def inspect(arguments: argparse.Namespace) -> int:
-    """Open, average, register and merge views, judge them, print the results, and write them with --out. Returns 0."""
+    """Open, average, register and merge views, judge, print, and write with --out. Returns 0. Raises UserError."""
     config = cli.mapping_of(arguments) if arguments.register is not None else None
     paths = arguments.paths[: config.views] if config else arguments.paths
     cli.refuse_misfits(arguments, paths)
@@ -206,7 +208,7 @@ def inspect(arguments: argparse.Namespace) -> int:
     recordings = [_opened(arguments, group) for group in ([[path] for path in paths] if config else [paths])]
     quiet = [] if arguments.quiet_capture is None else [_opened(arguments, [arguments.quiet_capture])]
 
-    # a view is named by the last part of its path, or by the whole path if these are not unique
+    # a view's name is the last part of its path, or the whole path if these parts are not distinct
     names = [path.resolve().name for path in paths] if config else [recordings[0].name]
     names = names if len(set(names)) == len(names) else list(map(str, paths))
     views: list[View] = []
@@ -215,7 +217,7 @@ def inspect(arguments: argparse.Namespace) -> int:
         views.append(View(name, _averaged(arguments, recording, field), guess))
     for view in views:
         with _mistakes_named(view if config else None):
-            choices.append(told.choice_by(config or getattr(detector, "settings", None), view.cloud))
+            choices.append(output.choice_by(config or getattr(detector, "settings", None), view.cloud))
     mapped, registrations = None, dict[str, Any]()
     if config:
         mapped, registrations = _merged(arguments, config, recordings, views, choices)
@@ -225,7 +227,7 @@ def inspect(arguments: argparse.Namespace) -> int:
         undamaged = _averaged(arguments, quiet[0], field)
         threshold = detector.quiet_threshold(undamaged, detector.analyse(undamaged))
         frames = f"{undamaged.n_frames} frames, here {cloud.n_frames}"
-        return threshold, f"the lowest without a finding on {arguments.quiet_capture}, one repeat of {frames}"
+        return threshold, f"the lowest that is silent on {arguments.quiet_capture}, one repeat of {frames}"
 
     evidence = analysed(detector, cloud)
     doubted = dict.fromkeys(doubt for view in views if (doubt := unsteadiness(view.cloud)))
@@ -260,7 +262,7 @@ def _averaged(arguments: argparse.Namespace, recording: Recording, field: FlatFi
 
 @contextmanager
 def _mistakes_named(view: View | None) -> Iterator[None]:
-    """Add the view's name to a UserError, if there are several views."""
+    """Name the view, if there are several, in a UserError from one of its steps."""
     try:
         yield
     except UserError as mistake:
@@ -275,21 +277,21 @@ def _merged(
     views: Sequence[View],
     choices: Sequence[Choice | None],
 ) -> tuple[Mapped, dict[str, Any]]:
-    """Find targets and marks (printed at once, since they explain later failures), register and merge the views. Return
-    also the data of registrations.json. Raises UserError if views have no target or cannot be registered."""
+    """Find targets and marks (printed at once, as they explain later failures), register and merge. Also return the
+    data of registrations.json. Raises UserError if a view has no target, or for all views that cannot be placed."""
     from detectors.mapping.merge import Mapped, merge, prepare
     from detectors.registration.by_marks import register_by_marks
     from detectors.registration.register import register
 
     for view, choice in zip(views, choices, strict=True):
-        told.print_warnings(f"view {view.name}: {why}" for why in (choice.warnings if choice else ()))
+        output.print_warnings(f"view {view.name}: {why}" for why in (choice.warnings if choice else ()))
     prepared: list[PreparedView] = []
     for recording, view, choice in zip(recordings, views, choices, strict=True):
         with _mistakes_named(view):
             ready = prepare(view, config)
-        told.print_choice(choice)
-        told.print_capture(recording, view.cloud, view.name, ready.inside, arguments.crop)
-        told.print_marks(ready)
+        output.print_choice(choice)
+        output.print_capture(recording, view.cloud, view.name, ready.inside, arguments.crop)
+        output.print_marks(ready)
         prepared.append(ready)
     reference, has_poses = prepared[0], arguments.poses is not None
     if config.registration.method in START_FROM_MARKS and not has_poses:
@@ -308,14 +310,14 @@ def _merged(
         reasons = "\n  ".join(f"{each.view}: {each.failure.removeprefix(f'{each.view}: ')}" for each in failed)
         several = f"{len(failed)} of {len(registrations)} views" if len(failed) > 1 else "one view"
         what = f"{several} cannot be registered to {registrations[0].view} by {failed[0].method}:\n  {reasons}"
-        pose = "correct their --poses" if has_poses else "state their poses (--poses)"
-        raise UserError(what, fix=f"leave out these views, {pose}, or choose another --register or --marks")
+        pose = "correct --poses" if has_poses else "state their poses (--poses)"
+        raise UserError(what, fix=f"leave such views out, {pose}, or choose another --register or --marks")
     mapped = Mapped(tuple(prepared), registrations, merge(tuple(prepared), registrations, config.merge))
     return mapped, _registration_data(mapped)
 
 
 def _registration_data(mapped: Mapped) -> dict[str, Any]:
-    """Return registrations as plain data (metres in matrices, else millimetres), with checks that need no truth."""
+    """Return registrations as plain data (metres in matrices, else millimetres), and checks that need no truth."""
     from detectors.registration.by_marks import held_out_error_m
     from detectors.registration.registered import plane_through, predicted_error_m, thinned
 
@@ -360,49 +362,49 @@ def _registration_data(mapped: Mapped) -> dict[str, Any]:
 def _print(run: Inspection) -> None:
     cloud, evidence, crop, choice = run.result.cloud, run.result.evidence, run.arguments.crop, run.choices[0]
     recorded = [warning for recording in run.recordings for warning in recording.warnings]
-    # with several views, warnings about their targets were printed before the registration
+    # with several views, doubts about their targets were printed before the registration
     doubts = choice.warnings if run.mapped is None and choice else ()
     of_gauge = run.seen.warnings if run.seen else ()
-    told.print_warnings((*recorded, *doubts, *evidence.warnings, *of_gauge))
+    output.print_warnings((*recorded, *doubts, *evidence.warnings, *of_gauge))
     kept = np.isfinite(evidence.residual_m)
     if run.mapped is None:
-        told.print_choice(choice)
-        told.print_capture(run.recordings[0], cloud, run.recordings[0].name, kept, crop)
+        output.print_choice(choice)
+        output.print_capture(run.recordings[0], cloud, run.recordings[0].name, kept, crop)
         if not cloud.organised and crop == "auto" and (off := cloud.valid.sum() - kept.sum()) > 0:
-            print(f"note: {off} points off the target or on its rim are not judged; --crop none judges all points")
+            print(f"note: {off} points lie off the target or on its rim: not judged; --crop none judges all of them")
     else:
-        told.print_registrations(run.registrations)
+        output.print_registrations(run.registrations)
         merged = run.mapped.merged
-        told.print_notes(merged.notes)
+        output.print_notes(merged.notes)
         height, width = cloud.valid.shape
-        grid = f", a map of {width} x {height} cells of {told.mm(run.cell_m)}" if run.cell_m is not None else ""
+        grid = f", a map of {width} x {height} cells of {output.mm(run.cell_m)}" if run.cell_m is not None else ""
         print(f"merged: {len(merged.views_used)} views, {cloud.valid.sum()} points, {kept.sum()} judged{grid}")
-    unit = evidence.unit or f"{told.mm(evidence.scale_m)} at the median point"
+    unit = evidence.unit or f"{output.mm(evidence.scale_m)} at the median point"
     print(f"surface: {evidence.notes.get('surface', '')}; one unit of score is {unit}")
     if run.result.missing is not None:
         print(run.result.missing.blind_text)
-    print(f"threshold: {told.threshold_text(run.threshold, evidence)} ({run.origin})")
-    told.print_findings(run.result.findings, grid="px" if run.cell_m is None else "cell")
+    print(f"threshold: {output.threshold_text(run.threshold, evidence)} ({run.origin})")
+    output.print_findings(run.result.findings, grid="px" if run.cell_m is None else "cell")
     if run.seen is not None:
-        told.print_notes(run.seen.notes)
+        output.print_notes(run.seen.notes)
         show([HITS_AND_MISSES.grid(run.seen.rows, terminal=True)])
         print(run.seen.answer)
 
 
 def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
-    """Return the facts that the JSON holds beside the findings, with the origin and digests of all files read."""
+    """Return the facts in the JSON file besides the findings, with the origin and digests of all files read."""
     evidence, arguments = run.result.evidence, run.arguments
     settings: dict[str, Any] = {"average": arguments.average, "unit": arguments.unit}
     facts: dict[str, Any] = {}
     if run.mapped is None or run.config is None:
-        facts["target"] = told.choice_facts(run.choices[0])
-        facts["capture"] = told.capture_facts(run.recordings[0], run.result.cloud)
+        facts["target"] = output.choice_facts(run.choices[0])
+        facts["capture"] = output.capture_facts(run.recordings[0], run.result.cloud)
     else:
         merged, cell_mm = run.mapped.merged, None if run.cell_m is None else run.cell_m / MM
-        facts["frame"] = "of the merged cloud; registrations.json gives its pose relative to the first view's camera"
+        facts["frame"] = "of the merged cloud; registrations.json has its pose relative to the first view's camera"
         facts["captures"] = [
-            {"view": ready.view.name, **told.capture_facts(each, ready.view.cloud), "target": told.choice_facts(choice)}
-            for each, ready, choice in zip(run.recordings, run.mapped.views, run.choices, strict=True)
+            {"view": view.view.name, **output.capture_facts(each, view.view.cloud), "target": output.choice_facts(own)}
+            for each, view, own in zip(run.recordings, run.mapped.views, run.choices, strict=True)
         ]
         facts["merged"] = {"views": merged.views_used, "cell_mm": cell_mm, "notes": merged.notes}
         settings["mapping"] = run.config.to_data()
@@ -428,22 +430,22 @@ def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
 def _write(run: Inspection, facts: dict[str, Any]) -> None:
 
     mapped, beside = run.mapped, dict[str, Callable[[Path], object]]()
-    count, limit = len(run.result.detections), told.threshold_text(run.threshold, run.result.evidence)
+    count, limit = len(run.result.detections), output.threshold_text(run.threshold, run.result.evidence)
     subject = f"{len(mapped.merged.views_used)} views" if mapped else run.recordings[0].name
     title = f"{subject}: {count} findings beyond {limit}"
     if run.seen is not None:
         table = HITS_AND_MISSES.frame(run.seen.rows).to_csv(index=False, float_format="%.6g", lineterminator="\n")
         beside[GAUGE_ROWS.name] = lambda path: path.write_text(table, encoding="utf-8")
     if mapped is None:
-        beside |= told.pictures(run.choices[0])
+        beside |= output.pictures(run.choices[0])
     else:
         from harness.report.view3d import write_view3d
 
-        scene = told.scene_of(mapped, run.result)
+        scene = output.scene_of(mapped, run.result)
         beside["registrations.json"] = lambda path: path.write_text(plain_json(run.registrations), encoding="utf-8")
         beside["view3d.html"] = lambda path: write_view3d(path, scene, title)
         for number, choice in enumerate(run.choices, start=1):
-            beside |= told.pictures(choice, f"targets-{number}.png")
+            beside |= output.pictures(choice, f"targets-{number}.png")
     name = "merged.ply" if mapped else "cloud.ply"
     for path in write_findings(run.arguments.out, run.result, facts, title, cloud_name=name, beside=beside):
         print(f"wrote {path}")

@@ -13,7 +13,7 @@ import numpy as np
 
 from detectors.recordings.depth_images import read_picture
 from harness.inspection.arguments import reading_of
-from harness.inspection.told import print_notes, print_warnings
+from harness.inspection.output import print_notes, print_warnings
 from harness.own_camera.camera_file import camera_of_size, opened_as, simulated, with_lens
 from harness.own_camera.measure import characteristics, read_still
 from harness.own_camera.page import MEASURED, SIMULATED, beside, write_page

@@ -43,7 +43,7 @@ def load_mitsuba() -> Any:
 
 
 def _works(mi: Any, name: str) -> bool:
-    """Tell whether the variant finds a ray's hit. A GPU whose driver lacks OptiX computes, but casts no rays."""
+    """Return whether the variant finds a ray's hit. A GPU whose driver lacks OptiX computes, but casts no rays."""
     if name not in mi.variants() or (name.startswith("cuda") and not _has_nvidia_driver()):
         return False
     with warnings.catch_warnings():
@@ -58,7 +58,7 @@ def _works(mi: Any, name: str) -> bool:
 
 
 def _has_nvidia_driver() -> bool:
-    """Tell whether there is an NVIDIA driver. Without it, Dr.Jit prints warnings that look like errors to a user."""
+    """Return whether there is an NVIDIA driver. Without it, Dr.Jit prints warnings that look like errors to a user."""
     return Path("/proc/driver/nvidia/version").exists() or Path("/dev/nvidiactl").exists() or sys.platform == "win32"
 
 

@@ -131,7 +131,7 @@ def lens_named(name: str) -> OtherLens:
 
 
 def camera_of(config: CameraConfig) -> AnyCamera:
-    """Return the camera that an experiment declares. Raises UserError where a replaced number is impossible."""
+    """Return the camera that an experiment declares. Raises UserError if a replaced number is impossible."""
     return _with_numbers(config.name, canonical_json(config.numbers)) if config.numbers else load_camera(config.name)
 
 

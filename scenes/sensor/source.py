@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
@@ -100,17 +100,17 @@ class SimulatedCapture:
         errors_m = frame_errors_m(camera.unit, config.effects, config.minutes_since_power_on, stream)
         return np.array(list(islice(errors_m, self.n_frames)))
 
-    def totals(self, frames: np.ndarray) -> FrameTotals | None:
-        """Return sums over the frames with these numbers (t,), drawn at once: their distribution is that of `frames`,
-        and they do not depend on the other numbers. None if frames must be drawn."""
-        summer, errors_m = self.unit.at_once, self.errors_m[frames]
-        if summer is None or np.abs(errors_m).max(initial=0.0) > summer.farthest_error_m:
+    def totals(self, parts: Sequence[np.ndarray]) -> list[FrameTotals] | None:
+        """Return the sums over the frames of the first of ``parts``, of the first two, and so on, drawn at once: their
+        distribution is that of `frames`. Each part has numbers of frames (t,). None if frames must be drawn."""
+        summer, errors_m = self.unit.at_once, self.errors_m
+        if summer is None or np.abs(errors_m[np.concatenate(parts)]).max(initial=0.0) > summer.farthest_error_m:
             return None
 
         def stream(block: int) -> np.random.Generator:
             return random_stream(self.seed, "frames at once", block, *self.labels)
 
-        return summer.totals(frames, errors_m, stream).cut(self.unit.cut)
+        return [sums.cut(self.unit.cut) for sums in summer.totals(parts, errors_m, stream)]
 
     def frames(self) -> Iterator[Frame]:
         """Yield the frames; each call repeats the same noise."""

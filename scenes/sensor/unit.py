@@ -52,11 +52,6 @@ class FrameTotals:
         images = {name: getattr(self, name)[at] for name in ("base", *SUMMED)}
         return replace(self, reasons=self.reasons[:, *at], **images)
 
-    def __add__(self, other: FrameTotals) -> FrameTotals:
-        """Add sums over other frames of the same view, with the same step and base."""
-        sums = {name: getattr(self, name) + getattr(other, name) for name in ("frames", "reasons", *SUMMED)}
-        return replace(self, **sums)
-
 
 def rays_of(slopes: np.ndarray, offset_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return, (h, w) each, an offset's (3,) component along each pixel's unit ray, and the ray's cosine to the axis."""

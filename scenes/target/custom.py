@@ -20,7 +20,7 @@ from harness.vocabulary.geometry import MM, rotation_xyz_deg
 from harness.vocabulary.meshes import FileUnit, FrontAxis
 from scenes.target.flaws import AnyFlawConfig, Coordinate, FlawConfig, PlacedConfig, PlaceMm
 
-NEAR_NM = 20.0  # an albedo holds so far around its wavelength: wood and paint change by a per cent or two (a guess)
+NEAR_NM = 20.0  # range of wavelengths for which an albedo holds: wood and paint change by a per cent or two (a guess)
 Albedo = Annotated[float, Field(ge=0.0, le=1.0)]
 Rgb = tuple[Albedo, Albedo, Albedo]
 Length = Annotated[float, Field(ge=1.0, le=1e4)]
@@ -97,8 +97,8 @@ class PanelConfig(Config):
 class RoughConfig(Config):
     """A face with random roughness, such as concrete, and a flat back. Heights are Gaussian. Their power spectrum in
     two dimensions is (k^2 + k_outer^2)^-(1 + H) with k_outer = 2 pi / ``outer_mm``, and ends at 2 pi / ``inner_mm``;
-    between both, the surface is self-affine (Persson et al., J. Phys.: Condens. Matter 17 (2005) R1). Pores and gravel
-    are not modelled."""
+    between both, the surface is self-affine (Persson et al., J. Phys.: Condens. Matter 17 (2005) R1). Not modelled:
+    pores, gravel."""
 
     kind: Literal["rough"]
     deviation_mm: Annotated[float, Field(gt=0.0, le=20.0)] = Field(0.3, description="standard deviation of the heights")
@@ -143,8 +143,7 @@ ShapeConfig = Annotated[
 
 
 class BoardConfig(Config):
-    """A board. Its outline, seen along z, is a rectangle; its thickness, along the face's normal, is the same
-    everywhere."""
+    """A board. Its outline, seen along z, is a rectangle; its thickness along the face's normal is constant."""
 
     width_mm: Annotated[float, Field(ge=5.0, le=5e3)]
     height_mm: Annotated[float, Field(ge=5.0, le=5e3)]
@@ -248,7 +247,7 @@ class ReflectanceConfig(Config):
 
 
 class MaterialConfig(ReflectanceConfig):
-    """Reflectance of one board; ``grain_seed`` tells it from boards of the same material."""
+    """Reflectance of one board; ``grain_seed`` distinguishes it from boards of the same material."""
 
     grain_seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 1
 
@@ -368,7 +367,7 @@ class TargetConfig(SetUpConfig):
 
     def at_wavelength(self, wavelength_nm: float) -> TargetConfig:
         """Return the declaration with the nearest albedos to that wavelength as its ``albedo_850``, and no others.
-        Raises UserError where the declaration has none for it, or lacks the albedo of one of its surfaces."""
+        Raises UserError if the declaration has none for it, or lacks the albedo of one of its surfaces."""
         near = [albedos for albedos in self.other_wavelengths if abs(albedos.wavelength_nm - wavelength_nm) <= NEAR_NM]
         from_850 = abs(wavelength_nm - 850.0)
         if from_850 <= NEAR_NM and all(from_850 <= abs(albedos.wavelength_nm - wavelength_nm) for albedos in near):

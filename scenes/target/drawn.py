@@ -30,8 +30,8 @@ Purpose = Literal["learning", "calibration", "hole_free", "damaged"]  # purposes
 NEAREST_M, FARTHEST_M = 0.1, 10.0  # limits of a pose's distance, jitter included
 WIDEST_BACKING_MM = 1e4  # largest backing in a declaration
 ATTEMPTS, TRIES = 50, 400
-"""Boards begun anew, and places tried for each damage: where discs ``apart_mm`` wide are to cover 40 % of the free area
-(random placement reaches 54.7 % at most), one attempt in three or more fills a board."""
+"""Attempts to fill a board, and places tried for each damage: if discs ``apart_mm`` wide are to cover 40 % of the free
+area (random placement reaches 54.7 % at most), one attempt in three or more fills a board."""
 
 
 def _ascending(limits: tuple[float, float]) -> tuple[float, float]:
@@ -104,8 +104,7 @@ RANGES["angle_deg"] = Annotated[tuple[flaws.Angle, flaws.Angle], AfterValidator(
 
 class DrawnFlaws(_Drawn):
     """A kind of damage of `scenes.target.flaws`. Each pair is a range. The size that ``size_of`` names and the depth
-    are drawn as those of holes, all other quantities uniformly and independently; a single number holds for all
-    boards."""
+    are drawn as those of holes, all other quantities uniformly and independently; a single number is not drawn."""
 
     kind: Any
 
@@ -220,9 +219,10 @@ class DrawnTargetConfig(Config):
 
     def _room_mm(self) -> tuple[float, float, float]:
         """Return the largest radius of a rim; the factor by which axes along a bent face's normals start farther apart
-        in plan, so as not to meet within the board (parallel surfaces at a depth t shrink by 1 - t / radius of
+        in plan, so that they do not meet within the board (parallel surfaces at a depth t shrink by 1 - t / radius of
         curvature); and the least distance of centres from the edge, the same for all sizes. A dent's rim on a face that
-        bends away is up to sqrt 2 larger than on a flat one; holes get the same room, to keep the dents' places."""
+        bends away is up to sqrt 2 larger than on a flat one; holes get the same room, so that they have the dents'
+        places."""
         bend_per_mm = _tightest_per_mm(self.board)
         round_on_bent = bend_per_mm > 0 and not isinstance(self.damage, DrawnFlaws)
         rim_mm = self.damage.widest_mm / 2 * (math.sqrt(2) if round_on_bent else 1.0)
@@ -235,7 +235,7 @@ class DrawnTargetConfig(Config):
 
     def drawn(self, purpose: Purpose, number: int) -> custom.TargetConfig:
         """Return a board of the family with its damage, ids from 1 in the order of size; of a hole-free one call
-        ``hole_free()``: the damages left out are unflawed sites. Raises UserError where the board is too full."""
+        ``hole_free()``: the damages left out are unflawed sites. Raises UserError if the board is too full."""
 
         def stream(quantity: str) -> np.random.Generator:
             return random_stream(self.seed, "drawn board", purpose, number, quantity)
@@ -351,7 +351,7 @@ def _dent_depths_mm(diameter_mm: float, bend_per_mm: float) -> tuple[float, floa
 
 @lru_cache(maxsize=256)
 def _tightest_per_mm(board: custom.BoardConfig) -> float:
-    """Return a face's largest curvature; 0 of a rough face or a mesh, and where its shape does not reach."""
+    """Return a face's largest curvature; 0 for a rough face or a mesh, and where its shape does not reach."""
     if face_of(board).rough or isinstance(board.shape, custom.MeshConfig):
         return 0.0
     x_m, y_m = face_grid_m(board, steps=OUTLINE_STEPS)[..., :2].reshape(-1, 2).T

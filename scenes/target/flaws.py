@@ -1,5 +1,4 @@
-"""Damage other than drilled holes and ball dents: slots, gouges, pressed dents and bumps, corrosion, chips,
-protrusions.
+"""Damage other than drilled holes and ball dents: slots, gouges, pressed sheets, corrosion, chips, protrusions.
 
 Each is a depth over its own frame, which touches the face at the damage's centre: s runs along the damage, t across it,
 and depth counts along the face's normal there, into the board. A kind gives its depth on a grid of (s, t) whose border
@@ -153,7 +152,7 @@ class RoundConfig(_FlawConfig):
 
     @property
     def pressed(self) -> bool:
-        """Tell whether the sheet's back moves too."""
+        """Return whether the sheet's back moves too."""
         return self.kind != "protrusion"
 
     def relief(self) -> Relief:

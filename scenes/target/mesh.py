@@ -99,8 +99,8 @@ TAPE_SINK_M = 0.1e-3  # depth of a strip's underside in the board, so that no tw
 CORNER_M = 4e-6  # by which corners of a circle's polygon, of the same area, may stand out: 28 for 2 mm, 104 for 1 in
 RINGS = 48  # steps of a dent's profile from pole to rim: volume short by 1 / (3 RINGS^2) = 0.014 %
 CELL_M, MOST_ALONG = 0.03, 64
-"""Longest edge of a damaged board's triangles, and the number of these along its sides from which on they are longer.
-Longer ones slow rays down, and a renderer in float32 misses their plane, by 0.1 mm at 1 m."""
+"""Longest edge of a damaged board's triangles, and the largest number of these along a side; beyond it, edges are
+longer. Longer edges slow rays down, and a renderer in float32 misses their plane, by 0.1 mm at 1 m."""
 SPARE_M = 0.2 * MM  # least distance by which a cutter reaches beyond the face
 MAX_CELLS = 1_000_000  # of a bent sheet: some 300 MB
 
@@ -109,7 +109,7 @@ MAX_CELLS = 1_000_000  # of a bent sheet: some 300 MB
 class TargetPart:
     """A surface. ``mesh``: camera frame, metres, normals outwards; sharp edges share vertices, so use face normals.
     ``albedo_850`` and ``rgb`` (3,) are the means of ``texture_850`` (h, w) and ``texture_rgb`` (h, w, 3), float32
-    linear reflectances, placed by ``uv`` (n_vertices, 2) in 0..1 (see the module); all None where the part is plain.
+    linear reflectances, placed by ``uv`` (n_vertices, 2) in 0..1 (see the module); all None if the part is plain.
     ``gloss``: share and exponent of its Phong lobe (`scenes.target.custom.GlossConfig`)."""
 
     name: str
@@ -171,7 +171,7 @@ def build_target(config: TargetConfig) -> Target:
 
 
 def board_solid(config: TargetConfig, truth: tuple[Damage, ...]) -> trimesh.Trimesh:
-    """Return the board less its damage, watertight, board frame."""
+    """Return the board without its damage, watertight, board frame."""
     size_m, thickness_m = (config.board.width_mm * MM, config.board.height_mm * MM), config.board.thickness_mm * MM
     face = face_of(config.board)
     added: list[trimesh.Trimesh] = []
@@ -208,7 +208,7 @@ def sheet(
 ) -> trimesh.Trimesh:
     """Return a watertight sheet over a rectangle in plan, between two parallels of the face (offsets along normals).
     Its facets stay within ``sagitta_m`` of the face; a flat sheet has 12 triangles. ``flat_back``: its lower side is a
-    plane. Board frame. Raises UserError where the face needs more than MAX_CELLS."""
+    plane. Board frame. Raises UserError if the face needs more than MAX_CELLS."""
     turn = turned(angle_rad)
 
     def plan(columns: int, rows: int) -> np.ndarray:

@@ -37,7 +37,7 @@ class MeshTargetConfig(custom.SetUpConfig):
     material: custom.MaterialConfig = custom.MaterialConfig(grain_contrast=0.0)
 
     def declare(self) -> custom.TargetConfig:
-        """Return the full declaration. Raises UserError where the file cannot be used."""
+        """Return the full declaration. Raises UserError if the file cannot be used."""
         shape = custom.MeshConfig(kind="mesh", file=self.file, unit=self.unit, front=self.front)
         sizes = np.round(np.ptp(part_of(shape)[0], axis=0), 9) / MM
         board = dict(zip(("width_mm", "height_mm", "thickness_mm"), sizes.tolist(), strict=True))
@@ -110,7 +110,7 @@ def _sweep(corners: np.ndarray, low: np.ndarray, high: np.ndarray, strips: np.nd
 
 @numba.njit(cache=True, nogil=True)
 def _pierces(one: np.ndarray, other: np.ndarray) -> bool:
-    """Tell whether an edge of one triangle passes through the inside of another."""
+    """Return whether an edge of one triangle passes through the inside of another."""
     a, b, c = other[0], other[1], other[2]
     for k in range(3):
         p, q = one[k], one[(k + 1) % 3]

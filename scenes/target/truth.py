@@ -27,8 +27,8 @@ _UNIT_CORNERS = np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
 
 @dataclass(frozen=True)
 class Face:
-    """A smooth height field with z(0, 0) = 0. ``derivatives`` gives z and its derivatives (`ORDERS`), each of the shape
-    of x and y, NaN beyond its reach, ``height`` z alone where that is much quicker. On a ``rough`` face, slope and
+    """A smooth height field with z(0, 0) = 0. ``derivatives``: gives z and its derivatives (`ORDERS`), each of the
+    shape of x and y, NaN beyond its reach; ``height``: z alone, if that is much quicker. On a ``rough`` face, slope and
     curvature at one place do not describe the places around it. Arguments of the methods broadcast."""
 
     derivatives: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
@@ -64,7 +64,7 @@ class Face:
         return upward / np.linalg.norm(upward, axis=-1, keepdims=True)
 
     def axis(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
-        """Return (..., 3): the direction from which a damage's depth counts: the normal, of a rough face z."""
+        """Return (..., 3): the direction from which a damage's depth counts: the normal, or z for a rough face."""
         normal = self.normal(x_m, y_m)
         return np.broadcast_to([0.0, 0.0, 1.0], normal.shape).copy() if self.rough else normal
 
@@ -225,11 +225,11 @@ def planes_of(config: custom.TargetConfig) -> Iterator[tuple[str, np.ndarray, fl
 
 @dataclass(frozen=True)
 class Damage:
-    """A hole, a dent or another damage. ``centre_*`` (3,) lies on the undamaged face, ``axis_*`` (3,) is the face's
-    unit normal there, out of the board. ``diameter_m``: of the drill; of a dent the rim on this face (by equal area);
-    of other kinds the size in plan that ``size_of`` names. ``depth_m``: along the axis, of corrosion the mean, of what
-    stands out (``raised``) its height, of what goes through the board's thickness. ``volume_m3`` of holes and dents:
-    exact on a flat face, to second order in diameter over radius of curvature on a curved one; of other kinds as
+    """A hole, a dent or another damage. ``centre_*`` (3,): on the undamaged face. ``axis_*`` (3,): the face's unit
+    normal there, out of the board. ``diameter_m``: of the drill, of a dent's rim on this face (by equal area), or of
+    other kinds the size in plan that ``size_of`` names. ``depth_m``: along the axis; for corrosion the mean, for
+    ``raised`` damage its height, for through-damage the board's thickness. ``volume_m3`` of holes and dents: exact on a
+    flat face, to second order in diameter over radius of curvature on a curved one; of other kinds as
     `scenes.target.flaws` meshes them, of a pressed sheet on its front. Kinds with an outline of their own have it and
     their centre line in plan (``outline_board_m`` (n, 2), ``line_board_m`` (k, 2), else None), and their sides."""
 
@@ -258,7 +258,8 @@ class Damage:
         return float(np.linalg.norm(self.outline_board_m - self.centre_board_m[:2], axis=1).max())
 
     def within(self, x_m: np.ndarray, y_m: np.ndarray, margin_m: float = 0.0) -> np.ndarray:
-        """Tell which places in plan lie inside the outline, or not so far outside; the shape is that of ``x_m``."""
+        """Return which places in plan lie inside the outline, or within ``margin_m`` of it; the shape is that of
+        ``x_m``."""
         apart = np.sqrt((x_m - self.centre_board_m[0]) ** 2 + (y_m - self.centre_board_m[1]) ** 2)
         with np.errstate(invalid="ignore"):
             near = np.asarray(apart < self.reach_m + margin_m)

@@ -1,9 +1,9 @@
-"""Signal against size (a-hat against a), MIL-HDBK-1823A (2009) appendix G and ASTM E3023: regression, then POD. y = b0
-+ b1 x + tau * normal, x = size or ln size, y = signal or ln signal, censored at the noise floor and at saturation. A
-target is found where y > decision: POD = Phi((x - mu) / sigma), mu = (decision - b0) / b1 and sigma = tau / b1, with
-the covariance of both by the delta method. k signals of one target are not k targets: the fit takes rows as independent
-and multiplies the covariance by k, the mean number of signals per target, which is right where a target's signals are
-all alike and too cautious else. Not modelled: scatter that grows with size, curvature (`diagnose` tests both)."""
+"""Signal against size (a-hat against a), MIL-HDBK-1823A (2009) appendix G and ASTM E3023: regression, then POD. The
+model is y = b0 + b1 x + tau * normal, x = size or ln size, y = signal or ln signal, censored at the noise floor and at
+saturation. A target is found if y > decision, so POD = Phi((x - mu) / sigma), mu = (decision - b0) / b1 and sigma = tau
+/ b1; the delta method gives their covariance. k signals of one target are not k targets: the fit treats rows as
+independent and multiplies the covariance by k, the mean number of signals per target. That is right if a target's
+signals are equal, else cautious. Not modelled: scatter that grows with size, curvature (`diagnose` tests both)."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from harness.vocabulary.errors import UserError
 LEAST_TARGETS = 40
 """Least number of independent targets of an a-hat study, by MIL-HDBK-1823A."""
 SAME = 1e-9
-"""Share of the largest signal within which signals differ by rounding alone; scatter below this share of the signals'
-largest deviation is a line drawn by rounding, with no likelihood."""
+"""Relative difference to the largest signal that is only rounding. A scatter below this share of the signals' largest
+deviation is a line drawn by rounding, which has no likelihood."""
 LEVEL = 0.05
-"""A diagnostic with a smaller p-value contradicts an assumption."""
+"""A diagnostic with a smaller p-value rejects its assumption."""
 LEAST = 8
 """Fewest signals between the limits for which Anderson and Darling's approximation of p holds."""
 
 
 @dataclass(frozen=True, eq=False)
 class AhatFit:
-    """A regression of signals and the POD curve that it implies. ``x``, ``y`` (n,): size and signal on the axes of the
-    fit, censored signals at their limit; ``below``, ``above`` (n,) bool: which are; ``left``, ``right``, ``decision``
-    in the signal's own unit. ``covariance`` (3, 3) of (b0, b1, tau) holds for independent targets; over ``per_target``
-    it is that were each row one. ``log_likelihood`` is of signals in their own unit."""
+    """A regression of signals and the POD curve that it implies. ``covariance`` (3, 3): of (b0, b1, tau) for
+    independent targets; divided by ``per_target`` it is that for independent rows. ``log_likelihood``: of signals in
+    their own unit. ``x``, ``y`` (n,): size and signal on the axes of the fit, censored signals at their limit.
+    ``below``, ``above`` (n,) bool: censored signals. ``decision``, ``left``, ``right``: in the signal's own unit."""
 
     curve: PodCurve
     b0: float
@@ -72,8 +72,8 @@ def fit_ahat(
     inspections: ArrayLike | None = None,
 ) -> AhatFit:
     """Regress ``signal`` (n,) on ``size`` (n,) with censoring, and derive the POD of signals above ``decision``.
-    Signals <= ``left`` are at the noise floor, signals >= ``right`` saturated. ``inspections`` (n,): which target a row
-    inspects. UserError for data that allow no such regression, or a signal that does not grow with size."""
+    Signals <= ``left`` are at the noise floor, signals >= ``right`` are saturated. ``inspections`` (n,): the target of
+    each row. Raises UserError for data that allow no such regression, or a signal that does not grow with size."""
     sizes, signals = _finite("sizes", size), _finite("signals", signal)
     n = len(sizes)
     names = np.arange(n) if inspections is None else np.asarray(inspections).astype(str)
@@ -86,7 +86,7 @@ def fit_ahat(
         raise UserError(f"noise floor {low:g} is not below saturation {high:g}")
     if not low <= decision <= high:
         legal = f"between the noise floor {low:g} and saturation {high:g}"
-        raise UserError(f"decision {decision:g} lies outside the signals that can be told apart", legal=legal)
+        raise UserError(f"decision {decision:g} lies outside the signals that can be distinguished", legal=legal)
     below, above = signals <= low, signals >= high
     between = signals[~(below | above)]
     if len(between) > 1 and np.ptp(between) <= SAME * np.abs(between).max():
@@ -100,7 +100,7 @@ def fit_ahat(
     if b1 <= 0:
         fix = "check the columns of size and signal, or reverse the sign of the signal"
         raise UserError(f"the signal does not grow with size (slope {b1:.4g}): there is no detection limit", fix=fix)
-    per_target = float(rows_each.mean())  # the design effect of rows that are alike within a target (Kish)
+    per_target = float(rows_each.mean())  # the design effect of rows that are equal within a target (Kish)
     mu, sigma, covariance = float((threshold - b0) / b1), float(line.tau / b1), line.covariance * per_target
     jacobian = np.array([[-1.0, -mu, 0.0], [0.0, -sigma, 1.0]]) / b1
     curve = PodCurve("probit", log_size, mu, sigma, jacobian @ covariance @ jacobian.T)
@@ -126,20 +126,20 @@ def choose_axes(
     right: float | None = None,
     inspections: ArrayLike | None = None,
 ) -> tuple[AhatFit, ...]:
-    """Fit all pairs of axes that the data allow, best (smallest deviance) first; never chosen by the limit. A logarithm
-    is left out where there are sizes, or signals, floor or decision, that have none. All have three parameters."""
+    """Fit all pairs of axes that the data allow, least deviance first, whatever their limits. A logarithm is left out
+    if some sizes, signals, floor or decision have none. All fits have three parameters."""
     sizes, signals = _finite("sizes", size), _finite("signals", signal)
     lowest = signals.min(initial=np.inf) if left is None else left
     log_sizes = (False, True) if np.all(sizes > 0) else (False,)
     log_signals = (False, True) if min(lowest, decision) > 0 else (False,)
     fit = partial(fit_ahat, sizes, signals, decision=decision, left=left, right=right, inspections=inspections)
     fits = [fit(log_size=one, log_signal=other) for one, other in product(log_sizes, log_signals)]
-    return tuple(sorted(fits, key=lambda one: one.deviance))
+    return tuple(sorted(fits, key=lambda each: each.deviance))
 
 
 def ahat_bound(fit: AhatFit, pod: float = 0.9, confidence: float = 0.95) -> Bound:
-    """One-sided upper bound of the size found with probability ``pod`` by the delta method on x: mu + z sigma +
-    z_confidence sqrt(V11 + 2 z V12 + z^2 V22), z = Phi^-1(pod). Infinite where sigma is not told from 0."""
+    """Return the one-sided upper bound on the size found with probability ``pod``, by the delta method on x: mu + z
+    sigma + z_confidence sqrt(V11 + 2 z V12 + z^2 V22), z = Phi^-1(pod). It is infinite if sigma may be 0."""
     curve, v = fit.curve, fit.curve.covariance
     z, quantile = float(stats.norm.ppf(pod)), float(stats.norm.ppf(confidence))
     if curve.sigma**2 <= quantile**2 * v[1, 1]:
@@ -150,8 +150,8 @@ def ahat_bound(fit: AhatFit, pod: float = 0.9, confidence: float = 0.95) -> Boun
 
 
 def ahat_band(fit: AhatFit, sizes: ArrayLike, confidence: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
-    """(lower, upper) POD at ``sizes`` (any shape), each one-sided, through the bounds of all sizes a_p: (x - mu - z
-    sigma)^2 = z_confidence^2 (V11 + 2 z V12 + z^2 V22) solved for z; 0 and 1 where the band is open."""
+    """Return (lower, upper) POD at ``sizes`` (any shape), each one-sided, through the bounds of all sizes a_p: (x - mu
+    - z sigma)^2 = z_confidence^2 (V11 + 2 z V12 + z^2 V22), solved for z; 0 and 1 where the band is open."""
     at = np.asarray(sizes, float)
     curve, c = fit.curve, float(stats.norm.ppf(confidence)) ** 2
     (v11, v12), (_, v22) = curve.covariance
@@ -178,8 +178,8 @@ def _axis(name: str, values: np.ndarray, log: bool) -> np.ndarray:
 
 
 class CensoredFit(NamedTuple):
-    """``coefficients`` (p,), scatter ``tau`` (maximum likelihood: no correction for degrees of freedom), inverse
-    observed information ``covariance`` (p + 1, p + 1) of (coefficients, tau), ``log_likelihood`` of the rows."""
+    """``coefficients`` (p,). ``tau``: scatter, by maximum likelihood without a correction for degrees of freedom.
+    ``covariance`` (p + 1, p + 1): inverse observed information of (coefficients, tau). ``log_likelihood``."""
 
     coefficients: np.ndarray
     tau: float
@@ -188,9 +188,10 @@ class CensoredFit(NamedTuple):
 
 
 def fit_censored(design: np.ndarray, y: np.ndarray, below: np.ndarray, above: np.ndarray) -> CensoredFit:
-    """Fit y = design @ coefficients + tau * normal by maximum likelihood (Tobin 1958). ``design`` (n, p); ``y`` (n,):
-    the value, or the limit where ``below`` or ``above`` (n,) say that it lies beyond. Solved in Olsen's 1978 parameters
-    (coefficients / tau, 1 / tau), in which the log-likelihood is concave. UserError without a line or scatter."""
+    """Fit y = design @ coefficients + tau * normal by maximum likelihood (Tobin 1958). ``design`` (n, p). ``y`` (n,):
+    the value, or the limit if ``below`` or ``above`` (n,) says that the value lies beyond it. Solved in Olsen's 1978
+    parameters (coefficients / tau, 1 / tau), which make the log-likelihood concave. Raises UserError without a line or
+    scatter."""
     exact = ~(below | above)
     p = design.shape[1]
     if exact.sum() <= p or np.linalg.matrix_rank(design[exact]) < p:
@@ -201,10 +202,10 @@ def fit_censored(design: np.ndarray, y: np.ndarray, below: np.ndarray, above: np
     scale = float(np.sqrt(np.mean(rest[exact] ** 2)))
     if scale <= SAME * float(np.max(np.abs(y[exact] - y[exact].mean()), initial=0.0)) or scale == 0:
         raise UserError("the signals lie exactly on a line: there is no scatter to estimate", fix="check the column")
-    # Orthonormal columns and residuals of unit scatter: Newton's system is then well conditioned in any unit.
+    # Orthonormal columns and residuals of unit scatter make Newton's system well conditioned in any unit.
     q, r = np.linalg.qr(design)
     q, r = q * np.sqrt(len(y)), r / np.sqrt(len(y))
-    # Every row's term depends on s = row @ parameters alone, but for n ln(1 / tau).
+    # Except for n ln(1 / tau), every row's term depends only on s = row @ parameters.
     rows = np.where(above, -1.0, 1.0)[:, None] * np.column_stack([-q, rest / scale])
 
     def value_and_information(at: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -239,7 +240,7 @@ def fit_censored(design: np.ndarray, y: np.ndarray, below: np.ndarray, above: np
 
 
 class Diagnostic(NamedTuple):
-    """One test of one assumption: ``p_value`` of a statistic at least as large while the assumption holds."""
+    """A test of one assumption. ``p_value``: probability of a statistic at least as large if the assumption holds."""
 
     assumption: str
     test: str
@@ -256,7 +257,7 @@ def diagnose(fit: AhatFit) -> tuple[Diagnostic, ...]:
     z, x = residual_scores(fit), fit.x[exact]
     n = len(z)
 
-    bend = 0.0  # likelihood ratio of a quadratic term, which takes the censored signals in
+    bend = 0.0  # likelihood ratio of a quadratic term, with the censored signals
     spread = (fit.x - fit.x.mean()) / fit.x.std()
     if len(np.unique(spread)) > 2:
         columns = np.column_stack([np.ones_like(spread), spread, spread**2])
@@ -277,8 +278,8 @@ def diagnose(fit: AhatFit) -> tuple[Diagnostic, ...]:
 
 
 def residual_scores(fit: AhatFit) -> np.ndarray:
-    """Compute residuals (signals between the limits,) as scores that are standard normal under the model: mapped
-    through their distribution, which the limits cut off, u = (F(r) - F(low)) / (F(high) - F(low)), z = Phi^-1(u)."""
+    """Return the residuals of the signals between the limits as scores that are standard normal under the model. Their
+    distribution, which the limits truncate, maps them: u = (F(r) - F(low)) / (F(high) - F(low)), z = Phi^-1(u)."""
     exact = ~(fit.below | fit.above)
     line = (fit.b0 + fit.b1 * fit.x)[exact]
 
@@ -288,7 +289,7 @@ def residual_scores(fit: AhatFit) -> np.ndarray:
         return ((np.log(limit) if fit.log_signal else limit) - line) / fit.tau
 
     r, low, high = (fit.y[exact] - line) / fit.tau, standard(fit.left, -np.inf), standard(fit.right, np.inf)
-    # Mirrored where the interval lies in the upper tail: the differences of F then keep their digits.
+    # Mirrored if the interval lies in the upper tail, so that differences of F keep their digits.
     mirror = np.where(np.minimum(low, r) > 0, -1.0, 1.0)
     ends = special.ndtr(mirror * low), special.ndtr(mirror * high)
     z = special.ndtri(np.abs(special.ndtr(mirror * r) - ends[0]) / np.abs(ends[1] - ends[0]))
@@ -296,7 +297,7 @@ def residual_scores(fit: AhatFit) -> np.ndarray:
 
 
 def _anderson_darling(z: np.ndarray) -> tuple[float, float]:
-    """Return the statistic, mean and variance estimated, and p by D'Agostino and Stephens 1986, table 4.9."""
+    """Return the statistic for an estimated mean and variance, and p by D'Agostino and Stephens 1986, table 4.9."""
     ordered, n = np.sort((z - z.mean()) / z.std(ddof=1)), len(z)
     logs = special.log_ndtr(ordered) + special.log_ndtr(-ordered[::-1])
     a = (-n - float(np.mean((2 * np.arange(1, n + 1) - 1) * logs))) * (1 + 0.75 / n + 2.25 / n**2)

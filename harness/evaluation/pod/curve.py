@@ -1,7 +1,7 @@
 """A probability of detection curve, its four links, and the likelihood of hits and misses under them.
 
 POD(a) = F((x - mu) / sigma), x = a or ln a. So mu is the 50 % size for logit and probit only; sigma is the width. For
-all links ln F and ln(1 - F) are concave, so there is one maximum wherever hits and misses overlap; where they do not,
+all links, ln F and ln(1 - F) are concave, so the likelihood has one maximum if hits and misses overlap; if they do not,
 Firth's penalty makes the estimate finite. Sources: McCullagh and Nelder, Generalized Linear Models (1989), 2.5 and 4.3;
 Firth, Biometrika 80 (1993), 27, in the form of Kosmidis and Firth, 96 (2009), 793."""
 
@@ -15,7 +15,7 @@ import numpy as np
 from scipy import optimize, special
 
 LARGEST_PREDICTOR = 500.0
-"""|b0 + b1 z| beyond which every link is 0 or 1 to the last bit; exp() of it does not overflow."""
+"""Limit of |b0 + b1 z|: beyond it, every link is 0 or 1 to the last bit; exp() of the limit does not overflow."""
 
 _F_AND_INVERSE: dict[str, tuple[Callable[[np.ndarray], np.ndarray], Callable[[np.ndarray], np.ndarray]]] = {
     "logit": (special.expit, special.logit),
@@ -25,22 +25,22 @@ _F_AND_INVERSE: dict[str, tuple[Callable[[np.ndarray], np.ndarray], Callable[[np
 }
 LINKS = tuple(_F_AND_INVERSE)
 CELLS = 2**17
-"""Number of curves times targets at a time, or of boards drawn again times theirs: 1 MB an array."""
+"""Number of curves times targets, or of resampled boards times their targets, in one block: 1 MB per array."""
 
 
 def link_cdf(link: str, t: np.ndarray) -> np.ndarray:
-    """Return F(t) of one of `LINKS`: logistic, normal, 1 - exp(-exp(t)) (cloglog), exp(-exp(-t)) (loglog)."""
+    """Return F(t) for one of `LINKS`: logistic, normal, 1 - exp(-exp(t)) (cloglog), exp(-exp(-t)) (loglog)."""
     with np.errstate(over="ignore"):
         return np.asarray(_F_AND_INVERSE[link][0](np.asarray(t, float)))
 
 
 def link_ppf(link: str, p: np.ndarray) -> np.ndarray:
-    """Return F^-1(p) of one of `LINKS`."""
+    """Return F^-1(p) for one of `LINKS`."""
     return np.asarray(_F_AND_INVERSE[link][1](np.asarray(p, float)))
 
 
 def logs_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return ln F, ln(1 - F) and ln f (the density) at the predictor, each of its shape and exact in both tails."""
+    """Return ln F, ln(1 - F) and ln f (the density), each of the predictor's shape and accurate in both tails."""
     t = np.clip(predictor, -LARGEST_PREDICTOR, LARGEST_PREDICTOR)
     if link == "logit":
         tail = np.log1p(np.exp(-np.abs(t)))
@@ -55,9 +55,9 @@ def logs_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def slopes_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return f / F, f / (1 - F) and d ln f / dt at t = predictor, each of its shape."""
+    """Return f / F, f / (1 - F) and d ln f / dt at t = predictor, each of the predictor's shape."""
     t = np.clip(predictor, -LARGEST_PREDICTOR, LARGEST_PREDICTOR)
-    if link == "logit":  # the most usual link, for which the ratios are the shares themselves
+    if link == "logit":  # the most common link: the ratios are the probabilities themselves
         hit, miss = special.expit(t), special.expit(-t)
         return miss, hit, miss - hit
     log_hit, log_miss, log_density = logs_of_link(link, t)
@@ -67,7 +67,7 @@ def slopes_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.nda
 
 @dataclass(frozen=True)
 class PodCurve:
-    """``mu``, ``sigma`` in the unit of x (size, or ln size where ``log_size``); ``covariance`` (2, 2) of the two."""
+    """``mu`` and ``sigma``: in the unit of x (size, or ln size if ``log_size``). ``covariance``: (2, 2)."""
 
     link: str
     log_size: bool
@@ -88,7 +88,7 @@ class PodCurve:
 
 @dataclass(frozen=True)
 class Bound:
-    """An upper confidence bound on a size, such as a90/95. Infinite, with ``why``, where there is none."""
+    """An upper confidence bound on a size, such as a90/95; infinite if there is none, and ``why`` gives the reason."""
 
     pod: float
     confidence: float
@@ -103,20 +103,20 @@ class Bound:
 
 
 STEPS, PLAIN_STEPS = 200, 12
-"""Most steps and halvings of a problem, and Newton steps that are tried first; five or six are usual."""
+"""Most steps, with halvings, of a problem; number of plain Newton steps before: five or six usually suffice."""
 TOLERANCE = 1e-7
-"""The search has arrived at a step below this: Newton's errors are squared with every step."""
+"""A search ends with a smaller step: every Newton step squares the error."""
 CLIMBED = 6
-"""Number of steep starts from which the search for a penalised maximum climbs."""
+"""Number of steep starts that are tried in the search for a penalised maximum."""
 PENALISED_SLOPES = np.linspace(np.log(1e-8), np.log(1e4), 140)
-"""Natural logarithms of the slopes with which the search of a penalised profile begins."""
+"""Natural logarithms of the slopes at which the search of a penalised profile starts."""
 
 
 @dataclass(frozen=True, eq=False)
 class HitsAndMisses:
-    """Hits and misses of one study or of several (d) on the same rows. ``design`` (n, p): columns of the predictor;
-    ``hits``, ``misses`` (n,) or (d, n) counts. ``penalty`` (a number, or (d,)): how often Jeffreys' prior is added:
-    None for never, 1 for Firth's, k where every target has k rows; for p = 2 only."""
+    """Hits and misses of one or several (d) studies on the same rows. ``design`` (n, p): columns of the predictor.
+    ``hits``, ``misses``: (n,) or (d, n) counts. ``penalty`` (a number, or (d,)): multiple of Jeffreys' prior, with p =
+    2 only: None for no penalty, 1 for Firth's, k if every target has k rows."""
 
     design: np.ndarray
     hits: np.ndarray
@@ -131,7 +131,7 @@ class HitsAndMisses:
         return np.asarray(self.design[:, 1])
 
     def value(self, b: np.ndarray) -> np.ndarray:
-        """Return the (penalised) log-likelihood (...) at coefficients (..., p); of several studies (d,) at (d, p)."""
+        """Return the (penalised) log-likelihood (...) at coefficients (..., p); for several studies (d,) at (d, p)."""
         found, missed, density = logs = logs_of_link(self.link, b @ self.design.T + self.offset)
         value = (self.hits * found + self.misses * missed).sum(axis=-1)
         if self.penalty is not None:
@@ -143,8 +143,8 @@ class HitsAndMisses:
         return np.asarray(value)
 
     def step(self, b: np.ndarray) -> np.ndarray:
-        """Return Newton steps (d, p) of (d,) studies at b (d, p), scoring steps under a penalty; they mean nothing
-        where the information is singular, in studies that have run off to infinity."""
+        """Return Newton steps (d, p) of (d,) studies at b (d, p); with a penalty, scoring steps. They are meaningless
+        if the information is singular, in studies that diverge to infinity."""
         up, down, bend = slopes_of_link(self.link, b @ self.design.T + self.offset)
         slope = self.hits * up - self.misses * down
         with np.errstate(all="ignore"):
@@ -171,7 +171,7 @@ class HitsAndMisses:
             return np.asarray(np.linalg.solve(information + ridge, (slope @ self.design)[:, :, None])[:, :, 0])
 
     def of(self, rows: np.ndarray) -> HitsAndMisses:
-        """Return some of several studies."""
+        """Return the studies ``rows``."""
         penalty = None if self.penalty is None else np.broadcast_to(self.penalty, len(self.hits))[rows]
         return replace(self, hits=self.hits[rows], misses=self.misses[rows], penalty=penalty)
 
@@ -188,7 +188,7 @@ def ascend(
     tolerance: float = TOLERANCE,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Climb from ``start`` (d, p) to maxima (d, p) and their values (d,), by ``value_and_step(places (k, p), which
-    (k,))``. A step that lowers the value is halved; one without a maximum ends where the steps ran out."""
+    (k,))``. A step that lowers the value is halved. A problem without a maximum ends at its last step."""
     place, moving = start.copy(), np.arange(len(start))
     best, step = value_and_step(place, moving)
     for _ in range(STEPS):
@@ -206,10 +206,10 @@ def ascend(
 
 
 def maxima(data: HitsAndMisses, start: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
-    """(d, p) coefficients with the largest likelihood of several studies, from ``start`` (p,); without a penalty. Hits
-    and misses of every study must overlap, else its coefficients end where the steps ran out. Plain Newton steps need
-    no values and nearly always arrive at the maximum; the others are searched again, and so are those that end lower
-    than they began: far out, where probabilities are rounded to 0 or 1, steps can be small without a maximum."""
+    """Return the coefficients (d, p) with the largest likelihood of several studies, from ``start`` (p,); without a
+    penalty. If hits and misses of a study do not overlap, its coefficients are those of the last step. Plain Newton
+    steps need no values and nearly always reach the maximum. The other studies are searched again, and so are those
+    that end lower than they began: where probabilities are rounded to 0 or 1, steps can be small without a maximum."""
     place = np.tile(np.asarray(start, float), (len(data.hits), 1))
     moving = np.arange(len(place))
     for _ in range(PLAIN_STEPS):
@@ -227,13 +227,13 @@ def maxima(data: HitsAndMisses, start: np.ndarray, tolerance: float = TOLERANCE)
 
 
 def penalised_maxima(data: HitsAndMisses, tolerance: float = TOLERANCE) -> np.ndarray:
-    """Find (d, 2) intercepts and slopes with the largest penalised likelihood of several studies, finite for separated
-    data too. Logit and probit have one maximum; under cloglog and loglog the highest is taken that is reached from a
-    flat start, from the gap between largest miss and smallest hit, and from the best `CLIMBED` others."""
+    """Return the intercepts and slopes (d, 2) with the largest penalised likelihood of several studies; they are finite
+    for separated data too. Logit and probit have one maximum. For cloglog and loglog, the highest of those is returned
+    that are reached from a flat start, the gap between largest miss and smallest hit, and the best `CLIMBED` others."""
     z, hits = data.z, data.hits
     below = np.where(data.misses > 0, z, -np.inf).max(axis=1)
     gap = np.where(hits > 0, z, np.inf).min(axis=1) - below
-    # Predictors of -1.5 and 1.5 at the ends of the gap, where these are not too close; then several widths through
+    # Predictors of -1.5 and 1.5 at the ends of the gap, if these are not too close; then several widths through
     # both its ends and its middle.
     widths = [(np.clip(3.0 / np.maximum(gap, 1e-9), 1.0, 100.0), 0.5)]
     widths += [(np.full_like(gap, slope), share) for slope in np.geomspace(1.5, 150.0, 9) for share in (0.0, 0.5, 1.0)]
@@ -251,26 +251,26 @@ def penalised_maxima(data: HitsAndMisses, tolerance: float = TOLERANCE) -> np.nd
 
 
 def profile(data: HitsAndMisses, z0: float, level: float, slope: float = 1.0) -> tuple[float, float]:
-    """Largest (penalised) log-likelihood of one study's rising curves (slope >= 0) whose predictor is ``level`` at
-    ``z0``, and the slope there; ``slope``: where the search begins, such as the slope at a neighbouring ``z0``."""
-    if data.penalty is not None:  # not proved to be concave, so the search begins with a grid
+    """Return the largest (penalised) log-likelihood of one study's rising curves (slope >= 0) whose predictor is
+    ``level`` at ``z0``, and the slope there. ``slope``: start of the search, such as that of a neighbour."""
+    if data.penalty is not None:  # concavity is not proved, so the search begins with a grid
 
         def rising(s: np.ndarray) -> np.ndarray:
             return data.value(np.stack([level - np.exp(s) * z0, np.exp(s)], axis=-1))
 
         return max(_largest(rising, PENALISED_SLOPES), float(data.value(np.array([level, 0.0])))), slope
     line = replace(data, design=data.z[:, None] - z0, offset=level, hits=data.hits[None], misses=data.misses[None])
-    # far out only slopes near that of the line through the mean chance have a likelihood that is not tiny
+    # far out, only slopes near that of the line through the mean probability have a likelihood that is not tiny
     rate = link_ppf(data.link, data.hits.sum() / (data.hits + data.misses).sum())
     starts = np.array([[slope], [(level - float(rate)) / max(z0, 1.0)]])
-    best, _ = ascend(line.climb, starts[[np.argmax(np.concatenate([line.value(one[None]) for one in starts]))]], 1e-5)
+    best, _ = ascend(line.climb, starts[[np.argmax(np.concatenate([line.value(s[None]) for s in starts]))]], 1e-5)
     best = np.maximum(best, 0.0)
     return float(line.value(best)[0]), float(best[0, 0])
 
 
 def flat_maximum(data: HitsAndMisses, highest: float) -> float:
-    """Largest (penalised) log-likelihood of one study's curves that do not rise at all, with a predictor of at most
-    ``highest``: the limit of `profile` as ``z0`` grows without end."""
+    """Return the largest (penalised) log-likelihood of one study's flat curves, with a predictor of at most
+    ``highest``: the limit of `profile` as ``z0`` grows to infinity."""
     if data.penalty is None:
         rate = data.hits.sum() / (data.hits + data.misses).sum()
         return float(data.value(np.array([min(highest, float(link_ppf(data.link, rate))), 0.0])))
@@ -280,7 +280,7 @@ def flat_maximum(data: HitsAndMisses, highest: float) -> float:
 
 
 def _largest(function: Callable[[np.ndarray], np.ndarray], grid: np.ndarray) -> float:
-    """Return the largest value of a function of a number, refined between the best of a grid and its neighbours."""
+    """Return the largest value of a function of one number, refined around the best point of a grid."""
     best = int(np.argmax(function(grid)))
     ends = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
     how: dict[str, Any] = {"bounds": ends, "method": "bounded", "options": {"xatol": 1e-9}}

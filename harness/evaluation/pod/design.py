@@ -1,4 +1,4 @@
-"""Plans of hit/miss studies: studies are simulated from a guess of the POD curve and analysed as real ones would be."""
+"""Plans hit/miss studies: it simulates them from a guess of the POD curve and analyses them like real ones."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from harness.vocabulary.seeds import random_stream
 
 @dataclass(frozen=True, eq=False)
 class StudyPlan:
-    """Expected outcome of studies, if the guess is right. ``bound``: median over simulated studies of a90/95, infinite
-    where half of them demonstrate none; ``low``, ``high``: their 10 % and 90 % quantiles; ``true_size``: the guess's
-    own; ``demonstrated``: share of studies with a finite bound; ``sizes`` (targets,) to make."""
+    """Expected outcome of studies, if the guess is right. ``true_size``: of the guess. ``bound``: median a90/95 of the
+    simulated studies, infinite if half of them demonstrate none. ``low``, ``high``: 10 % and 90 % quantiles.
+    ``demonstrated``: share of studies with a finite bound. ``sizes`` (targets,): to make."""
 
     targets: int
     studies: int
@@ -33,8 +33,8 @@ class StudyPlan:
 
 
 def curve_through(a50: float, a90: float, link: str = "logit", *, log_size: bool = False) -> PodCurve:
-    """Return the curve of ``link`` with POD 0.5 at ``a50`` and 0.9 at ``a90`` (any one unit); its covariance is zero.
-    Raises UserError where it would not rise, and for sizes that are not above 0."""
+    """Return the curve of ``link`` with POD 0.5 at ``a50`` and 0.9 at ``a90`` (same unit); its covariance is zero.
+    Raises UserError if it would not rise, or if a size is not above 0."""
     if not (np.isfinite([a50, a90]).all() and 0 < a50 < a90):
         what = f"a50 {a50:g} and a90 {a90:g}: the probability of detection must grow with size"
         raise UserError(what, legal="0 < a50 < a90", fix="a50 is found 50 % of the time and a90 90 %, so a90 is larger")
@@ -45,7 +45,7 @@ def curve_through(a50: float, a90: float, link: str = "logit", *, log_size: bool
 
 
 def even_sizes(number: int, range_of_sizes: tuple[float, float]) -> np.ndarray:
-    """Return ascending sizes (number,), midpoints of equal parts of the range: no target is spent on its ends."""
+    """Return ascending sizes (number,): midpoints of equal parts of the range, so that no target lies at its ends."""
     low, high = range_of_sizes
     return low + (high - low) * (np.arange(number) + 0.5) / number
 
@@ -53,8 +53,8 @@ def even_sizes(number: int, range_of_sizes: tuple[float, float]) -> np.ndarray:
 def design(
     guess: PodCurve, targets: Sequence[int], range_of_sizes: tuple[float, float], *, studies: int = 200, seed: int = 0
 ) -> tuple[StudyPlan, ...]:
-    """Simulate a `StudyPlan` of evenly spread sizes for each number of targets, analysed with the guess's link, axis. A
-    study that found all or nothing, or whose POD does not grow with size, demonstrates nothing."""
+    """Simulate a `StudyPlan` of evenly spread sizes for each number of targets, analysed with the guess's link and
+    axis. A study in which all or no targets are found, or whose POD does not grow with size, demonstrates nothing."""
     plans = []
     for number in targets:
         sizes, bounds = even_sizes(number, range_of_sizes), np.full(studies, np.inf)
@@ -62,10 +62,10 @@ def design(
         for study, hits in enumerate(stream.random((studies, number)) < guess.pod(sizes)):
             try:
                 fit = fit_hit_miss(sizes, hits, link=guess.link, log_size=guess.log_size)
-            except UserError:  # all or nothing found, or POD does not grow with size: nothing is demonstrated
+            except UserError:  # no limit: all or no targets are found, or POD does not grow with size
                 continue
             bounds[study] = bound(fit, POD, CONFIDENCE).value
-        # order statistics, because there is no mean between a number and infinity
+        # order statistics, because a number and infinity have no mean
         low, median, high = np.quantile(bounds, [0.1, 0.5, 0.9], method="inverted_cdf").tolist()
         facts = (number, studies, guess.size_at(POD))
         plans.append(StudyPlan(*facts, median, low, high, float(np.mean(np.isfinite(bounds))), sizes))
@@ -73,20 +73,20 @@ def design(
 
 
 def recommend(plans: Sequence[StudyPlan], goal: float | None = None) -> tuple[StudyPlan, bool | None]:
-    """Choose the plan with the fewest targets, `LEAST_TARGETS` or more if any plan has them, of whose studies nine of
-    ten demonstrate ``goal`` (None: no wish); the most targets where none do. Beside it: whether they do."""
+    """Return the plan with the fewest targets, at least `LEAST_TARGETS` if any plan has them, in which 90 % of the
+    studies demonstrate ``goal``, and True; else the plan with the most targets, and False. No goal: (fewest, None)."""
     most = max(plan.targets for plan in plans)
-    # below the handbook's minimum the largest number of targets is nearest to it
-    allowed = sorted((plan for plan in plans if plan.targets >= min(LEAST_TARGETS, most)), key=lambda one: one.targets)
+    # below the handbook's minimum, the largest number of targets is nearest to it
+    allowed = sorted((plan for plan in plans if plan.targets >= min(LEAST_TARGETS, most)), key=lambda p: p.targets)
     reaching = [plan for plan in allowed if goal is None or plan.high <= goal]
     return (reaching or allowed[-1:])[0], None if goal is None else bool(reaching)
 
 
 @dataclass(frozen=True)
 class HoleFree:
-    """Hole-free boards for a rate of false calls. ``calibration_boards``: the fewest that give a threshold, with
+    """Hole-free boards needed for a rate of false calls. ``calibration_boards``: the fewest that give a threshold, with
     ``expected_per_m2`` on average and at most ``upper_per_m2`` with ``confidence``. ``silent_m2``: the area without a
-    false call, on ``silent_boards`` other boards, that bounds the rate by the wanted one."""
+    false call, on ``silent_boards`` other boards, whose upper bound is the wanted rate."""
 
     rate_per_m2: float
     board_m2: float
@@ -99,12 +99,12 @@ class HoleFree:
 
 
 def hole_free(rate_per_m2: float, board_m2: float, confidence: float = 0.95) -> HoleFree:
-    """State how much hole-free area has to be inspected, by the rule of `threshold_for_rate` and by Poisson's law."""
+    """Return the hole-free area that must be inspected, by the rule of `threshold_for_rate` and by Poisson's law."""
     if not (np.isfinite([rate_per_m2, board_m2]).all() and rate_per_m2 > 0 and board_m2 > 0):
         raise UserError(f"{rate_per_m2:g} false calls per m2 on boards of {board_m2:g} m2", legal="both above 0")
     calling = -float(np.expm1(-rate_per_m2 * board_m2))
     fewest = max(int(np.ceil(1 / calling * (1 - 1e-12))) - 1, 1)
-    # any distinct scores: the rule's rates do not depend on them
+    # any distinct scores give the same rates
     threshold = threshold_for_rate(np.arange(float(fewest)), board_m2, rate_per_m2, confidence)
     area_m2 = float(stats.chi2.ppf(confidence, 2) / 2 / rate_per_m2)
     silent = area_m2, int(np.ceil(area_m2 / board_m2 * (1 - 1e-12)))

@@ -1,15 +1,16 @@
 """Probability of detection from hits and misses: a binomial regression on size, by MIL-HDBK-1823A appendix G.
 
-Rows that share an identity in ``inspections`` are one target and taken as fully dependent (the handbook's reading): of
-k rows a target, covariance and likelihood ratio criterion are scaled by k; where numbers differ, rows are weighted so
-that each target counts once. The bound is one-sided: the largest a90 in the set 2 (llmax - ll) <= chi2(confidence, 1) =
-3.841 of (mu, sigma), G.3 of the handbook, which equals the profile likelihood of a90 at that criterion. Not modelled:
-targets that differ in anything but size, inspectors, and hits by chance or misses at any size, which are tested for
-(`floor_ceiling_tests`).
+Rows with the same identity in ``inspections`` are one target and count as fully dependent, as the handbook has it. With
+k rows per target, the covariance and the criterion of the likelihood ratio are multiplied by k; if k differs between
+targets, rows are weighted so that each target counts once. The bound is one-sided: the largest a90 of all (mu, sigma)
+with 2 (llmax - ll) <= chi2(confidence, 1) = 3.841 (G.3 of the handbook), which equals the profile likelihood of a90 at
+that criterion. Not modelled: targets that differ in anything but size, inspectors, and hits by chance or misses at any
+size, for which `floor_ceiling_tests` tests.
 
-A bound of one model holds if that model is true. Where the data choose among eight models, the best one's bound covers
-91 to 96 % (1,000 studies of 60 targets for each of five true curves). So `largest_bound` takes the largest over all
-that the data hardly distinguish from the best (`near_models`): 95.6 to 99 % (``tests/validation/pod_coverage.py``)."""
+The bound of a model holds if that model is true. If the data choose among eight models, the bound of the best model
+covers 91 to 96 % (1,000 studies of 60 targets for each of five true curves). So `largest_bound` takes the largest of
+all models that the data hardly distinguish from the best (`near_models`): 95.6 to 99 %
+(``tests/validation/pod_coverage.py``)."""
 
 from __future__ import annotations
 
@@ -47,17 +48,17 @@ EXACT = 1e-9
 STEEPEST = 1e3
 """Largest slope in standardised sizes: a curve that rises within a thousandth of the sizes' spread is a step."""
 NEAR_DEVIANCE = 2.0
-"""Deviance above the least, for one inspection a target, up to which a model counts as hardly worse than the best: all
-have as many parameters, so it is a difference of 2 in Akaike's criterion (Burnham and Anderson 2002, section 2.6)."""
+"""Largest excess over the least deviance, with one inspection per target, of a model that is hardly worse than the
+best. With equally many parameters, it is a difference of 2 in AIC (Burnham and Anderson 2002, 2.6)."""
 STARTS = 10
-"""Places of a coarse grid from which the maximum with floor or ceiling is sought."""
+"""Points of a coarse grid from which the search for the maximum with floor or ceiling starts."""
 
 
 @dataclass(frozen=True, eq=False)
 class HitMissFit:
-    """A fitted curve and its basis. POD = F(b0 + b1 x), x = size or ln size; ``covariance`` (2, 2) of the two, scaled
-    for ``repeats`` = n / targets. Deviances count every row, without the penalty of ``method`` "Firth". ``place`` (2,):
-    intercept and slope in z = (x - centre) / spread; ``data``: the likelihood maximised."""
+    """A fitted curve, POD = F(b0 + b1 x) with x = size or ln size, and its basis. ``covariance`` (2, 2): of b0 and b1,
+    multiplied by ``repeats`` = n / targets. Deviances count every row, without the penalty of ``method`` "Firth".
+    ``place`` (2,): intercept and slope in z = (x - centre) / spread. ``data``: defines the likelihood."""
 
     curve: PodCurve
     b0: float
@@ -80,8 +81,8 @@ class HitMissFit:
 
 @dataclass(frozen=True)
 class FloorCeilingTest:
-    """A test whether POD = floor + (ceiling - floor) F fits better: ``p_value`` from the mixture of chi-squares of a
-    parameter on its boundary; ``needed`` at 5 %; the likeliest ``floor`` and ``ceiling``."""
+    """A test whether POD = floor + (ceiling - floor) F fits better. ``p_value``: from the mixture of chi-squares for a
+    parameter on its boundary. ``floor``, ``ceiling``: maximum likelihood estimates."""
 
     beyond: Beyond
     p_value: float
@@ -90,7 +91,7 @@ class FloorCeilingTest:
 
     @property
     def needed(self) -> bool:
-        """Return whether two parameters do not suffice at the 5 % level."""
+        """Return whether the model with two parameters is rejected at the 5 % level."""
         return self.p_value < 0.05
 
 
@@ -102,16 +103,16 @@ def fit_hit_miss(
     log_size: bool = False,
     inspections: ArrayLike | None = None,
 ) -> HitMissFit:
-    """Fit the POD curve of hits (0/1, (n,)) at sizes ((n,), any unit); ``inspections`` (n,): the target of each row.
-    Where hits and misses do not overlap there is no maximum of the likelihood: Firth's penalised one is fitted, with a
-    note. `UserError` for values that cannot be fitted and for a chance of detection that does not grow with size."""
+    """Fit the POD curve of hits (0/1, (n,)) at sizes ((n,), any unit); ``inspections`` (n,): the target of each row. If
+    hits and misses do not overlap, the likelihood has no maximum: Firth's penalised likelihood is used, with a note.
+    Raises `UserError` for values that cannot be fitted and for a POD that does not grow with size."""
     x, hits = _checked(size, hit, link, log_size)
     n, rows_each = len(x), rows_of_target(x, inspections)
     targets = round(float((1 / rows_each).sum()))
     repeats, centre, spread = n / targets, float(x.mean()), float(x.std())
     weight = repeats / rows_each  # every target counts the same, however often it was inspected
     rate = float(np.average(hits, weights=weight))
-    # Complete and quasi-complete separation on a line, either way round: Albert and Anderson, Biometrika 71 (1984).
+    # Complete and quasi-complete separation in either direction: Albert and Anderson, Biometrika 71 (1984).
     separated = bool(x[~hits].max() <= x[hits].min() or x[hits].max() <= x[~hits].min())
     design = np.column_stack([np.ones_like(x), (x - centre) / spread])
     found, penalty = weight * hits, repeats if separated else None
@@ -150,24 +151,25 @@ def fit_hit_miss(
 def choose_model(
     size: ArrayLike, hit: ArrayLike, *, links: Sequence[str] = LINKS, inspections: ArrayLike | None = None
 ) -> tuple[HitMissFit, ...]:
-    """Fit every link with a and (where all sizes are positive) ln a, least deviance first. The order does not depend on
-    the limits: a model chosen because its limit is small has no coverage."""
+    """Fit every link with a and, if all sizes are positive, with ln a; least deviance first. The order does not depend
+    on the limits: a model chosen because its limit is small has no coverage."""
     logs = (False, True) if np.all(np.asarray(size, float) > 0) else (False,)
     fit = partial(fit_hit_miss, size, hit, inspections=inspections)
     fits = [fit(link=link, log_size=log_size) for log_size, link in product(logs, links)]
-    return tuple(sorted(fits, key=lambda one: one.deviance))
+    return tuple(sorted(fits, key=lambda fit: fit.deviance))
 
 
 def near_models(fits: Sequence[HitMissFit]) -> tuple[HitMissFit, ...]:
-    """Keep, in their order, the fits of the same hits whose deviance is within `NEAR_DEVIANCE` of the least."""
+    """Return the fits of the same hits whose deviance is within `NEAR_DEVIANCE` of the least, in the same order."""
     least = min(fit.deviance for fit in fits)
     return tuple(fit for fit in fits if fit.deviance <= least + NEAR_DEVIANCE * fit.repeats)
 
 
 def floor_ceiling_tests(fit: HitMissFit) -> tuple[FloorCeilingTest, ...]:
     """Test three or four parameters against the two of ``fit`` by the likelihood ratio. A floor of 0 and a ceiling of 1
-    lie on the boundary: 1/2 chi2(0) + 1/2 chi2(1) for one of them, and 1/4, 1/2, 1/4 of chi2(0), chi2(1), chi2(2) for
-    both (Self and Liang, JASA 82 (1987), 605, cases 5 and 7, their correlation neglected). None of separated data."""
+    lie on the boundary: the distribution is 1/2 chi2(0) + 1/2 chi2(1) for either, and 1/4, 1/2, 1/4 of chi2(0),
+    chi2(1), chi2(2) for both (Self and Liang, JASA 82 (1987), 605, cases 5 and 7, without their correlation). No test
+    of separated data."""
     tests, sides = [], (("floor", (0.0, 0.5), (1.0, 1.0)), ("ceiling", (0.0, 0.0), (0.5, 1.0)))
     cases: tuple[tuple[Any, ...], ...] = (*sides, ("both", (0.0, 0.5), (0.5, 1.0)))
     for beyond, floor, ceiling in cases if fit.method == "ML" else ():
@@ -180,7 +182,7 @@ def floor_ceiling_tests(fit: HitMissFit) -> tuple[FloorCeilingTest, ...]:
 
 
 def value_and_gradient(data: HitsAndMisses, place: np.ndarray) -> tuple[float, np.ndarray]:
-    """Log-likelihood of one study and its gradient (4,) at (b0, b1, floor, ceiling)."""
+    """Return the log-likelihood of one study and its gradient (4,) at (b0, b1, floor, ceiling)."""
     b0, b1, floor, ceiling = place
     share, miss, density = np.exp(logs_of_link(data.link, b0 + b1 * data.z))
     p_hit = np.maximum(floor + (ceiling - floor) * share, 1e-300)
@@ -192,7 +194,7 @@ def value_and_gradient(data: HitsAndMisses, place: np.ndarray) -> tuple[float, n
 
 
 def _of_shares(data: HitsAndMisses, share: np.ndarray, miss: np.ndarray, floor: float, ceiling: float) -> np.ndarray:
-    """Log-likelihoods (m,) of curves between floor and ceiling that hit and miss these shares (m, n) of the way."""
+    """Return the log-likelihoods (m,) of curves with floor and ceiling, from their shares (m, n) of hits and misses."""
     p_hit = np.maximum(floor + (ceiling - floor) * share, 1e-300)
     p_miss = np.maximum((1.0 - ceiling) + (ceiling - floor) * miss, 1e-300)
     return np.asarray(np.log(p_hit) @ data.hits + np.log(p_miss) @ data.misses)
@@ -201,7 +203,7 @@ def _of_shares(data: HitsAndMisses, share: np.ndarray, miss: np.ndarray, floor: 
 def _search(
     data: HitsAndMisses, plain: np.ndarray, floor: tuple[float, float], ceiling: tuple[float, float]
 ) -> tuple[np.ndarray, float]:
-    """The likeliest curve (4,) with floor and ceiling in these ranges, climbed to from the best of a coarse grid."""
+    """Return the likeliest curve (4,) with floor and ceiling in these ranges, from the best points of a coarse grid."""
     floors = sorted({float(np.clip(f, *floor)) for f in (0.02, 0.1, 0.25)})
     ceilings = sorted({float(np.clip(c, *ceiling)) for c in (0.75, 0.9, 0.98)})
     middles = np.append(np.quantile(data.z, np.linspace(0.04, 0.96, 16)), -plain[0] / plain[1])
@@ -230,7 +232,7 @@ def _search(
 
 
 def _checked(size: ArrayLike, hit: ArrayLike, link: str, log_size: bool) -> tuple[np.ndarray, np.ndarray]:
-    """x (n,) and hits (n,) as booleans, or the user's mistake."""
+    """Return x (n,) and hits (n,) as booleans. Raises UserError for the user's mistake."""
     sizes, hits = np.asarray(size, float), np.asarray(hit, float)
     if link not in LINKS:
         raise UserError(f"link {link!r} is not known", legal=", ".join(LINKS))
@@ -252,7 +254,7 @@ def _checked(size: ArrayLike, hit: ArrayLike, link: str, log_size: bool) -> tupl
 
 
 def rows_of_target(size: np.ndarray, inspections: ArrayLike | None) -> np.ndarray:
-    """Return how many rows (n,) inspect each row's target; each row has its own where ``inspections`` is None."""
+    """Return for each row (n,) the number of rows of its target; every row is a target if ``inspections`` is None."""
     if inspections is None:
         return np.ones(len(size), int)
     names = np.asarray(inspections).astype(str)
@@ -265,16 +267,16 @@ def rows_of_target(size: np.ndarray, inspections: ArrayLike | None) -> np.ndarra
 
 
 FARTHEST = 2.0**40
-"""Largest distance from the estimate, in spreads of the sizes, at which a bound is looked for."""
+"""Largest distance from the estimate, in spreads of the sizes, at which a bound is sought."""
 DIRECTIONS = 720
-"""Points on the outline of the likelihood ratio set from which a band is drawn."""
+"""Points on the outline of the confidence set that determine a band."""
 REACH = 10
-"""Doublings of a distance at most, from 2 to 2000 standard errors."""
+"""Most doublings of a distance, from 2 to 2000 standard errors."""
 
 
 def bound(fit: HitMissFit, pod: float = 0.9, confidence: float = 0.95, *, design_effect: float = 1.0) -> Bound:
-    """Upper bound on the size with this POD; infinite, with its reason, where there is none. ``design_effect``: what
-    targets in clusters multiply variance and criterion by (Rao and Scott, Annals of Statistics 12 (1984), 46)."""
+    """Return the upper bound on the size with this POD; infinite, with the reason, if there is none. ``design_effect``:
+    factor of variance and criterion for targets in clusters (Rao and Scott, Annals of Statistics 12 (1984), 46)."""
     if not 0 < pod < 1:
         raise UserError(f"POD {pod:g} is out of range", legal="between 0 and 1")
     x, why = _likelihood_bound(fit, pod, criterion(confidence) * design_effect * fit.repeats)
@@ -287,7 +289,7 @@ def bound(fit: HitMissFit, pod: float = 0.9, confidence: float = 0.95, *, design
 
 
 def band(fit: HitMissFit, sizes: np.ndarray, confidence: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper POD at ``sizes`` (n,), each one-sided as in `bound`: the lower one crosses 90 % at a90/95."""
+    """Return lower and upper POD at ``sizes`` (n,), each one-sided as in `bound`: the lower crosses 90 % at a90/95."""
     x = np.log(np.maximum(sizes, np.finfo(float).tiny)) if fit.curve.log_size else np.asarray(sizes, float)
     outline = _outline(fit, criterion(confidence) * fit.repeats)
     predictors = outline[:, :1] + outline[:, 1:] * (x - fit.centre) / fit.spread
@@ -296,21 +298,21 @@ def band(fit: HitMissFit, sizes: np.ndarray, confidence: float = 0.95) -> tuple[
 
 
 def largest_bound(fits: Sequence[HitMissFit], design_effects: Sequence[float] = ()) -> Bound:
-    """Take the largest a90/95 over models; infinite where any of them has none. ``design_effects``: one a model."""
+    """Return the largest a90/95 of several models; infinite if any of them has none. ``design_effects``: by model."""
     effects = design_effects or [1.0] * len(fits)
     bounds = (bound(fit, design_effect=of) for fit, of in zip(fits, effects, strict=True))
-    return max(bounds, key=lambda one: one.value)
+    return max(bounds, key=lambda limit: limit.value)
 
 
 def criterion(confidence: float) -> float:
-    """Largest 2 (llmax - ll) in the set: 3.841 at 95 %."""
+    """Return the largest 2 (llmax - ll) of the confidence set: 3.841 at 95 %."""
     if not 0.5 < confidence < 1:
         raise UserError(f"confidence {confidence:g} is out of range", legal="between 0.5 and 1")
     return float(stats.chi2.ppf(confidence, 1))
 
 
 def _likelihood_bound(fit: HitMissFit, pod: float, allowed: float) -> tuple[float, str]:
-    """The largest x of this POD in the set 2 (llmax - ll) <= ``allowed``, or infinity and why."""
+    """Return the largest x of this POD in the set 2 (llmax - ll) <= ``allowed``, or infinity and the reason."""
     data, place, level = fit.data, fit.place, float(link_ppf(fit.curve.link, np.array(pod)))
     z_best = (fit.curve.mu + fit.curve.sigma * level - fit.centre) / fit.spread
     top = float(data.value(place))
@@ -321,7 +323,7 @@ def _likelihood_bound(fit: HitMissFit, pod: float, allowed: float) -> tuple[floa
     slope = place[1]
 
     def excess(z: float) -> float:
-        """The root of the ratio, which grows about linearly with z, less that of the criterion."""
+        """Return the root of the ratio, which grows about linearly with z, minus the root of the criterion."""
         nonlocal slope
         value, slope = profile(data, z, level, slope)
         return float(np.sqrt(max(2.0 * (top - value), 0.0)) - np.sqrt(allowed))
@@ -336,13 +338,13 @@ def _likelihood_bound(fit: HitMissFit, pod: float, allowed: float) -> tuple[floa
 
 
 def _outline(fit: HitMissFit, allowed: float) -> np.ndarray:
-    """(n, 2) points (b0, b1), in standardised sizes, on the outline of 2 (llmax - ll) <= ``allowed`` with b1 >= 0."""
+    """Return (b0, b1) (n, 2), in standardised sizes, on the outline of 2 (llmax - ll) <= ``allowed`` with b1 >= 0."""
     data, best = fit.data, fit.place
     scale = np.array([[1.0, fit.centre], [0.0, fit.spread]])
     metric = scale @ (fit.covariance / fit.repeats) @ scale.T
     try:
         root = np.linalg.cholesky(metric)
-    except np.linalg.LinAlgError:  # a step, whose covariance is singular: any metric will do that spans both directions
+    except np.linalg.LinAlgError:  # the covariance of a step is singular: use any metric that spans both directions
         spread, directions = np.linalg.eigh(metric)
         root = directions * np.sqrt(np.maximum(spread, 1e-4 * max(float(spread[-1]), 1e-8)))
     angle = np.linspace(0.0, 2.0 * np.pi, DIRECTIONS, endpoint=False)

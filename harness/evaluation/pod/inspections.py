@@ -1,7 +1,7 @@
-"""Tables of inspections in common forms: CSV in several encodings and number formats, or a sheet of Excel.
+"""Reads tables of inspections in common forms: CSV in several encodings and number formats, or a sheet of Excel.
 
-A row is one flaw, or one inspection of it. Several response columns (one for each inspector, the handbook's own layout)
-are inspections of the row's flaw. `Inspections.notes` lists what had to be interpreted."""
+A row is a flaw, or an inspection of a flaw. Several response columns (one for each inspector, the handbook's own
+layout) are inspections of the row's flaw. `Inspections.notes` says how unclear cells were interpreted."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import TABLE_BYTES, bounded_bytes, limited_memory
 
 FEWEST_ROWS = 10
-"""Too few below this for two parameters and a bound; MIL-HDBK-1823A asks for 60 targets (hit/miss) or 40 (signal)."""
+"""Fewest rows for two parameters and a bound; MIL-HDBK-1823A asks for 60 targets (hit/miss) or 40 (signal)."""
 SEPARATORS = (",", ";", "\t")
 HITS = dict.fromkeys(("1", "yes", "y", "true", "t", "hit", "h", "found", "detected"), 1.0)
 HITS |= dict.fromkeys(("0", "no", "n", "false", "f", "miss", "m", "missed", "not found", "not detected"), 0.0)
@@ -36,10 +36,10 @@ Rows = list[tuple[int, list[str]]]
 
 @dataclass(frozen=True)
 class Inspections:
-    """One inspection a row: ``size`` (n,) in the file's unit, ``response`` (n,) hits as 0/1 or signals, ``target`` (n,)
-    the name of what was inspected, None where every row is a target of its own; ``line`` (n,) of the file, from 1.
-    ``unflawed`` (m,): responses at sites without a flaw, whose size is 0 or missing. ``notes``: sentences on what was
-    left out, and how cells were understood where that was not plain."""
+    """One inspection per row. ``size`` (n,): in the file's unit. ``response`` (n,): hits as 0/1, or signals. ``target``
+    (n,): names of what was inspected; None if every row is a target of its own. ``line`` (n,): in the file, from 1.
+    ``unflawed`` (m,): responses at sites without a flaw, whose size is 0 or missing. ``notes``: sentences on rows that
+    were left out, and on the reading of unclear cells."""
 
     path: Path
     size_column: str
@@ -60,8 +60,8 @@ class Inspections:
 def read_inspections(
     path: Path, size: str, responses: Sequence[str], target: str | None = None, *, hits: bool = True
 ) -> Inspections:
-    """Read the named columns; ``responses``: one, or one for each inspector. ``hits``: responses are words or 0/1, else
-    signals. Raises UserError, with the line, for what cannot be read."""
+    """Read the named columns. ``responses``: one column, or one per inspector. ``hits``: whether responses are words or
+    0/1 rather than signals. Raises UserError, with the line, for cells that cannot be read."""
     (_, header), *rows = _rows(path, size)
     notes: list[str] = []
     header = [name.strip() for name in header]
@@ -79,14 +79,14 @@ def read_inspections(
     for line, name in zip(lines, names if target and names is not None else (), strict=False):
         if not name:
             raise UserError(f"{path}, line {line}: {target} is empty", fix="name the target, or remove the row")
-    # one inspection a row from here on: all of the first inspector, all of the second ...
+    # from here on, one inspection per row: all of the first inspector, then all of the second ...
     response, count = np.concatenate(each), len(responses)
     sizes, lines = np.tile(sizes, count), np.tile(lines, count)
     names = None if names is None else np.tile(names, count)
     if missing := int(np.isnan(response).sum()):
         notes.append(f"{missing} of {len(response)} inspections state no result and are left out")
     if (below := sizes < 0).any():
-        what = f"{path}, line {lines[below][0]}: {size} is {sizes[below][0]:g}, and no size is below 0"
+        what = f"{path}, line {lines[below][0]}: {size} is {sizes[below][0]:g}, but a size cannot be below 0"
         raise UserError(what, fix="give the sizes, not their logarithms: --log takes these")
     seen, flawed = ~np.isnan(response), np.nan_to_num(sizes) != 0
     if sites := int((seen & ~flawed).sum()):
@@ -103,7 +103,7 @@ def read_inspections(
 
 
 def texts_of(read: Inspections, column: str) -> np.ndarray:
-    """Return (n,) the text of another column in the rows that were read. Raises UserError where there is none."""
+    """Return the text (n,) of another column in the rows that were read. Raises UserError if there is none."""
     (_, header), *rows = _rows(read.path, read.size_column)
     header = [name.strip() for name in header]
     at, row_of = _column(read.path, header, column, (column,)), dict(rows)
@@ -111,7 +111,7 @@ def texts_of(read: Inspections, column: str) -> np.ndarray:
 
 
 def _require_one_size(read: Inspections) -> None:
-    """Refuse a target that the file gives two sizes."""
+    """Refuse a target with two sizes in the file."""
     assert read.target is not None
     first: dict[str, int] = {}
     for k, name in enumerate(read.target.tolist()):
@@ -132,7 +132,7 @@ def require_positive(read: Inspections, response: bool, why: str) -> None:
 
 
 def _column(path: Path, header: list[str], name: str, chosen: tuple[str | None, ...]) -> int:
-    """Return the number of a column. Raises UserError where it is not there, or is not the only one of this name."""
+    """Return the index of a column. Raises UserError if there is none, or more than one, of this name."""
     if chosen.count(name) > 1:
         raise UserError(f"column {name!r} is chosen twice", fix="name a different column for each option")
     if header.count(name) > 1:
@@ -147,7 +147,7 @@ def _column(path: Path, header: list[str], name: str, chosen: tuple[str | None, 
 
 
 def _hits(path: Path, name: str, lines: np.ndarray, texts: list[str], notes: list[str]) -> np.ndarray:
-    """Return (n,) 1 for a hit, 0 for a miss, NaN where nothing is stated."""
+    """Return (n,): 1 for a hit, 0 for a miss, NaN where nothing is stated."""
     found = np.full(len(texts), np.nan)
     for k, text in enumerate(texts):
         word = re.sub(r"^([01])[.,]0*$", r"\1", text.casefold())
@@ -161,7 +161,7 @@ def _hits(path: Path, name: str, lines: np.ndarray, texts: list[str], notes: lis
 
 
 def _numbers(path: Path, name: str, lines: np.ndarray, texts: list[str], notes: list[str]) -> np.ndarray:
-    """Return (n,) numbers, NaN where nothing is stated."""
+    """Return the numbers (n,), NaN where nothing is stated."""
     thousands, note = _thousands(path, name, texts)
     found = np.full(len(texts), np.nan)
     for k, text in enumerate(texts):
@@ -182,9 +182,9 @@ def _numbers(path: Path, name: str, lines: np.ndarray, texts: list[str], notes: 
 
 
 def _thousands(path: Path, name: str, texts: list[str]) -> tuple[set[str], str]:
-    """Return the marks that part thousands in a column, and a number that leaves it open ("" where none does). Of two
-    marks in a number the last is the decimal one; a mark that stands twice in a number parts thousands, and so does one
-    that only stands before three digits, where the other is decimal."""
+    """Return the thousands separators of a column, and an ambiguous number ("" if there is none). The last of two marks
+    in a number is the decimal mark. A mark that occurs twice in a number is a thousands separator, and so is a mark
+    that occurs only before three digits if another mark is the decimal one."""
     parts, decimals, grouped = set[str](), set[str](), dict[str, str]()
     for text in texts:
         marks = [mark for mark in text if mark in MARKS] if NUMBER.fullmatch(text) else []
@@ -203,8 +203,7 @@ def _thousands(path: Path, name: str, texts: list[str]) -> tuple[set[str], str]:
 
 
 def _rows(path: Path, column: str) -> Rows:
-    """Return (line, fields) of every row that is not blank, the header first: the first row with the ``column``, where
-    titles stand before it."""
+    """Return (line, fields) of every row that is not blank. The header is the first row with ``column``."""
     try:
         content = bounded_bytes(path, TABLE_BYTES)
     except OSError as error:
@@ -218,7 +217,7 @@ def _rows(path: Path, column: str) -> Rows:
 
 
 def _text_rows(path: Path, content: bytes, column: str) -> Rows:
-    """Return the rows of a CSV file: UTF-8, UTF-16 or Latin-1; separated as ``sep=`` says, else as suits its header."""
+    """Return the rows of a CSV file in UTF-8, UTF-16 or Latin-1, separated as ``sep=`` says or to fit the header."""
     try:
         text = content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
     except UnicodeDecodeError:
@@ -235,7 +234,7 @@ def _text_rows(path: Path, content: bytes, column: str) -> Rows:
         return []
     first = next((line for line in filled if column in line), filled[0])
     separator = (
-        stated.group(1) if stated else max(SEPARATORS, key=lambda one: len(next(csv.reader([first], delimiter=one))))
+        stated.group(1) if stated else max(SEPARATORS, key=lambda mark: len(next(csv.reader([first], delimiter=mark))))
     )
     reader = csv.reader(lines[skipped:], delimiter=separator)
     try:
@@ -245,7 +244,7 @@ def _text_rows(path: Path, content: bytes, column: str) -> Rows:
 
 
 def _sheet_rows(path: Path, content: bytes) -> Rows:
-    """Return the rows of an Excel file's only sheet that holds anything. Raises UserError where openpyxl is missing."""
+    """Return the rows of an Excel file's only sheet with content. Raises UserError if openpyxl is missing."""
     try:
         import openpyxl
     except ImportError as error:
@@ -265,7 +264,7 @@ def _sheet_rows(path: Path, content: bytes) -> Rows:
         legal, fix = "one sheet with inspections", "save the intended sheet as CSV"
         raise UserError(f"{path}: has {len(filled)} sheets with data: {', '.join(filled)}", legal=legal, fix=fix)
     rows = next(iter(filled.values()), [])
-    # a table may begin in any column, and rows end where their last cell does
+    # a table may begin in any column, and rows end at their last cell
     width = max((len(row) for _, row in rows), default=0)
     used = [k for k in range(width) if any(k < len(row) and row[k] for _, row in rows)]
     return [(line, [row[k] if k < len(row) else "" for k in range(used[0], used[-1] + 1)]) for line, row in rows]

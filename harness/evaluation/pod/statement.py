@@ -19,16 +19,16 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import jsonable
 
 POD, CONFIDENCE = 0.9, 0.95
-"""The field's customary statement, a90/95."""
+"""The field's usual statement, a90/95."""
 DRAWN = 241
-"""Sizes at which curve and band are drawn."""
+"""Number of sizes at which the curve and the band are drawn."""
 LEAST_TARGETS = 60
-"""MIL-HDBK-1823A: independent targets that a hit/miss study should have at least."""
+"""Fewest independent targets of a hit/miss study, by MIL-HDBK-1823A."""
 APART = 0.05
-"""Share by which a90/95 of models that fit about equally well may differ without a warning."""
+"""Largest relative difference between the a90/95 of models that fit about equally well without a warning."""
 DOUBTED = ": do not trust its limit"
 FEWEST_SITES = 5
-"""Unflawed sites below which no law is fitted to their signals."""
+"""Fewest unflawed sites whose signals can be fitted by a distribution."""
 TESTED: dict[Beyond, str] = {
     "floor": "a floor: hits by chance at any size",
     "ceiling": "a ceiling: misses at any size",
@@ -38,8 +38,8 @@ TESTED: dict[Beyond, str] = {
 
 @dataclass(frozen=True)
 class ModelRow:
-    """A model that was tried: its name, its ``deviance`` (smaller fits better), its sizes; ``near``: its bound is one
-    of those of which the statement's is the largest."""
+    """A model that was tried. ``deviance``: a smaller one fits better. ``near``: whether its bound is among those of
+    which the statement's bound is the largest."""
 
     name: str
     deviance: float
@@ -52,9 +52,9 @@ class ModelRow:
 
 @dataclass(frozen=True)
 class PodStatement:
-    """Statement on inspections, as ``read``; sizes are in ``unit``. ``fits``: of hits, the models over which bound and
-    band are the widest, that of the curve first; ``signal``: the regression, None of hits; ``models``: all that were
-    tried; ``numbers``: what else the fit says; ``tests``: (what, p-value, how it reads)."""
+    """The statement on the inspections ``read``. ``unit``: of sizes. ``fits``: for hits, the models whose largest bound
+    and widest band are stated, that of the curve first. ``signal``: the regression, None for hits. ``models``: all that
+    were tried. ``numbers``: further results of the fit. ``tests``: (subject, p-value, text)."""
 
     read: Inspections
     kind: str
@@ -89,10 +89,10 @@ class PodStatement:
 
     @cached_property
     def band(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper edges (`DRAWN`,) of the band; made when it is drawn, because it takes long."""
+        """Lower and upper edges (`DRAWN`,) of the band; computed when needed, because it takes long."""
         if self.signal:
             return ahat_band(self.signal, self.sizes, CONFIDENCE)
-        # the models' envelope, whose lower edge crosses 90 % at their `largest_bound`
+        # the envelope of the models: its lower edge crosses 90 % at their `largest_bound`
         low, high = zip(*(hit_miss.band(fit, self.sizes) for fit in self.fits), strict=True)
         return np.min(low, axis=0), np.max(high, axis=0)
 
@@ -103,7 +103,7 @@ class PodStatement:
 
     @property
     def counts(self) -> str:
-        """Numbers of rows, targets and hits of the statement."""
+        """Numbers of inspections, targets and hits."""
         rows = f"{len(self.read.size)} inspections of {self.read.targets} targets"
         return rows if self.signal else f"{rows}, {int(self.read.response.sum())} hits"
 
@@ -115,11 +115,11 @@ class PodStatement:
         limits = [row.bound.value for row in self.models if row.deviance <= most]
         if max(limits) <= (1 + APART) * min(limits):
             return doubts
-        texts = [f"{one:.3g}" if np.isfinite(one) else "not demonstrated" for one in (min(limits), max(limits))]
+        texts = [f"{limit:.3g}" if np.isfinite(limit) else "not demonstrated" for limit in (min(limits), max(limits))]
         return [f"{len(limits)} models fit about equally well, and their a90/95 differ: {' to '.join(texts)}", *doubts]
 
     def to_data(self) -> dict[str, Any]:
-        """The statement as JSON's types; an infinite size becomes None, and ``why`` says so."""
+        """Return the statement as JSON's types; an infinite size becomes None, and ``why`` gives the reason."""
         curve, read = self.curve, self.read
         of_curve = {name: getattr(curve, name) for name in ("link", "log_size", "mu", "sigma")}
         models = [
@@ -147,21 +147,21 @@ class PodStatement:
 def state_hits(
     read: Inspections, *, link: str | None = None, log_size: bool | None = None, unit: str = "", tested: bool = True
 ) -> PodStatement:
-    """State the curve of hits and misses: of all links and sizes or their logarithms (of those that ``link``,
-    ``log_size`` leave) the fit with the least deviance; its bound is the largest over the `near_models` of those left.
-    ``tested``: for hits by chance and misses at any size, which takes most of the time."""
+    """State the curve of hits and misses: the fit with the least deviance, over all links and over sizes or their
+    logarithms, unless ``link`` or ``log_size`` restricts them. The bound is the largest over the `near_models` among
+    these fits. ``tested``: whether to test for hits by chance and misses at any size, which takes most of the time."""
     from threadpoolctl import threadpool_limits
 
-    # L-BFGS-B hands LAPACK systems of four unknowns, whose threads wait for each other: 9 s, not 0.6 s, on busy cores
+    # L-BFGS-B solves tiny systems with LAPACK, whose threads wait for each other: 9 s instead of 0.6 s on busy cores
     with threadpool_limits(1, user_api="blas"):
         size, hit = read.size, read.response
         tried = hit_miss.choose_model(size, hit, inspections=read.target)
-        left = [one for one in tried if link in (None, one.curve.link) and log_size in (None, one.curve.log_size)]
+        left = [fit for fit in tried if link in (None, fit.curve.link) and log_size in (None, fit.curve.log_size)]
         fit, near = left[0], hit_miss.near_models(left)
         curve, notes = fit.curve, [*read.notes, *fit.notes]
         tests = hit_miss.floor_ceiling_tests(fit) if tested else ()
-        models = [(one, hit_miss.bound(one, POD, CONFIDENCE)) for one in tried]
-        limit = max((limit for one, limit in models if one in near), key=lambda limit: limit.value)
+        models = [(fit, hit_miss.bound(fit, POD, CONFIDENCE)) for fit in tried]
+        limit = max((limit for fit, limit in models if fit in near), key=lambda limit: limit.value)
 
     if fit.targets < LEAST_TARGETS:
         notes.append(f"{fit.targets} independent targets; MIL-HDBK-1823A asks for at least {LEAST_TARGETS}")
@@ -169,8 +169,8 @@ def state_hits(
         notes.append(f"a90/95 = {limit.value:.3g} lies beyond the largest size inspected, {largest:.4g}")
     if any(test.needed for test in tests):
         likeliest = min(tests, key=lambda test: test.p_value)
-        speaks = f"the data suggest {TESTED[likeliest.beyond]} (p = {likeliest.p_value:.2g})"
-        notes.append(f"the curve has no floor or ceiling, and {speaks}{DOUBTED}")
+        suggests = f"the data suggest {TESTED[likeliest.beyond]} (p = {likeliest.p_value:.2g})"
+        notes.append(f"the curve has no floor or ceiling, and {suggests}{DOUBTED}")
     texts = []
     for test in tests:
         fitted = f"(floor {test.floor:.3f}, ceiling {test.ceiling:.3f})"
@@ -195,8 +195,8 @@ def state_signals(
     log_signal: bool | None = None,
     unit: str = "",
 ) -> PodStatement:
-    """State the curve of signals against sizes. Of all pairs of axes the data allow (of those with ``log_size``,
-    ``log_signal`` where not None) the one with the least deviance; bounds by the delta method on x."""
+    """State the curve of signals against sizes: the fit with the least deviance over all pairs of axes that the data
+    allow, unless ``log_size`` or ``log_signal`` restricts them. Bounds are by the delta method on x."""
     tried = choose_axes(read.size, read.response, decision=decision, left=left, right=right, inspections=read.target)
     fits = [fit for fit in tried if log_size in (None, fit.log_size) and log_signal in (None, fit.log_signal)]
     if not fits:
@@ -210,15 +210,15 @@ def state_signals(
     numbers |= {"signals at or below --left": float(fit.below.sum())}
     numbers |= {"signals at or above --right": float(fit.above.sum()), "decision": fit.decision}
     numbers |= false_positives(read, fit)
-    models = [(one, ahat_bound(one, POD, CONFIDENCE)) for one in tried]
+    models = [(fit, ahat_bound(fit, POD, CONFIDENCE)) for fit in tried]
     reads = {True: f"doubtful at {LEVEL:.0%}", False: f"not rejected at {LEVEL:.0%}"}
-    tests = [(f"{one.assumption} ({one.test})", one.p_value, reads[one.p_value < LEVEL]) for one in diagnose(fit)]
+    tests = [(f"{test.assumption} ({test.test})", test.p_value, reads[test.p_value < LEVEL]) for test in diagnose(fit)]
     what = (read, "signal against size", unit, (), fit, _models(models, (fit,)), limit)
     return PodStatement(*what, numbers, (*read.notes, *fit.notes), tuple(tests))
 
 
 def _models(tried: Sequence[tuple[Any, Bound]], near: Sequence[Any]) -> tuple[ModelRow, ...]:
-    """Rows of fits with their limits; the first of those that are ``near`` is the one of the curve."""
+    """Return rows of fits with their limits; the first of the ``near`` fits is that of the curve."""
 
     def name(fit: HitMissFit | AhatFit) -> str:
         size = "ln size" if fit.curve.log_size else "size"
@@ -229,16 +229,16 @@ def _models(tried: Sequence[tuple[Any, Bound]], near: Sequence[Any]) -> tuple[Mo
     return tuple(
         ModelRow(
             *(name(fit), fit.deviance, fit.curve.size_at(0.5), fit.curve.size_at(POD)),
-            *(limit, fit is near[0], any(fit is one for one in near)),
+            *(limit, fit is near[0], any(fit is each for each in near)),
         )
         for fit, limit in tried
     )
 
 
 def false_positives(read: Inspections, fit: AhatFit | None = None) -> dict[str, float]:
-    """Return the probability of a false positive at unflawed sites by names, nothing where there are none: the share of
-    calls with its upper bound (Clopper and Pearson), and of signals also by the normal law that fits the noise best, on
-    the fit's axis, signals at or below its left limit censored (MIL-HDBK-1823A, 4.5.4 and G.3.4)."""
+    """Return the probability of a false positive at unflawed sites, by name; empty if there are no sites. It is the
+    share of calls with its upper bound (Clopper and Pearson); for signals, also by the normal distribution that fits
+    the noise best on the fit's axis, with signals up to the left limit censored (MIL-HDBK-1823A, 4.5.4 and G.3.4)."""
     sites = read.unflawed
     if not sites.size:
         return {}
@@ -259,10 +259,10 @@ def false_positives(read: Inspections, fit: AhatFit | None = None) -> dict[str, 
 
 
 def drawn_sizes(size: np.ndarray, log_size: bool, marks: tuple[float, ...]) -> np.ndarray:
-    """Sizes (`DRAWN`,) from just below the smallest to just above the largest, and past those of ``marks`` that are no
-    more than twice the largest size away; in equal steps, or in equal ratios where ``log_size``."""
+    """Return sizes (`DRAWN`,) from just below the smallest to just above the largest, and beyond those ``marks`` that
+    are at most twice the largest size; in equal steps, or in equal ratios if ``log_size``."""
     low, high = float(size.min()), float(size.max())
-    high = max([high, *(one for one in marks if np.isfinite(one) and high < one < 2 * high)])
+    high = max([high, *(mark for mark in marks if np.isfinite(mark) and high < mark < 2 * high)])
     if log_size:
         margin = (high / low) ** 0.04
         return np.geomspace(low / margin, high * margin, DRAWN)

@@ -1,14 +1,14 @@
 """Model-assisted probability of detection (MAPOD): a simulated curve, corrected by real hits and misses.
 
-The transfer function says that real damage of size a is as easily found as simulated damage of size a / k, and that the
+The transfer function says that real damage of size a is found as easily as simulated damage of size a / k, and that the
 curve's rise is w times as wide. Prior: ln k and ln w have a bivariate Student distribution about 0 with `FREEDOM`
-degrees of freedom, whose heavy tails let data that contradict the simulation overrule it (O'Hagan and Pericchi,
-Brazilian J. Probability and Statistics 26 (2012), 372); its scale matrix adds the simulated curve's own covariance.
-Real targets differ in more than a simulation lets them, so w < 1 is allowed only within the study's own uncertainty.
-Posterior: prior times the likelihood of the real hits and misses, on a grid; the limit is the largest over all models
-of the simulated curve that fit about equally well. Sources: MIL-HDBK-1823A, appendix H; Thompson et al., Review of
-Progress in QNDE 28 (2009), 1685. Simulations that are wrong by a factor of 1 to 2 in size and 0.6 to 1.6 in width,
-corrected by 24 holes: the limit covers the true a90 in 98 to 100 % of 300 campaigns (``tests/validation``).
+degrees of freedom. Its heavy tails let data that contradict the simulation overrule it (O'Hagan and Pericchi, Brazilian
+J. Probability and Statistics 26 (2012), 372); its scale matrix includes the simulated curve's own covariance. Real
+targets differ in more ways than simulated ones, so w < 1 is allowed only within the study's own uncertainty. Posterior:
+prior times the likelihood of the real hits and misses, on a grid; the limit is the largest over all models of the
+simulated curve that fit about equally well. Sources: MIL-HDBK-1823A, appendix H; Thompson et al., Review of Progress in
+QNDE 28 (2009), 1685. If simulations are wrong by factors of 1 to 2 in size and 0.6 to 1.6 in width, and 24 holes
+correct them, the limit covers the true a90 in 98 to 100 % of 300 campaigns (``tests/validation``).
 
 Not modelled: a floor or a ceiling of real inspections, real targets that share a part. The test of agreement looks for
 other errors of the simulation."""
@@ -36,16 +36,16 @@ PRIOR_SIZE, PRIOR_WIDTH = 1.5, 2.0
 REACH, NODES = 8.0, (241, 61)
 """Half the grid's side in scales, and its nodes along ln k and ln w."""
 DRAWS = 999
-"""Simulated campaigns behind the p-values of the tests of agreement: known to 0.7 % at 5 %."""
+"""Simulated campaigns for the p-values of the tests of agreement: 5 % is then known to 0.7 %."""
 ENOUGH = 1.2
-"""Stop rule: a90/95 is at most so many times a90, so that no further board can lower it by more."""
+"""Stop rule: the ratio of a90/95 to a90 at which no further board can lower a90/95 by more than this factor."""
 LIMIT_AT = float(stats.norm.cdf(np.sqrt(criterion(CONFIDENCE))))
-"""0.975: the quantile where the handbook's likelihood ratio, which gives every other a90/95, has its bound."""
+"""0.975: the quantile at which the handbook's likelihood ratio, which gives all other a90/95, has its bound."""
 
 
 @dataclass(frozen=True)
 class BoardStep:
-    """After so many boards: posterior medians ``a50``, ``a90``; ``a90_95``: quantile `LIMIT_AT` of a90."""
+    """The state after some boards. ``a50``, ``a90``: posterior medians. ``a90_95``: of a90, quantile `LIMIT_AT`."""
 
     board: str
     targets: int
@@ -56,7 +56,7 @@ class BoardStep:
 
     @property
     def enough(self) -> bool:
-        """Return whether more boards would lower the limit by less than the stop rule asks."""
+        """Return whether the stop rule holds: further boards would hardly lower the limit."""
         return self.a90_95 <= ENOUGH * self.a90
 
 
@@ -71,7 +71,7 @@ class Transfer:
 
     @cached_property
     def own_covariance(self) -> np.ndarray:
-        """(2, 2) covariance of the simulated curve's ln a50 and ln w, by the delta method from that of mu, sigma."""
+        """The covariance (2, 2) of the simulated curve's ln a50 and ln w, from that of mu, sigma (delta method)."""
         curve, half = self.curve, float(link_ppf(self.curve.link, np.array(0.5)))
         middle = curve.mu + half * curve.sigma
         slopes = np.array([[1.0, half], [0.0, 1.0 / curve.sigma]])
@@ -81,19 +81,19 @@ class Transfer:
 
     @cached_property
     def scale(self) -> np.ndarray:
-        """(2, 2) scale matrix of the prior of ln k, ln w."""
+        """The scale matrix (2, 2) of the prior of ln k and ln w."""
         return np.diag([np.log(PRIOR_SIZE) ** 2, np.log(PRIOR_WIDTH) ** 2]) + self.own_covariance
 
     @cached_property
     def grid(self) -> np.ndarray:
-        """(g, 2) nodes of ln k, ln w."""
+        """The nodes (g, 2) of ln k and ln w."""
         reach = REACH * np.sqrt(np.diag(self.scale))
         k, w = (np.linspace(-end, end, nodes) for end, nodes in zip(reach, NODES, strict=True))
         return np.stack([each.ravel() for each in np.meshgrid(k, w, indexing="ij")], axis=1)
 
     @cached_property
     def logs(self) -> tuple[np.ndarray, np.ndarray]:
-        """(g, n) ln POD and ln(1 - POD) of each target at each node."""
+        """The logarithms (g, n) of POD and of 1 - POD for each target at each node."""
         return self._logs(self.grid, self.size)
 
     def _logs(self, nodes: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -104,7 +104,7 @@ class Transfer:
         return found, missed
 
     def sizes_at(self, pod: float) -> np.ndarray:
-        """(g,) sizes of this POD at each node."""
+        """Return the size (g,) with this POD at each node."""
         shift = float(link_ppf(self.curve.link, np.array(pod)) - link_ppf(self.curve.link, np.array(0.5)))
         k, w = np.exp(self.grid.T)
         middle = self.curve.size_at(0.5)
@@ -115,24 +115,24 @@ class Transfer:
 
     @cached_property
     def own_spread(self) -> np.ndarray:
-        """(2, 2) covariance of ln k and ln w by the study's own uncertainty and by the distance of the nodes."""
+        """The covariance (2, 2) of ln k and ln w from the study's own uncertainty and the distance of the nodes."""
         return self.own_covariance + np.diag(np.diff(self.grid, axis=0).max(axis=0) ** 2 / 12)
 
     @cached_property
     def log_prior(self) -> np.ndarray:
-        """(g,) logarithms of the nodes' weights before any real inspection, less a constant."""
+        """The logarithms (g,) of the nodes' weights before any real inspection, minus a constant."""
         steeper = stats.norm.logcdf(self.grid[:, 1] / np.sqrt(self.own_spread[1, 1]))
         return np.asarray(stats.multivariate_t(np.zeros(2), self.scale, df=FREEDOM).logpdf(self.grid) + steeper)
 
     def posterior(self, rows: np.ndarray) -> np.ndarray:
-        """(g,) weights of the nodes after the inspections ``rows`` (n,) bool; their sum is 1."""
+        """Return the weights (g,) of the nodes after the inspections ``rows`` (n,) bool; their sum is 1."""
         found, missed = self.logs
         value = found @ (rows & self.hit) + missed @ (rows & ~self.hit) + self.log_prior
         weight = np.exp(value - value.max())
         return np.asarray(weight / weight.sum())
 
     def steps(self) -> tuple[BoardStep, ...]:
-        """State the sizes before any board and after each, in the order of their rows."""
+        """Return the estimates before any board and after each, in the order of the rows."""
         found, seen = [], np.zeros(len(self.size), bool)
         for board in ("none", *dict.fromkeys(self.board.tolist())):
             seen = seen | (self.board == board)
@@ -146,12 +146,12 @@ class Transfer:
         weight = self.posterior(np.ones(len(self.size), bool))
         kept = weight > weight.max() * 1e-6
         columns, ends = np.exp(self._logs(self.grid[kept], sizes)[0]).T, (0.5, 1 - LIMIT_AT, LIMIT_AT)
-        middle, low, high = (np.array([quantile(one, weight[kept], share) for one in columns]) for share in ends)
+        middle, low, high = (np.array([quantile(column, weight[kept], share) for column in columns]) for share in ends)
         return middle, low, high
 
     def agreement(self, seed: int = 1) -> float:
-        """Return the probability, were the simulated curve right, of real hits and misses as far from it as these or
-        farther. The statistic is the ratio of the largest likelihood over the grid to the mean one over the curves that
+        """Return the probability, if the simulated curve is right, of real hits and misses at least as far from it as
+        these. The statistic is the largest likelihood over the grid divided by the mean likelihood over the curves that
         the study's own uncertainty allows; its distribution is simulated at the same sizes."""
         found, missed = self.logs
         weight = stats.multivariate_normal(np.zeros(2), self.own_spread).pdf(self.grid)
@@ -168,7 +168,7 @@ class Transfer:
 
 
 def quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
-    """Return the value (n,) below which the weights (n,) come to this share of their sum, interpolated."""
+    """Return the interpolated value at which the cumulated weights (n,) of values (n,) reach a share of their sum."""
     order = np.argsort(values, kind="stable")
     sorted_weights = weights[order]
     below = np.cumsum(sorted_weights) - sorted_weights / 2
@@ -176,16 +176,16 @@ def quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
 
 
 DISAGREES = 0.05
-"""Probability of agreement below which the simulation counts as contradicted."""
+"""Probability of agreement below which the real hits contradict the simulation."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mapod:
-    """A study's curve beside real hits and misses and the combination of both. ``set_up``: the study's, by name;
-    ``measured``: the real ones alone, None where no curve fits them, ``why``. ``transfers``: of all simulated models
-    that fit about equally well. ``steps``: estimates before any board and after each, limits the largest over
-    ``transfers``. ``agrees``: probability of data as far from the simulated curve as these, were it right. ``unlike``:
-    how the real hits were counted otherwise than the study's, or that it is not known; "" where they agree."""
+    """A study's curve, real hits and misses, and the combination of both. ``set_up``: name in the study. ``measured``:
+    the real ones alone; None if no curve fits them (``why``). ``transfers``: of all simulated models that fit about
+    equally well. ``steps``: estimates before any board and after each; limits are the largest over ``transfers``.
+    ``agrees``: as in `Transfer.agreement`. ``unlike``: how the counting of the real hits differs from the study's, or
+    that this is unknown; "" if they agree."""
 
     set_up: str
     simulated: PodStatement
@@ -202,7 +202,7 @@ class Mapod:
         cls, set_up: str, simulated: PodStatement | None, why: str, read: Inspections, boards: np.ndarray | None = None,
         unlike: str = "",
     ) -> Mapod:  # fmt: skip
-        """Correct a study's curve. Raises UserError where the study has no curve, and says ``why``."""
+        """Correct a study's curve. Raises UserError if the study has no curve, with the reason ``why``."""
         if simulated is None:
             raise UserError(f"set-up {set_up} has no curve to correct: {why}", fix="name another set-up with --set-up")
         measured, none = None, ""
@@ -226,7 +226,7 @@ class Mapod:
 
     @property
     def a90_95(self) -> float:
-        """The combined limit; of a contradicted simulation the larger of it and the measured one, maybe infinite."""
+        """The combined limit; if the simulation is contradicted, at least the measured one, which may be infinite."""
         combined = self.steps[-1].a90_95
         if not self.contradicted:
             return combined

@@ -1,4 +1,4 @@
-"""Hits by chance, and curves over all thresholds; areas are trapezoids on those counted.
+"""Hits by chance, and curves over all thresholds, with areas by trapezoids between the counted thresholds.
 
 - ROC: signals of damages (highest scores within the hit radius) against those of the same places without damage.
 - Free-response curve (FROC): share of damages found against false calls per square metre of hole-free boards
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ChanceHits:
-    """``probability`` by shuffling, from ``laid`` pairs of a place and another board's run. ``expected``: 1 - exp(-rate
-    pi r^2) at the false-call rate, were calls spread evenly; NaN without hole-free boards. ``of_sites``: the share of
-    ``sites`` unflawed places (repeats as shares) that were found."""
+    """``probability``: by shuffling, from ``laid`` pairs of a place and another board's run. ``expected``: 1 -
+    exp(-rate pi r^2) for evenly spread false calls at the measured rate; NaN without hole-free boards. ``of_sites``:
+    share of ``sites`` unflawed places (repeats count as shares) that were found."""
 
     probability: float
     laid: int
@@ -55,7 +55,7 @@ def chance_hits(
 
 
 def _shuffled(places: pd.DataFrame, runs: pd.DataFrame, findings: pd.DataFrame, radius_mm: float) -> tuple[float, int]:
-    """The share of places laid over runs of other boards that have an unmatched finding near, and how many were."""
+    """Return the share of places, moved to runs of other boards, with an unmatched finding near, and their number."""
     at, own = places[["true_x_mm", "true_y_mm"]].to_numpy(float), places["board"]
     judged = runs[runs["role"].isin(("damaged", "hole_free"))]
     on_own = judged.loc[judged["role"] == "damaged", "board"].map(own.value_counts()).sum()
@@ -70,13 +70,13 @@ def _shuffled(places: pd.DataFrame, runs: pd.DataFrame, findings: pd.DataFrame, 
 
 
 PRO_LIMIT = 0.3
-"""False-positive rate to which per-region overlap is integrated, as MVTec AD does."""
+"""False-positive rate up to which per-region overlap is integrated, as in MVTec AD."""
 
 
 @dataclass(frozen=True, eq=False)
 class Roc:
-    """``false``, ``true`` (k,): shares of ``unflawed`` sites and of ``damages`` (inspections) with a signal as high,
-    from (0, 0) to (1, 1); ``at``: the two at the threshold in use."""
+    """``false``, ``true`` (k,): shares of ``unflawed`` sites and of ``damages`` (inspections) with at least a given
+    signal, from (0, 0) to (1, 1). ``at``: both at the threshold in use."""
 
     false: np.ndarray
     true: np.ndarray
@@ -88,9 +88,9 @@ class Roc:
 
 @dataclass(frozen=True, eq=False)
 class FreeResponse:
-    """Shares and rates at ``threshold`` (k,), descending: ``false_calls_per_m2`` (k,), ``found`` (k,) share of all
-    damages with ``found_low``, ``found_high`` (k,) over boards. ``at``: (false calls per m2, found) at the threshold in
-    use; ``area_m2`` of hole-free boards inspected."""
+    """Shares and rates at descending values of ``threshold`` (k,). ``found`` (k,): share of all damages, with
+    ``found_low`` and ``found_high`` (k,) over boards. ``at``: (false calls per m2, found) at the threshold in use.
+    ``area_m2``: inspected area of hole-free boards."""
 
     threshold: np.ndarray
     false_calls_per_m2: np.ndarray
@@ -103,9 +103,9 @@ class FreeResponse:
 
 @dataclass(frozen=True, eq=False)
 class PixelCurves:
-    """``false`` (k,): share of undamaged pixels above each threshold, ascending from 0; ``overlap`` (k,): mean over
-    damages of the share of their pixels above. ``pro``: the area under it up to `PRO_LIMIT`, divided by that; NaN, and
-    ``why``, where the thresholds counted do not reach so far, unless no pixel of damage is left to be gained beyond."""
+    """``false`` (k,): share of undamaged pixels above each threshold, ascending from 0. ``overlap`` (k,): mean over
+    damages of the share of their pixels above it. ``pro``: the area under it up to `PRO_LIMIT`, divided by that. If the
+    counted thresholds do not reach so far, and pixels of damage remain below them, it is NaN, and ``why`` says so."""
 
     false: np.ndarray
     overlap: np.ndarray
@@ -114,7 +114,7 @@ class PixelCurves:
 
 
 def roc_curve(holes: pd.DataFrame, sites: pd.DataFrame, threshold: float) -> Roc | None:
-    """Draw the ROC of all damages; None without damages or places. Where no pixel was judged nothing can be found."""
+    """Return the ROC of all damages; None without damages or places. Damage without judged pixels cannot be found."""
     if holes.empty or sites.empty:
         return None
     positive, negative = (table["signal"].fillna(-np.inf).to_numpy(float) for table in (holes, sites))
@@ -128,9 +128,9 @@ def roc_curve(holes: pd.DataFrame, sites: pd.DataFrame, threshold: float) -> Roc
 def free_response(
     operating: pd.DataFrame, runs: pd.DataFrame, holes: pd.DataFrame, draws: int = DRAWS
 ) -> FreeResponse | None:
-    """Draw the free-response curve of one set-up; None where no damage or no hole-free board was inspected, or no other
-    threshold was counted. Thresholds with fewer false calls than a higher one has are left out: that far down findings
-    run into one another, to one that covers the board, and the curve would fold back."""
+    """Return the free-response curve of one set-up; None if no damage or no hole-free board was inspected, or no other
+    threshold was counted. Thresholds with fewer false calls than a higher threshold are left out: there, findings merge
+    until one covers the board, and the curve would turn back."""
     import pandas as pd
 
     free = runs[runs["role"] == "hole_free"] if len(runs) else runs
@@ -142,7 +142,7 @@ def free_response(
     kept = calls >= np.maximum.accumulate(calls)
     damaged = operating[operating["role"] == "damaged"]
     of_board = holes.groupby("board", sort=True).size()
-    # A board that was too full for any damage has runs, and no inspections.
+    # A board without room for damage has runs but no inspections.
     of_run = pd.DataFrame(_counts(damaged["hits"]), damaged["board"].to_numpy())
     counted = of_run.groupby(level=0).sum().reindex(of_board.index, fill_value=0)
     hits, inspections = counted.to_numpy(float)[:, ::-1][:, kept], of_board.to_numpy(float)
@@ -156,7 +156,7 @@ def free_response(
 
 
 def pixel_curves(pixels: pd.DataFrame) -> PixelCurves | None:
-    """Compute per-region overlap of one set-up; None without damaged or without undamaged pixels."""
+    """Return the per-region overlap of one set-up; None without damaged or without undamaged pixels."""
     if pixels.empty:
         return None
     face = pixels[pixels["hole"] == ""]
@@ -175,5 +175,5 @@ def pixel_curves(pixels: pd.DataFrame) -> PixelCurves | None:
 
 
 def _counts(column: pd.Series) -> np.ndarray:
-    """Lists (n, k) over the thresholds, ascending, of one set-up."""
+    """Return the lists (n, k) over ascending thresholds of one set-up."""
     return np.stack(list(column.to_numpy()))

@@ -1,10 +1,10 @@
-"""A detector's efficiency: how much of the ideal observer's signal it uses.
+"""A detector's efficiency: the share of the ideal observer's signal that it uses.
 
-Hits are fitted against the ideal observer's index d' of each damage instead of its size, by a probit curve of ln d'.
-Where a detector needs d'_p to find a share p and the ideal observer d'_p,ideal, its efficiency is (d'_p,ideal /
-d'_p)^2: the share of independent pixels, or of frames without a fixed pattern, with which the ideal observer would do
-as well (Tanner and Birdsall, J. Acoust. Soc. Am. 30 (1958), 922); unknown where d'_p was not inspected. Hits by missing
-returns are left out, as the ideal observer does not see these."""
+Hits are fitted against the ideal observer's index d' of each damage instead of its size, by a probit curve of ln d'. If
+a detector needs d'_p to find a share p and the ideal observer d'_p,ideal, its efficiency is (d'_p,ideal / d'_p)^2: the
+share of independent pixels, or of frames without a fixed pattern, that the ideal observer needs for the same result
+(Tanner and Birdsall, J. Acoust. Soc. Am. 30 (1958), 922). It is unknown if d'_p was not inspected. Hits by missing
+returns are left out, as the ideal observer does not use these."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from harness.vocabulary.errors import UserError
 
 LINK = "probit"
 LEAST_INDEX = 0.05
-"""A smaller d' counts as this: nobody finds such damage, and its logarithm must not decide the curve."""
+"""Least value of d': smaller ones are raised to it: such damage is never found and must not decide the curve."""
 HARDLY = 0.5
-"""Hits, or misses, to be expected below which there is no curve."""
+"""Fewest expected hits, and misses, for a curve."""
 HEAVY = 1.0
-"""Excess kurtosis of the noise from which on it is no longer taken for Gaussian."""
+"""Excess kurtosis from which the noise no longer counts as Gaussian."""
 MOST_LOST = 0.01
-"""Share of a board's pixels within damage that may return nothing without a word."""
+"""Largest share of a board's pixels within damage that may return nothing without a warning."""
 
 
 @dataclass(frozen=True)
 class Level:
-    """Both observers at one share of damages found: ``ideal_mm``, the smallest inspected where none is missed
-    (``at_most``); d' that each needs (``ideal_index``, ``index``), NaN where unknown; the efficiency."""
+    """Both observers at one share of damages found. ``ideal_mm``: the ideal observer's size, or the smallest inspected
+    if none is missed (``at_most``). ``ideal_index``, ``index``: d' that each needs, NaN if unknown."""
 
     ideal_mm: float
     ideal_mm_interval: Interval
@@ -47,9 +47,9 @@ class Level:
 
 @dataclass(frozen=True, eq=False)
 class Efficiency:
-    """A set-up's detector beside the ideal observer, at shares of 50 % and 90 %. ``size_mm``, ``index``, ``pod``
-    (ideal observer's), ``hits``, ``inspections`` (n,) of each damage; ``curve``: the detector's POD against d', None
-    where there is none, and ``why``."""
+    """A set-up's detector and the ideal observer, at shares of 50 % (``half``) and 90 % (``most``). ``size_mm``,
+    ``index``, ``pod`` (ideal observer's), ``hits``, ``inspections``: (n,) of each damage. ``curve``: the detector's POD
+    against d'; None if there is none, and ``why``."""
 
     limit: SetUpLimit
     ideal: IdealDamages
@@ -68,8 +68,8 @@ class Efficiency:
 
 
 def expected_sizes(x: np.ndarray, pod: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return (2, d) values of x (n,) with POD of 50 and 90 % on probit curves of ln x through shares ``pod`` (n,)
-    under weights (d, n); infinite where hardly one is found, the smallest x where hardly one is missed."""
+    """Return the values (2, d) of x (n,) with POD of 50 and 90 % on probit curves of ln x through shares ``pod`` (n,)
+    with weights (d, n); infinite if hardly any is found, the smallest x if hardly any is missed."""
     log = np.log(x)
     centre, spread = float(log.mean()), float(log.std()) or 1.0
     design = np.column_stack([np.ones_like(log), (log - centre) / spread])
@@ -83,7 +83,7 @@ def expected_sizes(x: np.ndarray, pod: np.ndarray, weights: np.ndarray) -> np.nd
 
 
 def efficiency_of(limit: SetUpLimit, ideal: IdealDamages) -> Efficiency:
-    """Set a detector's hits beside the ideal observer on the damages that both judged."""
+    """Compare a detector's hits with the ideal observer on the damages that both judged."""
     seen = limit.record.inspected
     hit = seen.hit if seen.by_depth is None else seen.by_depth
     place = {key: number for number, key in enumerate(zip(ideal.board.tolist(), ideal.hole.tolist(), strict=True))}
@@ -119,7 +119,7 @@ def efficiency_of(limit: SetUpLimit, ideal: IdealDamages) -> Efficiency:
 
 
 def _level(ideal_mm: np.ndarray, ideal_index: np.ndarray, needed: np.ndarray, all_found: bool) -> Level:
-    """One share of damages found; arrays (1 + draws,), the estimate first."""
+    """Return one share of damages found, from arrays (1 + draws,) that begin with the estimate."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         share = (ideal_index / needed) ** 2
     of_index, of_share = (percentiles(of[1:]) if np.isfinite(needed[0]) else UNKNOWN for of in (needed, share))
@@ -135,7 +135,7 @@ def warnings_of(rows: list[Efficiency]) -> list[str]:
         if ideal.kurtosis > HEAVY:
             warnings.append(
                 f"{name}: the noise has heavier tails than a Gaussian (excess kurtosis {ideal.kurtosis:.2g}): the ideal"
-                " observer for Gaussian noise is not the best detector there, nor does it keep the stated rate"
+                " observer for Gaussian noise is not the best detector there, and its rate of false calls differs"
             )
         if ideal.lost > MOST_LOST:
             warnings.append(

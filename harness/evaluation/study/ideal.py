@@ -1,16 +1,16 @@
 """The ideal observer: the detections of the best possible detector at a wanted rate of false calls.
 
 It knows the exact signature s of each damage, as far as the camera shows it, and the covariance C of the noise over
-cameras, but neither where the damage is nor the undamaged surface, a polynomial B b with unknown b. Its statistic at
-each place is the log-likelihood ratio of Gaussian noise, s' K r / d' with K = C^-1 - C^-1 B (B' C^-1 B)^-1 B' C^-1, of
-deviation 1 without damage and mean d' at the damage, d'^2 = s' K s (Barrett and Myers, Foundations of Image Science
-(2004), chapter 13; ICRU Report 54 (1996)). Its threshold is where the field of this statistic has the wanted number of
-maxima on the pixels; a damage is found where any pixel about its place exceeds it.
+cameras. It knows neither the place of the damage nor the undamaged surface, a polynomial B b with unknown b. Its
+statistic at each place is the log-likelihood ratio of Gaussian noise, s' K r / d' with K = C^-1 - C^-1 B (B' C^-1 B)^-1
+B' C^-1. It has deviation 1 without damage and mean d' at the damage, d'^2 = s' K s (Barrett and Myers, Foundations of
+Image Science (2004), chapter 13; ICRU Report 54 (1996)). At its threshold, the field of this statistic has the wanted
+number of maxima on the pixels. A damage is found if any pixel around its place exceeds the threshold.
 
-C is stationary but for its scale: C = D R D, with the deviations D of each pixel and the autocovariance R of noise in
-deviations, pooled over boards and units and faded out by Parzen's window. Not modelled: tails that are not Gaussian,
-noise that differs within damage, information in missing returns, size and depth as unknowns (a bank of templates has a
-higher threshold)."""
+C is stationary except for its scale: C = D R D, with the deviations D of each pixel and the autocovariance R of noise
+in deviations, pooled over boards and units and faded out by Parzen's window. Not modelled: tails that are not Gaussian,
+noise that differs within damage, information in missing returns, size and depth as unknowns (with them, a bank of
+templates has a higher threshold)."""
 
 from __future__ import annotations
 
@@ -26,27 +26,27 @@ from scipy import optimize, special
 from harness.vocabulary.seeds import random_stream
 
 LONGEST_LAG_PX = 72
-"""Lag at which the autocovariance has faded: ten times the length of the pattern of known cameras. The window smears
-the spectrum a little: d' of 50 frames is 1 to 2 % below that with 110 pixels."""
+"""Lag at which the autocovariance is 0: ten times the length of known cameras' patterns. The window smooths the
+spectrum a little: d' of 50 frames is 1 to 2 % below that with 110 pixels."""
 LEAST_POWER = 1e-3
-"""Least power of the noise at any frequency, as a share of the mean: below it an estimate's error is all there is."""
+"""Least power of the noise at any frequency, as a share of the mean; smaller estimates are only error."""
 CONVERGED, MOST_ITERATIONS = 1e-4, 200
-"""Relative residual of C^-1 s, which is the relative error of d'^2, and a bound on the steps there."""
+"""Relative residual of C^-1 s, which is the relative error of d'^2, and the most steps to reach it."""
 NORMALS = 4096
-"""Draws of a neighbourhood of the statistic: rates of maxima are then known to some 3 %, thresholds to 0.01."""
+"""Draws of a neighbourhood of the statistic: rates of maxima are then known to 3 %, thresholds to 0.01."""
 AROUND = 3
-"""Half of the lattice of places about a damage at which it may be found, in strides."""
+"""Half of the lattice of places around a damage at which it may be found, in strides."""
 NEAR_CORRELATION = 0.2
-"""Places that are correlated by less with the damage's own do not add to its detection."""
+"""Places with a smaller correlation to the damage's own place do not add to its detection."""
 SHARES = (0.5, 0.9)
-"""Shares of damages found at which observers are compared."""
+"""Shares of damages found for the comparison of observers."""
 RANGE = (1.0, 12.0)
-"""Thresholds in deviations between which the wanted one is sought."""
+"""Range of thresholds, in deviations, in which the wanted one is sought."""
 LAGS = np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1)
 
 
 def _padded(height: int, width: int) -> tuple[int, int]:
-    """Return the sides of a periodic grid on which nothing within `LONGEST_LAG_PX` meets itself."""
+    """Return the sides of a periodic grid on which points within `LONGEST_LAG_PX` do not overlap by wrapping around."""
     high, wide = (max(side + LONGEST_LAG_PX, len(LAGS)) for side in (height, width))
     return int(scipy.fft.next_fast_len(high, real=True)), int(scipy.fft.next_fast_len(wide, real=True))
 
@@ -66,12 +66,12 @@ class NoiseSums:
         return NoiseSums(*(getattr(self, name) + getattr(other, name) for name in self.__dataclass_fields__))
 
     def __sub__(self, other: NoiseSums) -> NoiseSums:
-        """Take fields out."""
+        """Remove the sums over some fields."""
         return NoiseSums(*(getattr(self, name) - getattr(other, name) for name in self.__dataclass_fields__))
 
     @cached_property
     def autocovariance(self) -> np.ndarray:
-        """R (2 m + 1, 2 m + 1), 0 lag in the middle, 1 there, under Parzen's window."""
+        """R (2 m + 1, 2 m + 1) under Parzen's window, lag 0 in the middle, where it is 1."""
         far = np.minimum(np.hypot(LAGS[:, None], LAGS) / LONGEST_LAG_PX, 1.0)
         parzen = np.where(far <= 0.5, 1.0 - 6.0 * far**2 * (1.0 - far), 2.0 * (1.0 - far) ** 3)
         covariance = parzen * self.products / np.maximum(self.pairs, 1.0)
@@ -79,7 +79,7 @@ class NoiseSums:
 
     @property
     def kurtosis(self) -> float:
-        """Excess kurtosis of the noise: 0 where it is Gaussian."""
+        """Excess kurtosis of the noise: 0 if it is Gaussian."""
         middle = LONGEST_LAG_PX
         return float(self.fourth / self.pixels / (self.products[middle, middle] / self.pixels) ** 2 - 3.0)
 
@@ -92,7 +92,7 @@ class NoiseSums:
 
 
 def noise_sums(noise: np.ndarray, known: np.ndarray) -> NoiseSums:
-    """Return the sums over fields ``noise`` (k, h, w) in deviations, at the ``known`` (k, h, w) pixels."""
+    """Return the sums over fields ``noise`` (k, h, w), in deviations, at the ``known`` (k, h, w) pixels."""
     shape = _padded(*noise.shape[1:])
 
     def by_lag(images: np.ndarray) -> np.ndarray:
@@ -104,8 +104,8 @@ def noise_sums(noise: np.ndarray, known: np.ndarray) -> NoiseSums:
 
 
 def inverse_times(images: np.ndarray, known: np.ndarray, sums: NoiseSums) -> np.ndarray:
-    """Return R^-1 x (n, h, w) of images x (n, h, w) over the ``known`` (h, w) pixels, 0 elsewhere: by conjugate
-    gradients, with the inverse on a periodic grid to begin with; exact for any outline."""
+    """Return R^-1 x (n, h, w) of images x (n, h, w) over the ``known`` (h, w) pixels, 0 elsewhere, by conjugate
+    gradients that start from the inverse on a periodic grid; exact for any outline."""
     h, w = known.shape
     shape = _padded(h, w)
     power = sums.power(shape)
@@ -132,7 +132,7 @@ def inverse_times(images: np.ndarray, known: np.ndarray, sums: NoiseSums) -> np.
 
 
 def detectability(signals: np.ndarray, surface: np.ndarray, known: np.ndarray, sums: NoiseSums) -> np.ndarray:
-    """Return d' (n,) of signals (n, h, w) before an unknown sum of images ``surface`` (p, h, w), both in deviations."""
+    """Return d' (n,) of signals (n, h, w) on an unknown sum of images ``surface`` (p, h, w), both in deviations."""
     whitened = inverse_times(np.concatenate([surface, signals]), known, sums)
     flat = whitened.reshape(len(whitened), -1)
     gram = flat @ np.concatenate([surface, signals]).reshape(len(flat), -1).T
@@ -142,8 +142,8 @@ def detectability(signals: np.ndarray, surface: np.ndarray, known: np.ndarray, s
 
 
 def responses(signal: np.ndarray, sums: NoiseSums) -> np.ndarray:
-    """Return s' R^-1 s_k (2 m + 1, 2 m + 1), where s_k is a signal (h, w) in deviations moved by a lag k: in the middle
-    d'^2 on an endless board whose surface is known; elsewhere, over that, the correlation of the statistic."""
+    """Return s' R^-1 s_k (2 m + 1, 2 m + 1), where s_k is a signal (h, w) in deviations moved by a lag k. The middle is
+    d'^2 on an endless board with a known surface; the others, divided by it, are the statistic's correlation."""
     rows, columns = np.nonzero(signal)
     image = signal[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
     shape = _padded(*image.shape)
@@ -161,13 +161,13 @@ def _covariance(correlated: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:
-    """Return a matrix whose product with its transpose is a covariance, which rounding may have left indefinite."""
+    """Return a matrix whose product with its transpose is a covariance, which rounding may have made indefinite."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _normals(count: int) -> np.ndarray:
-    """Return (`NORMALS`, count) standard normals, the same every time, and each with its opposite."""
+    """Return standard normals (`NORMALS`, count): the same every time, each with its opposite."""
     drawn = random_stream(0, "neighbourhoods of the ideal observer", count).standard_normal((NORMALS // 2, count))
     return np.concatenate([drawn, -drawn])
 
@@ -180,7 +180,7 @@ def maxima_per_pixel(correlated: np.ndarray, thresholds: np.ndarray) -> np.ndarr
     that exceed their eight neighbours, by integration over the maximum's height."""
     rho = _covariance(correlated, np.concatenate([[(0, 0)], NEIGHBOURS]))
     spread = _normals(len(NEIGHBOURS)) @ _root(rho[1:, 1:] - np.outer(rho[1:, 0], rho[1:, 0])).T
-    # a value z exceeds a neighbour of mean rho z and deviation `spread` where z is above spread / (1 - rho)
+    # a value z exceeds a neighbour of mean rho z and deviation `spread` if z is above spread / (1 - rho)
     least = np.sort((spread / np.maximum(1.0 - rho[1:, 0], 1e-12)).max(axis=1))
     # maxima above t: the mean over draws of the normal's tail beyond max(t, least)
     tails = special.ndtr(-np.maximum(least[None], np.asarray(thresholds, float)[:, None]))
@@ -188,15 +188,15 @@ def maxima_per_pixel(correlated: np.ndarray, thresholds: np.ndarray) -> np.ndarr
 
 
 def threshold_for(correlated: np.ndarray, maxima: float) -> float:
-    """Return the threshold with so many maxima expected per pixel."""
+    """Return the threshold with this expected number of maxima per pixel."""
     return float(
         optimize.brentq(lambda t: np.log(maxima_per_pixel(correlated, np.array([t]))[0] / maxima), *RANGE, xtol=1e-4)
     )
 
 
 def needed_indices(correlated: np.ndarray, threshold: float) -> np.ndarray:
-    """Return draws (n,) of d' less one standard normal at which the statistic, of mean d' at the damage and d' times
-    its correlation about it, just exceeds the threshold at the best of the places that are near."""
+    """Return draws (n,) of d' minus one standard normal for which the statistic just exceeds the threshold at the best
+    of the near places; its mean is d' at the damage, and d' times its correlation around it."""
     middle = len(correlated) // 2
     half = int((correlated[middle, middle:] > 0.5).sum())
     stride = min(max(1, half // AROUND), middle // (2 * AROUND))
@@ -224,10 +224,10 @@ def index_for(needed: np.ndarray, share: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class BoardView:
-    """One damaged board as the ideal observer sees it, (h, w) each. ``known``: judged pixels; ``deviation_m``: of the
-    noise; ``signals_m`` (n, h, w): signatures of the ``holes``, 0 where not known; ``surface`` (p, h, w): polynomials;
-    ``sums`` over the noise of ``units``; ``pixel_m2``: area of a pixel on the face; ``lost``: share of the pixels
-    within damage that return nothing."""
+    """One damaged board as the ideal observer sees it, (h, w) each. ``known``: judged pixels. ``deviation_m``: of the
+    noise. ``signals_m`` (n, h, w): signatures of the ``holes``, 0 where not known. ``surface`` (p, h, w): polynomials.
+    ``sums``: over the noise of ``units`` units. ``pixel_m2``: area of a pixel on the face. ``lost``: share of the
+    pixels within damage that return nothing."""
 
     board: int
     holes: tuple[str, ...]
@@ -243,9 +243,9 @@ class BoardView:
 
 @dataclass(frozen=True, eq=False)
 class IdealDamages:
-    """The ideal observer on damages, (n,) each: ``board``, ``hole``, ``index`` (d'), ``threshold`` (NaN where d' is 0)
-    and ``pod``. ``needed`` (2, n): d' at which shares of `SHARES` are found. ``units`` and excess ``kurtosis``
-    of the noise; ``lost``: greatest share of a board's damage without return."""
+    """The ideal observer on damages, (n,) each. ``index``: d'. ``threshold``: NaN if d' is 0. ``needed`` (2, n): d' at
+    which shares of `SHARES` are found. ``kurtosis``: excess, of the noise of ``units``. ``lost``: largest share of a
+    board's damage without return."""
 
     board: np.ndarray
     hole: np.ndarray

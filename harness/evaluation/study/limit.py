@@ -1,13 +1,12 @@
-"""The detection limit of one set-up: a90/95, the same over boards drawn again, and POD over diameter and depth.
+"""The detection limit of one set-up: a90/95, its bound over resampled boards, and POD over diameter and depth.
 
-The headline is the likelihood ratio bound of the hit/miss curve, the largest over models that fit about as well
-(`harness.evaluation.pod.statement.state_hits`), in which damages are the independent targets. Damages of one board are
-not quite that; beside it stands the same bound with its criterion multiplied by the boards' design effect. Where the
-a50 of boards scatters by 2 mm about 6 mm, a90/95 of the true model covers 88 % (60 boards) and 91 % (20), that bound 93
-% and 95 %; where boards do not matter both cover 95 to 97 %. The upper percentile of boards drawn again does not
-replace it: it covers 86 % with 20 boards (300 studies, ``tests/validation/study_coverage.py``). Boards, not damages,
-are what a study draws at random, so whole boards are resampled with replacement (the cluster bootstrap; Davison and
-Hinkley 1997, section 3.8)."""
+The quoted limit is the likelihood ratio bound of the hit/miss curve, the largest over models that fit about equally
+well (`harness.evaluation.pod.statement.state_hits`). It takes damages as independent targets, which damages of one
+board are not quite; so a second bound multiplies the criterion by the boards' design effect. If the a50 of boards
+scatters by 2 mm about 6 mm, a90/95 of the true model covers 88 % (60 boards) and 91 % (20), the second bound 93 % and
+95 %; if boards do not matter, both cover 95 to 97 %. The upper percentile over resampled boards does not replace it: it
+covers 86 % with 20 boards (300 studies, ``tests/validation/study_coverage.py``). A study draws boards at random, not
+damages, so whole boards are resampled with replacement (cluster bootstrap; Davison and Hinkley 1997, section 3.8)."""
 
 from __future__ import annotations
 
@@ -45,8 +44,8 @@ DRAWS = 500
 
 @dataclass(frozen=True, eq=False)
 class Targets:
-    """Damages, one a row: ``board`` (n,), ``size_mm`` (n,), ``hits`` of ``inspections`` (n,); ``unit`` (n,) of the
-    camera where each unit's inspections of a damage are a row of their own."""
+    """One damage per row. ``size_mm``: (n,). ``hits``: (n,) of ``inspections`` (n,). ``unit`` (n,): of the camera, if
+    each unit's inspections of a damage are a separate row."""
 
     board: np.ndarray
     size_mm: np.ndarray
@@ -56,7 +55,7 @@ class Targets:
 
 
 def targets_of(board: np.ndarray, hole: np.ndarray, size_mm: np.ndarray, hit: np.ndarray) -> Targets:
-    """Join rows (n,) of inspections to targets: repeats of one damage of one board are one target."""
+    """Combine rows (n,) of inspections into targets: repeats of one damage of one board are one target."""
     _, boards = np.unique(board, return_inverse=True)
     _, holes = np.unique(hole, return_inverse=True)
     _, first, which = np.unique(boards * (holes.max(initial=0) + 1) + holes, return_index=True, return_inverse=True)
@@ -71,9 +70,9 @@ def _drawn(stream: np.random.Generator, boards: int, draws: int) -> np.ndarray:
 
 
 def weights_in_blocks(draws: int, *rows: tuple[np.ndarray, str]) -> Iterator[tuple[np.ndarray, ...]]:
-    """Draw boards again, for one or several (board (n,), population): yield, in blocks of draws to bound the memory,
-    (draws, n) how often the board of each row is in each draw; alike for as many boards of a population, so that
-    set-ups are paired; two populations ("damaged", "hole-free") are drawn independently."""
+    """Resample boards for one or several (board (n,), population). Yield, in blocks of draws to limit the memory, how
+    often each draw has the board of each row, (draws, n). Draws are the same for equal numbers of boards of a
+    population, so set-ups are paired; two populations ("damaged", "hole-free") are drawn independently."""
     found = [(*np.unique(board, return_inverse=True), population) for board, population in rows]
     streams = [random_stream(0, "boards drawn again", of, len(names)) for names, _, of in found]
     at_once = max(1, CELLS // max(1, *(len(which) for _, which, _ in found)))
@@ -84,15 +83,15 @@ def weights_in_blocks(draws: int, *rows: tuple[np.ndarray, str]) -> Iterator[tup
 
 
 def refitted_sizes(targets: Targets, curve: PodCurve, pods: tuple[float, ...], draws: int = DRAWS) -> np.ndarray:
-    """Refit ``curve``'s link and axis to boards drawn again: (len(pods), draws) sizes in mm, by Firth's likelihood
-    where hits and misses part. Infinite where nothing is found or POD does not grow; smallest where everything is."""
+    """Refit ``curve``'s link and axis to resampled boards: sizes (len(pods), draws) in mm, by Firth's likelihood if
+    hits and misses are separated. Infinite if nothing is found or POD does not grow; smallest if all is found."""
     rows = [(targets.board, "damaged")] + ([] if targets.unit is None else [(targets.unit, "units")])
     blocks = (_refitted(targets, curve, pods, np.multiply.reduce(w)) for w in weights_in_blocks(draws, *rows))
     return np.concatenate(list(blocks), axis=1)
 
 
 def _refitted(targets: Targets, curve: PodCurve, pods: tuple[float, ...], weights: np.ndarray) -> np.ndarray:
-    """Refit the curve to targets under ``weights`` (draws, n)."""
+    """Refit the curve to targets with ``weights`` (draws, n)."""
     x = np.log(targets.size_mm) if curve.log_size else targets.size_mm
     centre, spread = float(x.mean()), float(x.std()) or 1.0
     z = (x - centre) / spread
@@ -116,16 +115,16 @@ def _refitted(targets: Targets, curve: PodCurve, pods: tuple[float, ...], weight
 
 
 def crossings(b: np.ndarray, link: str, pods: tuple[float, ...]) -> np.ndarray:
-    """Sizes (len(pods), draws) at which curves ``b`` (draws, 2) have these PODs; infinite where flat or unknown."""
+    """Return the sizes (len(pods), draws) at which curves ``b`` (draws, 2) have these PODs; infinite if none."""
     levels = link_ppf(link, np.array(pods))[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(b[:, 1] > 0, (levels - b[:, 0]) / b[:, 1], np.inf)
 
 
 def design_effect(targets: Targets, curve: PodCurve, pod: float) -> float:
-    """Compute the variance of the size with this POD when boards are the units over that when damages are: 1 where
-    damages of one board are no more alike than those of two. Both are sandwich variances (Liang and Zeger, Biometrika
-    73 (1986), 13) with G / (G - 1) for G units. NaN below two boards."""
+    """Return the variance of the size with this POD with boards as units over that with damages as units: 1 if damages
+    of one board are no more alike than those of two. Both are sandwich variances (Liang and Zeger, Biometrika 73
+    (1986), 13) with G / (G - 1) for G units. NaN below two boards."""
     if len(np.unique(targets.board)) < 2 or len(targets.board) < 3:
         return np.nan
     x = np.log(targets.size_mm) if curve.log_size else targets.size_mm
@@ -138,23 +137,23 @@ def design_effect(targets: Targets, curve: PodCurve, pod: float) -> float:
     influence = (design * slope[:, None]) @ np.linalg.solve(information, gradient)
     _, which = np.unique(targets.board, return_inverse=True)
     units = (np.bincount(which, influence), influence)
-    of_boards, of_targets = (float((one**2).sum() * len(one) / (len(one) - 1)) for one in units)
+    of_boards, of_targets = (float((unit**2).sum() * len(unit) / (len(unit) - 1)) for unit in units)
     return of_boards / of_targets if of_targets > 0 else np.nan
 
 
 LINKS = ("logit", "probit")
 LEAST_RATIO = 1.2
-"""Deepest over shallowest damage below which a coefficient of depth would be guesswork."""
+"""Least ratio of the deepest to the shallowest damage for which a coefficient of depth can be estimated."""
 STEPS = 25
-"""Diameters at which the depth found is drawn, in equal ratios over those inspected."""
+"""Number of diameters at which the depth found is drawn, in equal ratios over those inspected."""
 
 
 @dataclass(frozen=True, eq=False)
 class PodSurface:
-    """``b`` (4,): coefficients of 1, ln a, ln d and ln a ln d, sizes in mm, the last 0 unless its p-value,
-    ``interaction_p``, is below 5 %. ``diameter_mm``, ``d90_mm``, ``d90_low_mm``, ``d90_high_mm`` (k,): the depth found
-    90 % of the time at each diameter, infinite where depth does not help, with 95 % percentiles over boards, which hold
-    the truth in some 87 % of studies of 30 boards. ``depth_range_mm``: inspected. ``note``: what to know, or ""."""
+    """POD over diameter a and depth d. ``b`` (4,): coefficients of 1, ln a, ln d and ln a ln d, sizes in mm; the last
+    is 0 unless its p-value, ``interaction_p``, is below 5 %. ``d90_mm`` (k,): the depth found 90 % of the time at each
+    ``diameter_mm`` (k,), infinite if depth does not help. ``d90_low_mm``, ``d90_high_mm`` (k,): its 95 % percentiles
+    over boards, which hold the truth in 87 % of studies of 30 boards. ``depth_range_mm``: inspected."""
 
     link: str
     b: np.ndarray
@@ -168,7 +167,7 @@ class PodSurface:
     note: str = ""
 
     def pod(self, diameter_mm: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
-        """POD at diameters and depths of a common shape."""
+        """Return POD at diameters and depths of a common shape."""
         a, d = np.log(diameter_mm), np.log(depth_mm)
         return link_cdf(self.link, self.b[0] + self.b[1] * a + self.b[2] * d + self.b[3] * a * d)
 
@@ -179,7 +178,7 @@ def depth_varies(depth_mm: np.ndarray) -> bool:
 
 
 def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | None, str]:
-    """Fit the surface; None, and why, where there is none."""
+    """Fit the surface; None, and the reason, if there is none."""
     seen = record.inspected
     hit = seen.hit
     if not len(hit) or hit.all() or not hit.any():
@@ -196,12 +195,12 @@ def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | No
     repeats = len(hit) / len({*zip(seen.board.tolist(), seen.hole.tolist(), strict=True)})
 
     def fit(link: str, design: np.ndarray) -> tuple[float, np.ndarray, str]:
-        """Deviance, coefficients (4,) and link."""
+        """Return deviance, coefficients (4,) and link."""
         hits = hit.astype(float)
         b = _coefficients(design, hits[None], 1 - hits[None], link)[0]
         return float(-2 * HitsAndMisses(design, hits, 1 - hits, link).value(b)), np.pad(b, (0, 4 - len(b))), link
 
-    deviance, b, link = min((fit(link, crossed[:, :3]) for link in LINKS), key=lambda one: one[0])
+    deviance, b, link = min((fit(link, crossed[:, :3]) for link in LINKS), key=lambda made: made[0])
     if b[1] <= 0:
         return None, f"the probability of detection does not grow with {seen.size_of}"
     p, terms, note = np.nan, 3, "POD falls with depth" if b[2] < 0 else ""
@@ -233,7 +232,7 @@ def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | No
 def _coefficients(
     design: np.ndarray, hits: np.ndarray, misses: np.ndarray, link: str, start: np.ndarray | None = None
 ) -> np.ndarray:
-    """(draws, p) coefficients; columns are centred and scaled for the search, whose first column is the constant."""
+    """Return coefficients (draws, p). The first column is the constant; the others are scaled for the search."""
     centre, scale = design[:, 1:].mean(axis=0), design[:, 1:].std(axis=0)
     back = np.eye(design.shape[1])
     back[1:, 1:] = np.diag(1 / scale)
@@ -244,8 +243,8 @@ def _coefficients(
 
 
 def _separated(design: np.ndarray, hit: np.ndarray) -> bool:
-    """Return whether a plane parts hits from misses (Albert and Anderson, Biometrika 71 (1984), 1), by linear
-    programming: the largest sum of one-sided margins, which is 0 where hits and misses overlap."""
+    """Return whether a plane separates hits from misses (Albert and Anderson, Biometrika 71 (1984), 1), by linear
+    programming: the largest sum of one-sided margins is 0 if hits and misses overlap."""
     scaled = np.column_stack([np.ones(len(design)), (design[:, 1:] - design[:, 1:].mean(0)) / design[:, 1:].std(0)])
     signed = np.where(hit, 1.0, -1.0)[:, None] * scaled
     found = linprog(-signed.sum(axis=0), A_ub=-signed, b_ub=np.zeros(len(signed)), bounds=(-1, 1), method="highs")
@@ -253,20 +252,20 @@ def _separated(design: np.ndarray, hit: np.ndarray) -> bool:
 
 
 ALL_FOUND = int(np.ceil(np.log(1 - CONFIDENCE) / np.log(POD)))
-"""29: with a POD below 90 % as many targets are all found in less than 5 % of studies (0.9^29 = 0.047)."""
+"""29: with a POD below 90 %, this many targets are all found in less than 5 % of studies (0.9^29 = 0.047)."""
 WIDER = 1.1
-"""Boards matter where the limit over boards is larger than a90/95 by more than this factor."""
+"""Boards matter if the limit over boards exceeds a90/95 by more than this factor."""
 
 
 @dataclass(frozen=True, eq=False)
 class SetUpLimit:
-    """Sizes in mm, diameters or depths (`Inspected.limit_of`). ``statement``: curve, band and bounds from hits, None
-    where none can be fitted, and ``why``. ``a90_95``: the limit to quote; infinite where not demonstrated.
-    ``a90_draws_mm`` (B,): over boards (and units) drawn again, in one order for all set-ups of as many boards.
-    ``over_boards``: a90/95 were damages of one board as alike as the data say. Where everything is found the estimates
-    are the smallest size inspected, which they do not exceed; where nothing is, or POD does not grow with size, they
-    are NaN and their draws infinite. ``beside``: findings on damaged boards that count for no damage.
-    ``size_error_mm``: median error of the size of hits ``sized`` by a model. ``seconds_detect``: median a cloud."""
+    """Sizes in mm, diameters or depths (`Inspected.limit_of`). ``statement``: curve, band and bounds from hits; None if
+    no curve can be fitted, and ``why``. ``a90_95``: the limit to quote; infinite if not demonstrated. ``a90_draws_mm``
+    (B,): over resampled boards (and units), in one order for all set-ups with equally many boards. ``over_boards``:
+    a90/95 with the measured similarity of damages of one board. If everything is found, the estimates are upper bounds:
+    the smallest size inspected. If nothing is, or POD does not grow with size, they are NaN and their draws infinite.
+    ``beside``: findings on damaged boards that match no damage. ``size_error_mm``: median error of the size of the
+    ``sized`` hits that a model measured. ``seconds_detect``: median per cloud."""
 
     record: SetUpRecord
     statement: PodStatement | None
@@ -294,22 +293,22 @@ class SetUpLimit:
 
     @property
     def is_at_most(self) -> bool:
-        """Return whether ``a50_mm`` and ``a90_mm`` are sizes that both do not exceed, everything having been found."""
+        """Return whether everything was found, so that ``a50_mm`` and ``a90_mm`` are upper bounds."""
         return self.statement is None and bool(np.isfinite(self.a90_mm))
 
     def beyond(self, size_mm: float) -> bool:
-        """Return whether a size lies beyond ``largest_mm``, where the curve alone speaks of it."""
+        """Return whether a size lies beyond ``largest_mm``, where only the curve gives a POD."""
         return bool(size_mm > self.largest_mm)
 
     @property
     def boards_matter(self) -> bool:
-        """Return whether the limit over boards is more than 10 % above a90/95 by a known design effect."""
+        """Return whether the limit over boards exceeds a90/95 by more than 10 %, with a known design effect."""
         return bool(np.isfinite(self.design_effect) and self.over_boards.value > WIDER * self.a90_95.value)
 
 
 def limit_of(record: SetUpRecord, *, draws: int = DRAWS, tested: bool = False) -> SetUpLimit:
-    """Judge ``record``. ``tested``: for a floor and a ceiling too, with a note. Deterministic. Data without a curve are
-    no error: ``why``."""
+    """Return the limit of ``record``. ``tested``: whether to test for a floor and a ceiling, with a note.
+    Deterministic. Data without a curve are not an error: ``why`` gives the reason."""
     seen = record.inspected
     targets = targets_of(seen.board, seen.hole, seen.size_mm, seen.hit)
     statement: PodStatement | None = None
@@ -334,15 +333,15 @@ def limit_of(record: SetUpRecord, *, draws: int = DRAWS, tested: bool = False) -
         over_boards = a90_95
         if statement.fits[0].method == "ML":
             effects = [design_effect(targets, fit.curve, POD) for fit in statement.fits]
-            effect, at_least_one = effects[0], [max(1.0, one) for one in effects]
+            effect, at_least_one = effects[0], [max(1.0, each) for each in effects]
             if max(at_least_one) > 1:
                 over_boards = largest_bound(statement.fits, at_least_one)
         if apart.unit is not None:
             rows = (apart.size_mm, seen.hit, target_names(seen), apart.unit)
             units = over_units(*rows, statement.curve, over_boards)
     elif n and seen.hit.all():
-        # Were the POD of the 29th smallest target below 90 %, so would those of the 28 smaller ones be, and all 29
-        # would be found in less than 5 % of studies. So a90 lies below its size, with no assumption but that POD grows.
+        # If the POD of the 29th smallest target were below 90 %, so would that of the 28 smaller ones, and all 29
+        # would be found in less than 5 % of studies. So a90 lies below its size, provided that POD grows with size.
         a50 = a90 = float(targets.size_mm.min())
         a90_95 = _all_found(targets.size_mm, "targets")
         smallest = [targets.size_mm[targets.board == board].min() for board in np.unique(targets.board)]
@@ -362,12 +361,12 @@ def limit_of(record: SetUpRecord, *, draws: int = DRAWS, tested: bool = False) -
 
 
 def target_names(seen: Inspected) -> np.ndarray:
-    """Name (n,) what each row inspects: repeats of one damage of one board have the same name."""
+    """Return a name (n,) for what each row inspects; repeats of one damage of one board share it."""
     return np.array([f"{board}:{hole}" for board, hole in zip(seen.board, seen.hole, strict=True)], dtype=str)
 
 
 def _false_calls(runs: Unflawed | None, draws: int, population: str) -> tuple[FalseCallRate | None, Interval]:
-    """The rate of false calls in runs, and its interval over boards; unknown without runs or calls."""
+    """Return the rate of false calls in runs, and its interval over boards; unknown without runs or calls."""
     if runs is None or not len(runs.board):
         return None, UNKNOWN
     rate = false_call_rate(int(runs.calls.sum()), float(runs.area_m2.sum()))

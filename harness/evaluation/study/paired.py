@@ -1,6 +1,6 @@
-"""Comparison of two set-ups by hits, a90, signals and false calls. Boards are the units: damages of one board share its
-render, its pose and its surface. The tests of hits and limits do not know that each set-up drew its own calibration of
-the threshold; those of signals and of false calls do. The first of two one-sided p values is for being worse."""
+"""Comparison of two set-ups by hits, a90, signals and false calls. Boards are the units, because damages of one board
+share its render, its pose and its surface. The tests of hits and limits ignore that each set-up drew its own
+calibration of the threshold; those of signals and false calls do not. The first of two p-values means worse."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ Tails = tuple[float, float]
 
 @dataclass(frozen=True)
 class HitsChange:
-    """Hits of two set-ups on the same inspections, ``inspections`` of them on ``boards``. ``only_first``,
-    ``only_second``: found by one alone. ``fewer_p``, ``more_p``: one-sided sign-flip test over boards: the chance of so
-    few (many) hits of the second if each board's two sums of hits might as well be exchanged."""
+    """Hits of two set-ups on the same ``inspections`` of ``boards``. ``only_first``, ``only_second``: found by only
+    one. ``fewer_p``, ``more_p``: one-sided sign-flip test over boards: the probability of so few (many) hits of the
+    second if each board's two sums of hits are exchangeable."""
 
     boards: int
     inspections: int
@@ -32,7 +32,7 @@ class HitsChange:
 
 
 def hits_change(first: Inspected, second: Inspected) -> HitsChange | None:
-    """Compare hits on the inspections (board, hole, repeat) that both have; None where there are none."""
+    """Compare hits on the inspections (board, hole, repeat) that both have; None if there are none."""
     one, two = shared_rows(first, second)
     if not len(one):
         return None
@@ -52,25 +52,25 @@ def shared_rows(first: Inspected, second: Inspected) -> tuple[np.ndarray, np.nda
 
 
 def sign_flip(gained: np.ndarray) -> Tails:
-    """(P(sum <= observed), P(sum >= observed)) of integer differences (n,) whose signs are tossed: Fisher's
-    randomisation test for pairs, exact, by building the distribution of the sum up board by board."""
-    chance = np.ones(1)  # of the sum of those that come out positive
+    """Return (P(sum <= observed), P(sum >= observed)) of integer differences (n,) with random signs: Fisher's
+    randomisation test for pairs. It is exact: the distribution of the sum is built up board by board."""
+    chance = np.ones(1)  # of the sum of the differences with a positive sign
     for size in np.abs(gained[gained != 0]).tolist():
         chance = 0.5 * (np.pad(chance, (0, size)) + np.pad(chance, (size, 0)))
     return _tails(chance, int(gained[gained > 0].sum()))
 
 
 def _tails(chance: np.ndarray, observed: int) -> Tails:
-    """Return (P(<= observed), P(>= observed)) of a distribution over 0, 1, ..."""
+    """Return (P(<= observed), P(>= observed)) for a distribution over 0, 1, ..."""
     return min(1.0, float(chance[: observed + 1].sum())), min(1.0, float(chance[observed:].sum()))
 
 
 @dataclass(frozen=True)
 class LimitChange:
-    """a90 of the second set-up over and less that of the first. ``interval_mm``: 95 % percentiles of the difference
-    over boards drawn again, alike where ``paired``. ``grown_p``, ``shrunk_p``: one-sided, by Student's t of the
-    change's logarithm over its deviation in paired draws; unpaired, or where many draws have no a90, the share of draws
-    in which it has not grown (shrunk)."""
+    """Ratio and difference of the second set-up's a90 to the first's. ``interval_mm``: 95 % percentiles of the
+    difference over resampled boards, the same for both if ``paired``. ``grown_p``, ``shrunk_p``: one-sided, by
+    Student's t of the change's logarithm over its deviation in paired draws. If unpaired, or if many draws have no a90,
+    they are the share of draws in which it has not grown (shrunk)."""
 
     ratio: float
     difference_mm: float
@@ -81,18 +81,18 @@ class LimitChange:
 
 
 KNOWN = 0.9
-"""Share of draws with an a90 from which their deviation is taken as that of the change."""
+"""Least share of draws with an a90 whose deviation counts as that of the change."""
 
 
 def limit_change(first: SetUpLimit, second: SetUpLimit, same_boards: bool) -> LimitChange:
-    """Compare two a90 by boards drawn again. ``same_boards``: of equal damage; paired if both saw the same."""
+    """Compare two a90 by resampled boards. ``same_boards``: boards with equal damage; paired if both saw the same."""
     one, two = first.a90_draws_mm, second.a90_draws_mm
     boards = [np.unique(limit.record.inspected.board) for limit in (first, second)]
     paired = same_boards and bool(np.array_equal(boards[0], boards[1])) and len(one) == len(two)
-    with np.errstate(invalid="ignore"):  # infinite less infinite gives NaN, no evidence either way
+    with np.errstate(invalid="ignore"):  # infinity minus infinity is NaN: no evidence
         differences = two - one if paired else (two[:, None] - one[None, :]).ravel()
     tie = 0.5 * float(np.mean(np.isnan(differences) | (differences == 0)))
-    weight = 1.0 / (1 + len(one)) if paired else 0.0  # no share of so few draws is evidence below this
+    weight = 1.0 / (1 + len(one)) if paired else 0.0  # the least p-value that so few draws can support
     shares = (float(np.mean(differences < 0)) + tie, float(np.mean(differences > 0)) + tie)
     grown, shrunk = ((1 - weight) * share + weight for share in shares)
     before, now = first.a90_mm, second.a90_mm
@@ -105,13 +105,14 @@ def limit_change(first: SetUpLimit, second: SetUpLimit, same_boards: bool) -> Li
 
 
 SAME = 1e-6
-"""Relative difference of the same threshold between machines."""
+"""Relative difference of equal thresholds between machines."""
 
 
 @dataclass(frozen=True)
 class SignalChange:
-    """Median change, a factor ``ratio``, of ``damages``' signals over the signal from which they are found
-    (``found_from``: first, second). ``error`` of its logarithm, over boards and calibrations; p one-sided, normal."""
+    """Change of the signals of ``damages``, each divided by the least signal that is found (``found_from``: first,
+    second). ``ratio``: median, as a factor. ``error``: of its logarithm, over boards, calibrations. p: one-sided,
+    normal."""
 
     damages: int
     ratio: float
@@ -122,9 +123,9 @@ class SignalChange:
 
 
 def signal_change(first: SetUpRecord, second: SetUpRecord) -> SignalChange | None:
-    """Compare signals on the inspections that both have. It is more sensitive than hits: signals change with all of the
-    noise and the threshold, hits only near the limit. Damages count whose two signals, each over what is needed, exceed
-    1 in the geometric mean: smaller ones are noise. None where fewer than two boards have any, or for two detectors."""
+    """Compare signals on the inspections that both have. This is more sensitive than hits: signals change with all
+    noise and with the threshold, hits only near the limit. A damage counts if the geometric mean of its two signals,
+    each over ``found_from``, exceeds 1; smaller signals are noise. None for two detectors or fewer than two boards."""
     one, two = shared_rows(first.inspected, second.inspected)
     if first.detector != second.detector or not len(one):
         return None
@@ -150,8 +151,8 @@ def signal_change(first: SetUpRecord, second: SetUpRecord) -> SignalChange | Non
 
 
 def found_from(seen: Inspected) -> float:
-    """Find the signal that separates hits from misses with the fewest exceptions, midway between its two neighbours:
-    the threshold as it acts. Hits by missing returns alone do not count; NaN without any signal."""
+    """Return the effective threshold: the signal that separates hits from misses with the fewest exceptions, midway
+    between its neighbours. Hits by missing returns alone do not count; NaN without any signal."""
     hit = seen.hit if seen.by_depth is None else seen.by_depth
     known = np.flatnonzero(seen.signal > 0)
     if not len(known):
@@ -164,8 +165,8 @@ def found_from(seen: Inspected) -> float:
 
 
 def _threshold_error(record: SetUpRecord) -> float:
-    """Return the standard error of a calibrated threshold's logarithm: half the distance of the scores one standard
-    deviation of its rank above and below (Woodruff, J. American Statistical Association 47 (1952), 635)."""
+    """Return the standard error of a calibrated threshold's logarithm: half the distance between the scores one
+    standard deviation of its rank above and below (Woodruff, J. American Statistical Association 47 (1952), 635)."""
     if record.calibrated is None or len(record.calibrated.score) < 2:
         return 0.0
     falling = np.sort(np.maximum(record.calibrated.score, 1e-9))[::-1]
@@ -177,9 +178,10 @@ def _threshold_error(record: SetUpRecord) -> float:
 
 @dataclass(frozen=True)
 class CallsChange:
-    """``calls`` on ``areas_m2`` of hole-free boards, ``calling`` of ``boards`` with a call (first repeat of each), each
-    (first, second). ``more_p``, ``fewer_p``: one-sided, by ``way``: signs of boards tossed (same frames and threshold),
-    two draws of the calibration (different frames), or the larger of both."""
+    """False calls, each as (first, second): ``calls`` on ``areas_m2`` of hole-free boards, and ``calling`` of
+    ``boards`` with a call in their first repeat. ``more_p``, ``fewer_p``: one-sided. ``way``: "signs", the signs of
+    boards are randomised (same frames and threshold); "calibrations", two draws of the calibration (different frames);
+    "both", the larger p."""
 
     calls: tuple[int, int]
     areas_m2: tuple[float, float]
@@ -196,26 +198,26 @@ class CallsChange:
 
     @property
     def ratio(self) -> float:
-        """The second rate over the first: infinite where only the second has calls, 1 where neither has."""
+        """The second rate over the first: infinite if only the second has calls, 1 if neither has."""
         before, now = self.rates_per_m2
         return now / before if before else (np.inf if now else 1.0)
 
 
 def calls_change(first: SetUpRecord, second: SetUpRecord, wanted_per_m2: float | None) -> CallsChange | None:
-    """Compare false calls of two set-ups whose thresholds were each calibrated on hole-free boards of their own. Two
-    honest calibrations for one rate give two different true rates (Beta distributed, Wilks 1941): a test of two Poisson
-    counts is called at 5 % in 20 % of honest pairs with 240 boards each. So each gets its own draw of that
-    distribution. On identical frames with the same threshold the signs of each board's difference are tossed, which
-    shows smaller changes; where anything moved the threshold on identical frames, both tests must agree. None where
-    either has no hole-free board. ``wanted_per_m2``: None without a wanted rate."""
+    """Compare false calls of two set-ups whose thresholds were calibrated on hole-free boards of their own. Two correct
+    calibrations for one rate give two different true rates (Beta distributed, Wilks 1941): at a level of 5 %, a test of
+    two Poisson counts rejects 20 % of equal pairs with 240 boards each. So each set-up gets its own draw of that
+    distribution. On identical frames with the same threshold, the signs of each board's difference are randomised,
+    which shows smaller changes; if the threshold differs on identical frames, both tests must agree. None if either
+    set-up has no hole-free board. ``wanted_per_m2``: None without a wanted rate."""
     one, two = first.unflawed, second.unflawed
     areas = (float(one.area_m2.sum()), float(two.area_m2.sum()))
     if not min(areas) > 0:
         return None
     calls = (int(one.calls.sum()), int(two.calls.sum()))
     (boards_1, calling_1), (boards_2, calling_2) = _calling(one), _calling(two)
-    # scores on identical frames are alike if the calibration took the same number for threshold, which two scorings do
-    # by chance only where scores are few whole numbers; a given threshold had no luck
+    # on identical frames, an equal calibrated threshold means equal scores: two scorings give the same number by chance
+    # only if scores are few whole numbers; a given threshold has no scatter
     given = not (first.calibration_runs or second.calibration_runs)
     way: Literal["signs", "calibrations", "both"] = "both"
     if first.frames_digest != second.frames_digest:
@@ -230,7 +232,7 @@ def calls_change(first: SetUpRecord, second: SetUpRecord, wanted_per_m2: float |
     if way != "signs":
         total = calling_1 + calling_2
         ranks = _rank(first, wanted_per_m2), _rank(second, wanted_per_m2)
-        of_second = np.arange(total + 1)  # how many of all boards that called are the second's
+        of_second = np.arange(total + 1)  # number of the second's boards among all that called
         if ranks[0] is None or ranks[1] is None:
             chance = hypergeom.pmf(of_second, boards_1 + boards_2, total, boards_2)
         else:
@@ -244,13 +246,13 @@ def calls_change(first: SetUpRecord, second: SetUpRecord, wanted_per_m2: float |
 
 
 def _calling(table: Unflawed) -> tuple[int, int]:
-    """Return (boards, those that called) in the first repeat of each: repeats of one board are not independent."""
+    """Return (boards, boards with a call) in the first repeat of each: repeats of one board are not independent."""
     first = table.repeat == table.repeat.min()
     return int(first.sum()), int((table.calls[first] > 0).sum())
 
 
 def _rank(record: SetUpRecord, wanted_per_m2: float | None) -> tuple[int, int] | None:
-    """Return (r, n + 1 - r): the threshold is the r-th highest of n calibration scores; None where it was given."""
+    """Return (r, n + 1 - r): the threshold is the r-th highest of n calibration scores; None if it was given."""
     n = record.calibration_runs
     if not n:
         return None

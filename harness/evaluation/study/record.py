@@ -1,4 +1,4 @@
-"""The record of a study: every inspection of every set-up, by itself enough for limits and comparisons. It is stored as
+"""The record of a study: every inspection of every set-up, which suffices for limits and comparisons. It is stored as
 ``study.json`` in a result folder and as the baseline of a gate; the classes here declare, check and write the file."""
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from harness.vocabulary.path_names import in_words
 from harness.vocabulary.provenance import check_version
 
 RECORD_VERSION = 2
-"""1: hits by depth alone. Raised when a field's meaning, or what counts as a hit, changes."""
+"""1: hits by depth alone. Increased when the meaning of a field, or of a hit, changes."""
 OLDEST_VERSION = 1
-"""Still read: where nothing is lost by missing returns its hits are those of today."""
+"""Still read: if no damage is found only by missing returns, its hits are those of today."""
 LEGAL = "a study.json, or a baseline that python -m harness.check --update wrote"
 AGAIN = "run the study again, which rewrites the file; do not edit it by hand"
 
@@ -68,7 +68,7 @@ def _one_table(table: Any) -> Any:
 
 
 def _no_set_up_twice(set_ups: tuple[SetUpRecord, ...]) -> tuple[SetUpRecord, ...]:
-    names = [(one.variant, one.frames) for one in set_ups]
+    names = [(set_up.variant, set_up.frames) for set_up in set_ups]
     for variant, frames in names:
         if names.count((variant, frames)) > 1:
             raise ValueError(f"set-up {variant!r} with frames {frames} occurs twice")
@@ -95,10 +95,10 @@ FORM = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 @dataclass(frozen=True, eq=False)
 class Inspected:
-    """Inspections of damage, one a row: each damage of each board for every repeat of the noise. True: ``diameter_mm``
-    (of long damage the width or length that ``size_of`` names), ``depth_mm`` removed, ``x_mm``, ``y_mm`` on the board.
-    ``signal`` (n,): the highest score within the hit radius, NaN where no pixel there was judged. ``by_depth``,
-    ``by_no_return`` (n,) bool: hits by each kind of finding; None where hits were counted by depth alone."""
+    """Inspections of damage, one per row: each damage of each board for every repeat of the noise. True values:
+    ``diameter_mm`` (of long damage the width or length, as ``size_of`` says), ``depth_mm`` removed, ``x_mm``, ``y_mm``
+    on the board. ``signal`` (n,): the highest score within the hit radius; NaN if no pixel there was judged.
+    ``by_depth``, ``by_no_return`` (n,) bool: hits by each kind of finding; None if hits were counted by depth alone."""
 
     __pydantic_config__ = FORM
     board: Counts
@@ -116,7 +116,7 @@ class Inspected:
 
     @property
     def limit_of(self) -> str:
-        """Name the size of limits: the depth where damage of one diameter (width, length) differs in it, else that."""
+        """The name of the limits' size: depth if only depth varies, else diameter, width or length."""
         one_diameter = len(self.hit) > 0 and np.ptp(self.diameter_mm) == 0
         return "depth" if one_diameter and 0 < self.depth_mm.min() < self.depth_mm.max() else self.size_of
 
@@ -128,8 +128,8 @@ class Inspected:
 
 @dataclass(frozen=True, eq=False)
 class Unflawed:
-    """Runs on boards of one kind that set no threshold, hole-free or damaged, (m,) each: false ``calls`` on ``area_m2``
-    of judged face; ``no_return_calls``: calls without return among them, or None."""
+    """Runs on boards of one kind, hole-free or damaged, that set no threshold, (m,) each. ``calls``: false calls on
+    ``area_m2`` of judged face. ``no_return_calls``: those without return among them, or None."""
 
     __pydantic_config__ = FORM
     board: Counts
@@ -141,8 +141,8 @@ class Unflawed:
 
 @dataclass(frozen=True, eq=False)
 class Calibrated:
-    """Hole-free runs that set a threshold: ``board``, ``repeat`` (k,) int; ``score`` (k,): of the highest pixel, above
-    which the run has no finding; ``x_mm``, ``y_mm`` (k,): where that pixel lies on the board, NaN where off it;
+    """Hole-free runs that set a threshold: ``board``, ``repeat`` (k,) int. ``score`` (k,): of the highest pixel; above
+    it, the run has no finding. ``x_mm``, ``y_mm`` (k,): place of that pixel on the board, NaN if it is off the board.
     ``u_px``, ``v_px`` (k,): its column and row on the sensor, or None."""
 
     __pydantic_config__ = FORM
@@ -157,12 +157,12 @@ class Calibrated:
 
 @dataclass(frozen=True, eq=False)
 class SetUpRecord:
-    """One set-up at one number of frames. ``axes``: by dotted path, without frames. ``threshold`` in the detector's
-    units, ``threshold_mm`` NaN where it has no scale; ``calibration_runs`` hole-free runs on boards of their own set it
-    (0: given). ``failed``: trials that raised. ``targets_digest`` names boards and damage, ``frames_digest`` those with
-    camera, noise seed and simulating code. ``calibrated``, ``beside``: what calibration runs found, and runs on the
-    damaged boards, where kept. Of more than one of ``units``, repeat r of a damaged board is before unit r modulo
-    ``units``, and every other board before a unit of its own."""
+    """One set-up at one number of frames. ``axes``: by dotted path, without frames. ``threshold``: in the detector's
+    units; ``threshold_mm``: NaN without a scale. ``calibration_runs``: number of hole-free runs on separate boards that
+    set it (0: given). ``failed``: trials that raised. ``targets_digest``: identifies boards and damage;
+    ``frames_digest``: also camera, noise seed and simulating code. ``calibrated``, ``beside``: findings of calibration
+    runs, and of runs on the damaged boards, if kept. ``units``: if more than one, repeat r of a damaged board shows
+    unit r modulo ``units``, and every other board has a unit of its own."""
 
     __pydantic_config__ = FORM
     variant: Name
@@ -191,8 +191,8 @@ class SetUpRecord:
 
 @dataclass(frozen=True, eq=False)
 class StudyRecord:
-    """A whole study. ``hit_radius_mm``, ``hit_overlap`` (None: not asked): what counts as a hit. The thresholds' rate
-    ``false_calls_per_m2`` is None where they were given. ``provenance``: commit, dirty, versions, seed."""
+    """A whole study. ``hit_radius_mm``, ``hit_overlap`` (None: not used): the rule for a hit. ``false_calls_per_m2``:
+    the thresholds' rate; None if they were given. ``provenance``: commit, dirty, versions, seed."""
 
     __pydantic_config__ = FORM
     name: Name
@@ -206,7 +206,7 @@ class StudyRecord:
     @property
     def hit_rule(self) -> str:
         """Rule for a hit, as the end of a sentence that begins with a damage."""
-        long = any(one.inspected.size_of != "diameter" for one in self.set_ups)
+        long = any(set_up.inspected.size_of != "diameter" for set_up in self.set_ups)
         of = "its centre line" if long else "its own" if self.hit_overlap is None else "its centre"
         rule = f"where the centre of a finding lies within {self.hit_radius_mm:.3g} mm of {of}"
         if self.hit_overlap is None:
@@ -215,22 +215,22 @@ class StudyRecord:
         return f"{rule}, or at least {share} of a finding's pixels lie on it or 2 pixels beside it"
 
     def to_data(self) -> dict[str, Any]:
-        """Return JSON's types; NaN becomes None, and a column or table that is None is left out."""
+        """Return the record as JSON's types; NaN becomes None, and a column or table that is None is left out."""
         data = TypeAdapter(StudyRecord).dump_python(self, mode="json", exclude_none=True)
         return {"record_version": RECORD_VERSION, "false_calls_per_m2": None, **data}
 
 
 def record_text(record: StudyRecord) -> str:
-    """Write the record as JSON text, one set-up a line, so that a changed baseline reads as a change of few lines."""
+    """Return the record as JSON text with one set-up per line, so that a changed baseline differs in few lines."""
     data = record.to_data()
-    lines = ",\n  ".join(json.dumps(one, sort_keys=True) for one in data.pop("set_ups"))
+    lines = ",\n  ".join(json.dumps(set_up, sort_keys=True) for set_up in data.pop("set_ups"))
     head = json.dumps(data, sort_keys=True, indent=1)[:-2]
     return f'{head},\n "set_ups": [\n  {lines}\n ]\n}}\n'
 
 
 def read_record(path: Path) -> StudyRecord:
-    """Read the record at ``path``: a file, or a result folder with its ``study.json``. Raises UserError where there is
-    none, where it is not a record or is damaged (with set-up and field), and where it is of another version."""
+    """Read the record at ``path``: a file, or a result folder with its ``study.json``. Raises UserError if there is
+    none, if it is not a record or is damaged (with set-up and field), and if it has another version."""
     file = Path(path) / "study.json" if Path(path).is_dir() else Path(path)
     try:
         data = strict_json(bounded_bytes(file, RECORD_BYTES), nan=True)  # NaN is allowed in the record's columns
@@ -249,7 +249,7 @@ def read_record(path: Path) -> StudyRecord:
 
 
 def set_up_named(study: StudyRecord, name: str | None) -> SetUpRecord:
-    """Return the set-up with this label, or the only one. Raises UserError where there is none, or none is named."""
+    """Return the set-up with this label, or the only one. Raises UserError if there is none, or none is named."""
     by_label = {record.label: record for record in study.set_ups}
     name, known = name or (next(iter(by_label)) if len(by_label) == 1 else None), "; ".join(by_label)
     if name is None:
@@ -266,8 +266,8 @@ def _mistake(error: ValidationError, data: Any) -> str:
     first, *others = error.errors(include_url=False)
     path = [part for part in first["loc"] if not str(part).startswith(("float", "none"))]
     where, value = ".".join(map(str, path)), first.get("input")
-    if path[:1] == ["set_ups"] and len(path) > 1 and isinstance(one := data["set_ups"][path[1]], dict):
-        where += f" (set-up {one.get('variant')}, frames {one.get('frames')})"
+    if path[:1] == ["set_ups"] and len(path) > 1 and isinstance(set_up := data["set_ups"][path[1]], dict):
+        where += f" (set-up {set_up.get('variant')}, frames {set_up.get('frames')})"
     given = f", not {shown(value)}" if value is None or isinstance(value, str | int | float) else ""
     text = str(first.get("ctx", {}).get("error", first["msg"])).partition(" or an instance of")[0]
     return f"{where}: {text}{given}" + (f"; and {len(others)} more" if others else "")

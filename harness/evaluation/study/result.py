@@ -1,6 +1,6 @@
-"""A whole study judged: every set-up's limit and curves, limits against each swept axis, and the limits of validity.
+"""The evaluation of a whole study: every set-up's limit and curves, limits along each swept axis, and their validity.
 
-Intervals of ratios are a little narrow: 8 to 9 % of those of equal set-ups leave out 1 (60 and 20 boards of 8)."""
+Intervals of ratios are slightly narrow: 8 to 9 % of those of equal set-ups exclude 1 (60 and 20 boards of 8)."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ FRAMES = "capture.frames"
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """a90 of ``to`` over that of ``frm``, with its 95 % interval over boards; ``paired``: judged on the same boards;
-    ``beyond_chance``: the interval leaves out 1. Infinite draws of both are left out."""
+    """Ratio of ``to``'s a90 to ``frm``'s, with its 95 % interval over boards, without draws that are infinite for both.
+    ``paired``: judged on the same boards. ``beyond_chance``: the interval excludes 1."""
 
     frm: SetUpLimit
     to: SetUpLimit
@@ -43,8 +43,8 @@ class Difference:
 
 @dataclass(frozen=True, eq=False)
 class AxisLine:
-    """Set-ups that differ in ``axis`` (a dotted path) alone: ``values`` and ``limits`` in ascending order, text as
-    declared; ``held``: the other axes; ``steps``: from each to the next; ``numeric``: can be drawn to scale."""
+    """Set-ups that differ only in ``axis`` (a dotted path). ``held``: the other axes. ``values`` and ``limits``:
+    ascending, text in the declared order. ``steps``: from each to the next. ``numeric``: can be drawn to scale."""
 
     axis: str
     held: Mapping[str, Any]
@@ -55,7 +55,7 @@ class AxisLine:
 
 
 def axis_lines(limits: Sequence[SetUpLimit]) -> tuple[AxisLine, ...]:
-    """Find every line of two set-ups or more, axis by axis; frames last."""
+    """Return every line of two or more set-ups, axis by axis; frames last."""
     places = [{**limit.record.axes, FRAMES: limit.record.frames} for limit in limits]
     lines = []
     for axis in dict.fromkeys(name for place in places for name in place):
@@ -80,7 +80,7 @@ def axis_lines(limits: Sequence[SetUpLimit]) -> tuple[AxisLine, ...]:
 
 
 def difference(frm: SetUpLimit, to: SetUpLimit) -> Difference:
-    """Compare a90 of two set-ups: paired where both have the same boards and damage, none missing by failed trials."""
+    """Compare a90 of two set-ups: paired if both have the same boards and damage, and no failed trials."""
     a, b = frm.record.inspected, to.record.inspected
     paired = all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("board", "hole", "x_mm", "y_mm"))
     before, after = frm.a90_draws_mm, to.a90_draws_mm
@@ -106,14 +106,14 @@ KINDS = {
 SIZES = {"diameter_mm": "in diameter", "length_mm": "long", "width_mm": "wide", "depth_mm": "deep"}
 NEARLY = f"deviance is at most {NEAR_DEVIANCE:g} above the least"
 RISE = (0.05, 0.95)
-"""POD between which the curve rises; sizes should reach past both, or the curve is known from one side."""
+"""POD between which the curve rises; sizes should reach beyond both, else only one side of the curve is known."""
 
 
 def validity_of(
     record: StudyRecord, limits: Sequence[SetUpLimit], chances: Sequence[ChanceHits | None], facts: Mapping[str, Any]
 ) -> tuple[Section, ...]:
-    """State headings with their sentences. ``facts``: the resolved experiment as plain data (``source``, ...)."""
-    radius, largest = record.hit_radius_mm, max((one.largest_mm for one in limits), default=np.nan)
+    """Return headings with their sentences. ``facts``: the resolved experiment as plain data (``source``, ...)."""
+    radius, largest = record.hit_radius_mm, max((limit.largest_mm for limit in limits), default=np.nan)
     counted = "closest pairs first, each finding for one damage at most; fixed beforehand, the same for all sizes"
     hits = [f"A damage is hit {record.hit_rule} ({counted})."]
     if record.hit_overlap is not None:
@@ -139,7 +139,7 @@ def _span(low: float, high: float) -> str:
 
 
 def _inspected(limits: Sequence[SetUpLimit], sweep: Mapping[str, Sequence[Any]]) -> tuple[str, ...]:
-    """Sizes, depths and boards, where all set-ups have them in common, else set-up by set-up; and the axes."""
+    """Return sizes, depths and boards, together if all set-ups share them, else by set-up; and the axes."""
     reasons: dict[str, list[str]] = {}
     for limit in limits:
         seen = limit.record.inspected
@@ -158,9 +158,9 @@ def _inspected(limits: Sequence[SetUpLimit], sweep: Mapping[str, Sequence[Any]])
 def _departures(
     limits: Sequence[SetUpLimit], chances: Sequence[ChanceHits | None], facts: Mapping[str, Any]
 ) -> tuple[str, ...]:
-    a_board = max((one.targets / one.boards for one in limits if one.boards), default=1.0)
-    # Unflawed places are where damage could have been drawn, on hole-free boards.
-    places = [one.sites / limit.targets for limit, one in zip(limits, chances, strict=True) if one and limit.targets]
+    a_board = max((limit.targets / limit.boards for limit in limits if limit.boards), default=1.0)
+    # Unflawed places are places of drawn damage on hole-free boards.
+    places = [each.sites / limit.targets for limit, each in zip(limits, chances, strict=True) if each and limit.targets]
     fewest_places, failed = min(places, default=np.inf), sum(limit.record.failed for limit in limits)
     chosen = any(limit.statement is not None for limit in limits)
     all_found = any(limit.statement is None and limit.a90_95.demonstrated for limit in limits)
@@ -171,8 +171,8 @@ def _departures(
     independent = "a90/95 takes them as independent; the bound with their design effect stands beside it"
     counted = "and count once each, the criterion of a90/95 scaled by the number of inspections"
     rules = (
-        (simulated, "Boards and camera are simulated. The handbook speaks of real flaws and the real system."),
-        (a_board > 1, f"Targets share boards, {a_board:.3g} to a board. {independent} (Rao and Scott 1984)."),
+        (simulated, "Boards and camera are simulated. The handbook demands real flaws and the real system."),
+        (a_board > 1, f"Targets share boards, {a_board:.3g} per board. {independent} (Rao and Scott 1984)."),
         (repeated, f"Targets were inspected more than once with new noise {counted}."),
         (
             units > 1,
@@ -209,14 +209,14 @@ def _sizes_miss_the_rise(limit: SetUpLimit) -> tuple[tuple[bool, str], ...]:
 
 
 def _one_kind(facts: Mapping[str, Any]) -> str:
-    """The kind of all damage drawn; empty where nothing is drawn or an axis varies the damage."""
+    """Return the kind of all damage drawn; empty if nothing is drawn or an axis varies the damage."""
     kind = facts.get("source", {}).get("target", {}).get("damage", {}).get("kind", "")
     varied = any("source.target.damage.kind".startswith(axis) for axis in facts.get("sweep") or {})
     return kind if kind in KINDS and not varied else ""
 
 
 def _damage_words(facts: Mapping[str, Any]) -> str:
-    """All damage as ``gouges 60 mm long, 10 mm wide``: its kind, and the sizes that are the same everywhere."""
+    """Return all damage as ``gouges 60 mm long, 10 mm wide``: its kind, and the sizes that are the same everywhere."""
     kind, sweep = _one_kind(facts), facts.get("sweep") or {}
     if not kind:
         return ""
@@ -266,14 +266,14 @@ CONDITIONS = (
 
 
 def conditions_of(facts: Mapping[str, Any], inspected: int | None = None) -> str:
-    """Return the conditions common to all set-ups in one line, damage first; ``inspected``: damages that were seen."""
+    """Return the conditions common to all set-ups in one line, damage first. ``inspected``: damages in view."""
     conditions = [words] if (words := _damage_words(facts)) else []
     for path, words in CONDITIONS:
         value: Any = facts
         for key in path.split("."):
             value = value.get(key) if isinstance(value, Mapping) else None
         varied = any(path.startswith(axis) for axis in facts.get("sweep") or {})
-        known = words.startswith("threshold") and any(one.startswith("threshold") for one in conditions)
+        known = words.startswith("threshold") and any(text.startswith("threshold") for text in conditions)
         if value is not None and not varied and not known:
             text = words.format(camera_title(value) if isinstance(value, str) else value)
             conditions.append(text.replace(" 1 false calls", " 1 false call"))
@@ -286,8 +286,8 @@ def conditions_of(facts: Mapping[str, Any], inspected: int | None = None) -> str
 
 @dataclass(frozen=True, eq=False)
 class SetUpResult:
-    """One set-up: ``limit``; ``chance`` hits (None: nothing to lay them over); ``roc``, ``free_response``, ``pixels``
-    (None where not counted); ``surface`` over diameter and depth, or ``surface_why`` there is none."""
+    """One set-up. ``chance``: None if there are no other boards to compare. ``roc``, ``free_response``, ``pixels``:
+    None if not counted. ``surface``: over diameter and depth, or ``surface_why`` there is none."""
 
     limit: SetUpLimit
     chance: ChanceHits | None
@@ -300,7 +300,7 @@ class SetUpResult:
 
 @dataclass(frozen=True, eq=False)
 class StudyResult:
-    """Set-ups in the record's order, lines over swept axes, limits of validity; ``facts``: the resolved experiment."""
+    """``set_ups``: in the record's order. ``axes``: lines along swept axes. ``facts``: the resolved experiment."""
 
     record: StudyRecord
     set_ups: tuple[SetUpResult, ...]
@@ -318,10 +318,11 @@ class StudyResult:
 def evaluate_study(
     record: StudyRecord, tables: ResultTables, facts: Mapping[str, Any], *, draws: int = DRAWS
 ) -> StudyResult:
-    """Judge a study; ``facts``: its resolved experiment, plain data. Deterministic. A limit without curve says why."""
-    set_ups = tuple(_set_up(one, tables, record.hit_radius_mm, draws) for one in record.set_ups)
-    limits = tuple(one.limit for one in set_ups)
-    validity = validity_of(record, limits, [one.chance for one in set_ups], facts)
+    """Evaluate a study. ``facts``: its resolved experiment, plain data. Deterministic. A limit without a curve says
+    why."""
+    set_ups = tuple(_set_up(each, tables, record.hit_radius_mm, draws) for each in record.set_ups)
+    limits = tuple(set_up.limit for set_up in set_ups)
+    validity = validity_of(record, limits, [set_up.chance for set_up in set_ups], facts)
     return StudyResult(record, set_ups, limits, axis_lines(limits), validity, facts)
 
 

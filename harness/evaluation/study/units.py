@@ -1,12 +1,12 @@
-"""Limits over units of a camera: each unit's own, and the limit of a newly drawn unit.
+"""Limits over units of a camera: each unit's own, and the limit of a new, randomly drawn unit.
 
-All units inspect the same boards, so that their limits differ by the unit and by noise alone. Logarithms of the units'
-a90 are taken as normal (a random effect of the unit). With 95 % confidence that of a new unit lies less than
-t(0.95, U - 1) s sqrt(1 + 1 / U) above their mean, where s is the standard deviation of U units. The mean has an error
-from the boards, which all units share: that of a90/95 over boards, ln(a90/95) - ln(a90). Both are independent, and
-their margins are joined as the root of the sum of squares (Zou and Donner, Statistics in Medicine 27 (2008), 1693).
-``tests/validation/units_coverage.py`` measures how often a new unit keeps to the limit. Not modelled: units that differ
-in more than their fixed pattern (temperature, age, a maker's change of parts)."""
+All units inspect the same boards, so their limits differ only by unit and noise. The logarithms of the units' a90 are
+assumed to be normal (a random effect of the unit). With 95 % confidence, that of a new unit lies less than t(0.95, U -
+1) s sqrt(1 + 1 / U) above their mean, where s is the standard deviation of U units. The mean has an error from the
+boards, which all units share: that of a90/95 over boards, ln(a90/95) - ln(a90). Both are independent, and their margins
+are combined as the root of the sum of squares (Zou and Donner, Statistics in Medicine 27 (2008), 1693).
+``tests/validation/units_coverage.py`` measures how often a new unit is within the limit. Not modelled: units that
+differ in more than their fixed pattern (temperature, age, a maker's change of parts)."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ METHOD = "prediction of a new unit over units and boards"
 
 @dataclass(frozen=True, eq=False)
 class OverUnits:
-    """``a90_mm``, ``a90_95_mm`` (u,): those of each unit alone, with link and axis of all units; infinite where a unit
-    has none. ``spread``: standard deviation of ln a90 between units, noise of their hits included.
-    ``new_unit``: upper bound, at 95 % confidence, of the a90 of a unit drawn anew."""
+    """``a90_mm``, ``a90_95_mm`` (u,): of each unit alone, with the link and axis of all units; infinite for a unit
+    without one. ``spread``: standard deviation of ln a90 between units, including the noise of their hits.
+    ``new_unit``: upper bound, at 95 % confidence, on the a90 of a new unit."""
 
     a90_mm: np.ndarray
     a90_95_mm: np.ndarray
@@ -43,8 +43,8 @@ class OverUnits:
 def over_units(
     size_mm: np.ndarray, hit: np.ndarray, target: np.ndarray, unit: np.ndarray, curve: PodCurve, limit: Bound
 ) -> OverUnits:
-    """Judge inspections, one a row (n,): ``hit`` bool, names of ``target``, numbers of ``unit``; ``curve`` of all
-    units, ``limit`` its a90/95 over boards. If a unit found all or nothing, no limit of a new one is demonstrated."""
+    """Judge inspections, one per row (n,): ``hit`` bool, names of ``target``, numbers of ``unit``. ``curve``: of all
+    units; ``limit``: its a90/95 over boards. If a unit found all or nothing, no limit of a new unit is demonstrated."""
     found = []
     for number in np.unique(unit):
         own = unit == number

@@ -1,8 +1,8 @@
 """The verdict whether a detection limit has become worse: a factor *and* a paired test, as asv judges benchmarks. A
-set-up is worse if its a90, or its rate of false calls, has grown (or its signals over the threshold have fallen) by
-more than `MARGIN` and by more than chance explains, by Holm's step-down over the three questions of all set-ups at
-`ALPHA`; or if it has lost its limit. On the same boards the tests of hits and of a90 decide on the limit, on other
-boards the bootstrap of a90. See `harness.evaluation.study.paired`."""
+set-up is worse if its a90 or its rate of false calls has grown (or its signals over the threshold have fallen) by more
+than `MARGIN` and by more than chance explains, by Holm's step-down method over the three questions of all set-ups at
+`ALPHA`; or if it has lost its limit. On the same boards, the tests of hits and of a90 decide on the limit; on other
+boards, the bootstrap of a90 does. See `harness.evaluation.study.paired`."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from harness.evaluation.study.record import SetUpRecord, StudyRecord
 from harness.vocabulary.seeds import canonical_json
 
 MARGIN = 1.10
-"""Growth of a90, the rate of false calls, or the threshold over signals up to which nothing is worse or better."""
+"""Largest growth of a90, the rate of false calls, or threshold over signals that is neither worse nor better."""
 ALPHA = 0.001
-"""Level of a gate's tests, for a whole comparison. As low as this because each set-up's luck with the calibration of
-its threshold is in no test over boards; see `harness.check` for how often the rule fails with it."""
+"""Level of a gate's tests, for a whole comparison. It is low because no test over boards includes the scatter of each
+set-up's calibration of the threshold; `harness.check` says how often the rule fails because of it."""
 QUESTIONS = 3
 """The questions about a set-up: its limit, false calls and signals."""
 
@@ -32,15 +32,15 @@ Mark = Literal[
     "not comparable", "only in first", "only in second",
 ]  # fmt: skip
 SIGNS: dict[Mark, str] = dict(zip(get_args(Mark), "+- ~!* x<>", strict=True))
-"""Signs of the marks, asv's where it has one: + means a larger number, which is worse."""
+"""Signs of the marks, as in asv where it has them: + means a larger number, which is worse."""
 OTHER_DAMAGE_P = 0.001
-"""Boards drawn anew from one family differ by chance; at a smaller p they are taken for another family."""
+"""Boards of one family that are drawn again differ by chance; with a smaller p-value they count as another family."""
 Pair = tuple[SetUpRecord | None, SetUpRecord | None]
 
 
 @dataclass(frozen=True, eq=False)
 class ComparedSetUps:
-    """One set-up of two studies; ``why``: of ``mark``. ``*_p``: adjusted p of (worse, better), 1 without a test."""
+    """One set-up of two studies. ``*_p``: adjusted p for (worse, better), 1 without a test. ``why``: reason."""
 
     first: SetUpLimit | None
     second: SetUpLimit | None
@@ -57,19 +57,19 @@ class ComparedSetUps:
 
     @property
     def label(self) -> str:
-        """Set-up and frames, of both where they differ."""
+        """Set-up and frames, of both if they differ."""
         labels = [limit.record.label for limit in (self.first, self.second) if limit is not None]
         return " → ".join(dict.fromkeys(labels))
 
     @property
     def is_worse(self) -> bool:
-        """True where a gate fails on this set-up."""
+        """True if a gate fails on this set-up."""
         return self.mark in ("worse", "newly failing")
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Two studies, set-up by set-up; ``alpha``: level of the tests for all of them together."""
+    """Two studies, set-up by set-up. ``alpha``: level of all tests together."""
 
     first: StudyRecord
     second: StudyRecord
@@ -82,8 +82,8 @@ class Comparison:
 
 
 def fewest_boards(set_ups: int, alpha: float = ALPHA) -> int:
-    """Shared boards from which on the tests can convict one of so many set-ups at all: if every board is worse, one
-    toss in 2^boards says as much, and that p is multiplied by all set-ups' questions, and by the limit's two tests."""
+    """Return the fewest shared boards with which the tests can show that one of the set-ups is worse. If it is worse on
+    every board, the p-value is 1 in 2^boards, multiplied by the questions of all set-ups and the limit's two tests."""
     return int(np.floor(np.log2(2 * QUESTIONS * set_ups / alpha))) + 1
 
 
@@ -104,7 +104,7 @@ def compare_studies(first: StudyRecord, second: StudyRecord, alpha: float = ALPH
         calls = paired.calls_change(one, other, first.false_calls_per_m2)
         signal = paired.signal_change(one, other) if same else None
         rows.append(ComparedSetUps(before, now, changed, paired.limit_change(before, now, same), hits, calls, signal))
-    # a question that was not asked does not belong to the family of tests
+    # only questions that were asked belong to the family of tests
     p_values = [p for row in rows for p in _p_values(row)]
     sides = []
     for side in (0, 1):
@@ -120,7 +120,7 @@ def compare_studies(first: StudyRecord, second: StudyRecord, alpha: float = ALPH
 
 
 def holm(p_values: Iterable[float]) -> np.ndarray:
-    """Return adjusted p (n,) by Holm's step-down (1979): those below a level hold together at that level."""
+    """Return adjusted p-values (n,) by Holm's step-down method (1979): those below a level hold jointly at it."""
     p = np.asarray(list(p_values), float)
     order = np.argsort(p, kind="stable")
     stepped = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1))
@@ -130,7 +130,7 @@ def holm(p_values: Iterable[float]) -> np.ndarray:
 
 
 def paired_set_ups(first: StudyRecord, second: StudyRecord) -> tuple[Pair, ...]:
-    """Pair set-ups by variant and frames; those left by place on the axes and frames; a single one of each is a pair.
+    """Pair set-ups by variant and frames, then the rest by place on the axes and frames; two single set-ups are a pair.
     In the order of ``first``; set-ups of only one study are paired with None, those of the second at the end."""
     if len(first.set_ups) == len(second.set_ups) == 1:
         return ((first.set_ups[0], second.set_ups[0]),)
@@ -144,14 +144,14 @@ def paired_set_ups(first: StudyRecord, second: StudyRecord) -> tuple[Pair, ...]:
                 at = of_free.index(key)
                 partner[place] = free.pop(at)
                 of_free.pop(at)
-    pairs: list[Pair] = [(one, partner.get(place)) for place, one in enumerate(first.set_ups)]
-    return (*pairs, *((None, one) for one in free))
+    pairs: list[Pair] = [(record, partner.get(place)) for place, record in enumerate(first.set_ups)]
+    return (*pairs, *((None, record) for record in free))
 
 
 def not_comparable(first: StudyRecord, second: StudyRecord, one: SetUpRecord, other: SetUpRecord) -> str:
-    """Return why the two were not measured in the same way (hit radius, wanted false calls, damage), empty where they
-    were. Damage of other boards is compared by Kolmogorov and Smirnov's test with as many values as there are boards,
-    since damages of one board may be alike: cautious where they are not."""
+    """Return why the two were not measured in the same way (hit radius, wanted false calls, damage), empty if they
+    were. Damage of other boards is compared by Kolmogorov and Smirnov's test with the boards' number as sample size:
+    cautious unless damages of a board are alike."""
     if first.hit_radius_mm != second.hit_radius_mm:
         return f"hits within {first.hit_radius_mm:g} mm there, within {second.hit_radius_mm:g} mm here"
     if first.hit_overlap != second.hit_overlap:
@@ -161,7 +161,7 @@ def not_comparable(first: StudyRecord, second: StudyRecord, one: SetUpRecord, ot
         there, here = ("no stated rate" if rate is None else f"{rate:g} false calls per m²" for rate in rates)
         return f"thresholds for {there} there, for {here} here"
     if bool(one.calibration_runs) != bool(other.calibration_runs):
-        return "the threshold of one is calibrated, that of the other given"
+        return "one threshold is calibrated, the other is given"
     boards = [len(np.unique(record.inspected.board)) for record in (one, other)]
     if one.targets_digest == other.targets_digest or not min(boards):
         return ""
@@ -174,7 +174,7 @@ def not_comparable(first: StudyRecord, second: StudyRecord, one: SetUpRecord, ot
 
 
 def differences(one: SetUpRecord, other: SetUpRecord) -> tuple[str, ...]:
-    """Describe differences that may be the cause."""
+    """Return differences that may be the cause."""
     facts = [(f"{of.detector} {of.detector_version}", f"frames {of.frames}") for of in (one, other)]
     changes = [f"{before} → {now.removeprefix('frames ')}" for before, now in zip(*facts, strict=True) if before != now]
     for axis in sorted({*one.axes, *other.axes}):
@@ -189,7 +189,7 @@ def differences(one: SetUpRecord, other: SetUpRecord) -> tuple[str, ...]:
 
 
 def _p_values(row: ComparedSetUps) -> tuple[Tails | None, Tails | None, Tails | None]:
-    """Return (worse, better) p values of the limit, of false calls and of signals."""
+    """Return (worse, better) p-values of the limit, of false calls and of signals."""
     calls = None if row.calls is None else (row.calls.more_p, row.calls.fewer_p)
     signal = None if row.signal is None else (row.signal.less_p, row.signal.more_p)
     if row.limit is None:
@@ -201,13 +201,13 @@ def _p_values(row: ComparedSetUps) -> tuple[Tails | None, Tails | None, Tails | 
 
 
 def _verdict(row: ComparedSetUps, alpha: float) -> tuple[Mark, str]:
-    """Return mark and reason; failures come first. Growth either way must exceed both the margin and chance."""
+    """Return mark and reason; failures come first. Growth in either direction must exceed margin and chance."""
     first, second, calls = row.first, row.second, row.calls
     assert first is not None and second is not None
     growth, grown = _growth(first, second), f"a90 {first.a90_mm:.2f} → {second.a90_mm:.2f} mm"
     if first.a90_95.demonstrated != second.a90_95.demonstrated:
         bounds = (first.a90_95, second.a90_95)
-        there, here = (f"{one.value:.2f} mm" if one.demonstrated else "not demonstrated" for one in bounds)
+        there, here = (f"{bound.value:.2f} mm" if bound.demonstrated else "not demonstrated" for bound in bounds)
         grown = f"a90/95 {there} → {here}"
     if why := _lost(first, second):
         return "newly failing", why
@@ -228,13 +228,13 @@ def _verdict(row: ComparedSetUps, alpha: float) -> tuple[Mark, str]:
 
 
 def limit_margin(signal: paired.SignalChange | None) -> float:
-    """Widen the margin of a90 by two standard errors of the signals over the threshold, where these are known: a depth
-    limit moves as they do, and no test of hits has the luck of two calibrations."""
+    """Return the margin of a90, widened by two standard errors of the signals over the threshold, if known: a depth
+    limit changes with them, and no test of hits includes the scatter of two calibrations."""
     return MARGIN * float(np.exp(2 * signal.error)) if signal else MARGIN
 
 
 def _lost(before: SetUpLimit, now: SetUpLimit) -> str:
-    """Name what ``before`` had and ``now`` has not; empty where nothing."""
+    """Return what ``before`` had and ``now`` lacks; empty if nothing."""
     if now.record.failed > before.record.failed:
         return f"{now.record.failed} trials failed, {before.record.failed} before"
     if np.isfinite(before.a90_mm) and not np.isfinite(now.a90_mm):
@@ -243,7 +243,7 @@ def _lost(before: SetUpLimit, now: SetUpLimit) -> str:
 
 
 def _growth(first: SetUpLimit, second: SetUpLimit) -> float:
-    """Return a90 over a90; infinite (0) if a90/95 is demonstrated no more (for the first time); NaN without a limit."""
+    """Return the ratio of a90; infinite (0) if a90/95 is no longer (newly) demonstrated; NaN without a limit."""
     before, now = first.a90_95.demonstrated, second.a90_95.demonstrated
     ratio = second.a90_mm / first.a90_mm
     if before == now or not np.isfinite(ratio):

@@ -11,7 +11,7 @@ less than that of single frames' means (standard error 3 %); the cause is not kn
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
@@ -25,7 +25,7 @@ from scenes.sensor.amcw import kernels, ranging
 from scenes.sensor.amcw.certainty import Certainty, certainty, even_pixels, fill_even
 from scenes.sensor.amcw.kernels import LANES, FilterSettings
 from scenes.sensor.amcw.linear import DEVIATIONS, Light, light_of_samples, linearised, unknown_filtered
-from scenes.sensor.normals import EXACT_SUMS, FAST, standard_normals
+from scenes.sensor.normals import EXACT_SUMS, FAST, random_words, standard_normals
 from scenes.sensor.unit import N_REASONS, FrameTotals
 
 if TYPE_CHECKING:
@@ -40,8 +40,9 @@ class Linear(NamedTuple):
     """Pixels of a view, (n,) float32 except ``kind`` (uint8) and ``row`` (int32); z in steps of the output. ``noise``:
     one deviation of a pixel's noise, in any unit. ``z``: the mean minus ``base``, a whole number. ``by_path``: change
     of z per step of half path. EVEN pixels have ``each``, the change of z by a neighbour's noise at weight 1, and
-    ``more``, that by the centre's own noise beyond its weight's part. UNEVEN pixels have ``row`` in ``moved`` (m, k):
-    the same by each neighbour. ``taps`` (side,): symmetric weights by distance along a row."""
+    ``more``, that by the centre's own noise beyond its weight's part. UNEVEN pixels have ``row`` in ``moved`` (m,
+    side^2): the same by each neighbour. ``taps`` (side,): symmetric weights by distance along a row. The sides are
+    an odd multiple of 5, with zeros around a smaller window."""
 
     kind: np.ndarray
     noise: np.ndarray
@@ -77,25 +78,16 @@ def _noise_row(y, words, given, given_at, noise, w, half, row):  # type: ignore[
 
 
 @numba.njit(**FAST)
-def _pair_sum(above, below, tap, shift, other_shift, length, total):  # type: ignore[no-untyped-def]
-    for k in range(np.uint64(length)):
-        total[k] += tap * (above[np.uint64(shift) + k] + below[np.uint64(other_shift) + k])
-
-
-@numba.njit(**FAST)
-def _window_sums(rows, blank, y, h, taps, w, down, across):  # type: ignore[no-untyped-def]
-    """Write weighted sums over the window of each pixel of picture row y, (w lanes,), into ``across``."""
-    side = taps.size
-    half = side // 2
-    length = w * LANES
-    down[:] = taps[half] * rows[y % side]
-    for d in range(1, half + 1):
-        above = rows[(y - d) % side] if y - d >= 0 else blank
-        below = rows[(y + d) % side] if y + d < h else blank
-        _pair_sum(above, below, taps[half - d], 0, 0, down.size, down)
-    across[:] = taps[half] * down[half * LANES : half * LANES + length]
-    for d in range(1, half + 1):
-        _pair_sum(down, down, taps[half - d], (half - d) * LANES, (half + d) * LANES, length, across)
+def _sum_over(values, starts, taps, total):  # type: ignore[no-untyped-def]
+    """Write into ``total`` (n,) the sum of n values from each of ``starts`` (5 k,) on, times its tap."""
+    for q in range(0, taps.size, 5):
+        s1, s2, s3 = np.uint64(starts[q]), np.uint64(starts[q + 1]), np.uint64(starts[q + 2])
+        s4, s5 = np.uint64(starts[q + 3]), np.uint64(starts[q + 4])
+        a, b, c, d, e = taps[q], taps[q + 1], taps[q + 2], taps[q + 3], taps[q + 4]
+        for k in range(np.uint64(total.size)):
+            before = total[k] if q else f4(0)
+            some = a * values[s1 + k] + b * values[s2 + k] + c * values[s3 + k]
+            total[k] = before + some + d * values[s4 + k] + e * values[s5 + k]
 
 
 @numba.njit(**FAST)
@@ -121,54 +113,44 @@ def _sums_of(rounded, counted):  # type: ignore[no-untyped-def]
 def add_linear_frames(  # type: ignore[no-untyped-def]
     shape, linear, words, given, given_at, errors, counted, total, squares
 ):
-    """Add `LANES` frames at the EVEN and UNEVEN pixels of ``linear`` to (n,): z minus base, and its square, in steps.
+    """Add `LANES` frames at the EVEN and UNEVEN pixels of ``linear`` to (k, n): z minus base, and its square, in steps,
+    over the frames that each row of ``counted`` (k, lanes) counts.
     ``words`` (n lanes,) int8: random bytes; the normals ``given`` (g, lanes) replace them where ``given_at`` (n,) is
     not -1, so that pixels simulated in another way share their noise. ``errors`` (lanes,): displacements in steps."""
     h, w = shape
     side = linear.taps.size
     half = side // 2
     width = (w + 2 * half) * LANES
-    rows = np.zeros((side, width), np.float32)
-    blank, down, across = np.zeros(width, np.float32), np.empty(width, np.float32), np.empty(w * LANES, np.float32)
-    sums, rounded = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
+    # noise of the picture rows of a window, and of one beyond the picture; its sums along columns, and over windows
+    rows, down, across = np.zeros((side + 1, width), f4), np.empty(width, f4), np.empty(w * LANES, f4)
+    noise, starts, places = rows.reshape(rows.size), np.empty(side, np.int64), np.empty(side * side, np.int64)
+    beside = np.arange(side) * LANES
+    sums, rounded = np.empty(LANES, f4), np.empty(LANES, f4)
     for y in range(-half, h):
         if y + half < h:
             _noise_row(y + half, words, given, given_at, linear.noise, w, half, rows[(y + half) % side])
         if y < 0:
             continue
-        _window_sums(rows, blank, y, h, linear.taps, w, down, across)
-        own = rows[y % side]
+        for q in range(side):
+            starts[q] = ((y + q - half) % side if 0 <= y + q - half < h else side) * width
+        _sum_over(noise, starts, linear.taps, down)
+        _sum_over(down, beside, linear.taps, across)
         for x in range(w):
-            i = y * w + x
+            i, own = y * w + x, starts[half] + (x + half) * LANES
             z, by_path = linear.z[i], linear.by_path[i]
             if linear.kind[i] == EVEN:
-                start, mine = x * LANES, (x + half) * LANES
-                _round(z, by_path, errors, linear.each[i], across, start, linear.more[i], own, mine, rounded)
+                _round(z, by_path, errors, linear.each[i], across, x * LANES, linear.more[i], noise, own, rounded)
             elif linear.kind[i] == UNEVEN:
-                sums[:] = f4(0)
                 for q in range(side * side):
-                    pull = linear.moved[linear.row[i], q]
-                    if pull != f4(0):
-                        source, first = rows[(y + q // side - half) % side], np.uint64((x + q % side) * LANES)
-                        for t in range(np.uint64(LANES)):
-                            sums[t] += pull * source[first + t]
+                    places[q] = starts[q // side] + (x + q % side) * LANES
+                _sum_over(noise, places, linear.moved[linear.row[i]], sums)
                 _round(z, by_path, errors, f4(1), sums, 0, f4(0), sums, 0, rounded)
             else:
                 continue
-            a, b = _sums_of(rounded, counted)
-            total[i] += a
-            squares[i] += b
-
-
-@numba.njit(**EXACT_SUMS)
-def add_bytes(words: np.ndarray, counted: np.ndarray, total: np.ndarray) -> None:
-    """Add to ``total`` (n,) the bytes ``words`` (n lanes,) int8 of the counted frames, as numbers of variance 1."""
-    scale = f4(1 / np.sqrt((256.0**2 - 1) / 12))
-    for i in range(total.size):
-        sum_of_all = f4(0)
-        for t in range(np.uint64(LANES)):
-            sum_of_all += counted[t] * (f4(words[np.uint64(i * LANES) + t]) + f4(0.5))
-        total[i] += scale * sum_of_all
+            for part in range(len(counted)):
+                a, b = _sums_of(rounded, counted[part])
+                total[part, i] += a
+                squares[part, i] += b
 
 
 MOST_LISTED = 0.25  # if more of the pixels had to be simulated one by one, whole frames would cost less
@@ -278,6 +260,9 @@ def _linear(
     by_each = np.copysign(np.sqrt((pulls**2).sum(axis=0)), pulls.sum(axis=0)) * by_path[at, None] / step_m
     by_each /= windows_of(noise.reshape(imager.region.shape), side, 1.0, at)
     taps = space[side // 2] / np.sqrt(space[side // 2, side // 2])
+    rim = (10 * ((side + 4) // 10) + 5 - side) // 2
+    taps, by_each = np.pad(taps, rim), np.pad(by_each.reshape(-1, side, side), ((0, 0), (rim, rim), (rim, rim)))
+    by_each = by_each.reshape(-1, taps.size**2)
     base = np.round(z)
     own, off, steps, others, rest_of = (values.astype(f4) for values in (noise, z - base, by_path, each, more))
     return Linear(kind, own, base.astype(f4), off, steps, others, rest_of, row, by_each.astype(f4), taps.astype(f4))
@@ -325,52 +310,73 @@ class AtOnce:
         return engine._replace(geometry=engine.geometry.take(at, axis=1), outside_mask=engine.outside_mask[at])
 
     def totals(
-        self, frames: np.ndarray, errors_m: np.ndarray, stream: Callable[[int], np.random.Generator]
-    ) -> FrameTotals:
-        """Sum the frames with numbers ``frames`` (t,), displaced by ``errors_m`` (t,). The noise of frames `LANES` k to
-        `LANES` (k + 1) - 1 comes from ``stream`` (k), whichever of them are requested."""
-        n, p, shape, step_m = self.linear.z.size, len(self.listed), self.shape, self.imager.camera.z_step_m
-        total, squares, sway, given_at = np.zeros(n), np.zeros(n), np.zeros(n, f4), np.full(n, -1, np.int32)
+        self, parts: Sequence[np.ndarray], errors_m: np.ndarray, stream: Callable[[int], np.random.Generator]
+    ) -> Sequence[FrameTotals]:
+        """Return the sums over the first of ``parts``, over the first two, and so on: each has numbers of frames (t,),
+        no number twice. ``errors_m``: displacements by number. The noise of frames `LANES` k to `LANES` (k + 1) - 1
+        comes from ``stream`` (k), whichever of them are requested."""
+        n, p, k, shape, step_m = (
+            self.linear.z.size,
+            len(self.listed),
+            len(parts),
+            self.shape,
+            self.imager.camera.z_step_m,
+        )
+        total, squares, sway = np.zeros((k, n)), np.zeros((k, n)), np.zeros((k, n), f4)
+        sums = (np.zeros((k, p), np.int32), *np.zeros((3, k, p)), np.zeros((k, N_REASONS, p), np.uint16))
+        given_at = np.full(n, -1, np.int32)
         given_at[self.list.halo] = np.arange(len(self.list.halo))
-        sums = np.zeros(p, np.int32), np.zeros(p), np.zeros(p), np.zeros(p), np.zeros((N_REASONS, p), np.uint16)
-        for block in np.unique(frames // LANES):
-            chosen = frames // LANES == block
-            errors, counted = np.zeros(LANES), np.zeros(LANES, f4)
-            errors[frames[chosen] % LANES], counted[frames[chosen] % LANES] = errors_m[chosen], 1
-            rng = stream(int(block))
-            given = self._add_one_by_one(errors, counted, rng, sums)
-            words = rng.bit_generator.random_raw(2 * n * LANES // 8).view(np.int8)
-            steps = (errors / f4(step_m)).astype(f4)
-            add_linear_frames(shape, self.linear, words[: n * LANES], given, given_at, steps, counted, total, squares)
-            add_bytes(words[n * LANES :], counted, sway)
+        blocks = 1 + max(int(frames.max(initial=0)) for frames in parts) // LANES
+        part_of, errors = np.full(blocks * LANES, -1), np.zeros(blocks * LANES, f4)
+        for number, frames in enumerate(parts):
+            part_of[frames], errors[frames] = number, errors_m[frames]
+        for block in np.unique(np.flatnonzero(part_of >= 0) // LANES).tolist():
+            lanes = slice(block * LANES, (block + 1) * LANES)
+            rng, counted = stream(block), (part_of[lanes] == np.arange(k)[:, None]).astype(f4)
+            given = self._add_one_by_one(errors[lanes], part_of[lanes], rng, sums)
+            words, signs = random_words(rng, n * LANES // 8).view(np.int8), random_words(rng, n)
+            steps = errors[lanes] / f4(step_m)
+            add_linear_frames(shape, self.linear, words, given, given_at, steps, counted, total, squares)
+            for part, there in zip(sway, counted, strict=True):
+                # the amplitude's noise in each frame is one deviation up or down
+                bits = np.uint64(sum(1 << lane for lane in np.flatnonzero(there).tolist()))
+                part += f4(2) * np.bitwise_count(signs & bits) - f4(there.sum())
+        running = (np.cumsum(values, axis=0, dtype=values.dtype) for values in (total, squares, sway, *sums))
+        frames_in = np.cumsum([len(frames) for frames in parts]).tolist()
+        return [self._finished(*each) for each in zip(frames_in, *running, strict=True)]
 
-        certain, taps, noise = self.certain, self.linear.taps, sway.reshape(shape)
+    def _finished(
+        self, frames: int, total: np.ndarray, squares: np.ndarray, sway: np.ndarray, *sums: np.ndarray
+    ) -> FrameTotals:
+        """Return the sums over ``frames`` frames from those of the linear and of the listed pixels."""
+        certain, taps, shape = self.certain, self.linear.taps, self.shape
+        noise = sway.reshape(shape)
         for axis in (0, 1):
             noise = ndimage.correlate1d(noise, taps / np.sqrt((taps**2).sum()), axis=axis, mode="constant")
-        swaying = len(frames) * certain.amplitude + certain.amplitude_deviation * noise.ravel()
-        amplitude = np.where(certain.always, swaying, 0.0)
-        count = np.where(certain.always, len(frames), 0).astype(np.int32)
-        reasons = np.zeros((N_REASONS, n), np.uint16)
+        amplitude = np.where(
+            certain.always, frames * certain.amplitude + certain.amplitude_deviation * noise.ravel(), 0.0
+        )
+        count = np.where(certain.always, frames, 0).astype(np.int32)
+        reasons = np.zeros((N_REASONS, len(count)), np.uint16)
         never, at = np.flatnonzero(certain.never), self.listed
-        reasons[certain.reason[never], never] = len(frames)
-        reasons[Reason.VALID, certain.always] = len(frames)
+        reasons[certain.reason[never], never] = frames
+        reasons[Reason.VALID, certain.always] = frames
         count[at], total[at], squares[at], amplitude[at], reasons[:, at] = sums
         return FrameTotals(
-            len(frames), step_m, self.linear.base.astype(float).reshape(shape), count.reshape(shape),
+            frames, self.imager.camera.z_step_m, self.linear.base.astype(float).reshape(shape), count.reshape(shape),
             total.reshape(shape), squares.reshape(shape), amplitude.reshape(shape), reasons.reshape(-1, *shape),
         )  # fmt: skip
 
     def _add_one_by_one(
-        self, errors_m: np.ndarray, counted: np.ndarray, rng: np.random.Generator, sums: tuple[np.ndarray, ...]
+        self, errors_m: np.ndarray, part_of: np.ndarray, rng: np.random.Generator, sums: Arrays
     ) -> np.ndarray:
-        """Add the listed pixels of a block to ``sums``."""
+        """Add the listed pixels' frames to ``sums``, each to its ``part_of`` (lanes,). Return their halo's noise of z
+        (g, lanes)."""
         light, flying_gate, wanted = self.light, self.imager.engine.flying, self.list.wanted
         g, m, n_frequencies = len(self.list.halo), len(self.list.range), len(light.turn)
-        normals = standard_normals(rng, (g, n_frequencies, 2, LANES))
-        if m == 0:
-            return normals[:, 0, 0]
-        planes = np.empty((g, n_frequencies, kernels.BLOCK), f4)
-        kernels.noisy_phasors(light.phasor, light.amplitude, light.turn, light.swell, normals, planes)
+        normals, noise = standard_normals(rng, (g, n_frequencies, 2, LANES)), np.zeros((g, LANES), f4)
+        planes = np.empty((g // kernels.BESIDE + 2, n_frequencies, 3, kernels.STRIDE), f4)
+        kernels.noisy_phasors(*light[:2], *light[3:], self.shares, normals, planes, noise)
         filtered, edge = np.empty((n_frequencies, 3, m, LANES), f4), np.empty((n_frequencies, m, LANES), f4)
         kernels.filter_listed(planes, self.list.window, self.imager.filter_settings, filtered, edge)
         flat, unsaturated = filtered.reshape(n_frequencies, 3, -1), np.zeros(m * LANES, np.uint8)
@@ -381,24 +387,25 @@ class AtOnce:
         if flying_gate is not None:
             ranging.find_flying(z_m, total, reason, wanted, self.list.near, flying_gate, flying)
         base, step_m = self.linear.base[self.listed], f4(self.imager.camera.z_step_m)
-        _add_listed(z_m, reason, total, flying, wanted, counted, 1.0 / n_frequencies, step_m, base, *sums)
-        return np.asarray((self.shares[:, :, None] * normals[:, :, 1]).sum(axis=1))
+        _add_listed(z_m, reason, total, flying, wanted, part_of, 1.0 / n_frequencies, step_m, base, *sums)
+        return noise
 
 
 @numba.njit(**FAST)
 def _add_listed(  # type: ignore[no-untyped-def]
-    z_m, reason, strength, flying, wanted, counted, share, step_m, base, count, total, squares, amplitude, reasons
+    z_m, reason, strength, flying, wanted, part_of, share, step_m, base, count, total, squares, amplitude, reasons
 ):
-    """Add the frames that are ``counted`` (t,) of listed pixels to sums (p,), and to ``reasons`` (r, p)."""
+    """Add the frames of listed pixels to sums (k, p) and ``reasons`` (k, r, p), each to its part; -1: not counted."""
     for p in range(wanted.size):
-        for t in range(counted.size):
-            if counted[t] == f4(0):
+        for t in range(part_of.size):
+            k = part_of[t]
+            if k < 0:
                 continue
             code = np.uint8(ranging.EDGE) if flying[p, t] else reason[wanted[p], t]
-            reasons[code, p] += 1
+            reasons[k, code, p] += 1
             if code == ranging.VALID:
                 steps = np.floor(z_m[wanted[p], t] / step_m + f4(0.5)) - base[p]
-                count[p] += 1
-                total[p] += steps
-                squares[p] += steps * steps
-                amplitude[p] += strength[wanted[p], t] * share
+                count[k, p] += 1
+                total[k, p] += steps
+                squares[k, p] += steps * steps
+                amplitude[k, p] += strength[wanted[p], t] * share

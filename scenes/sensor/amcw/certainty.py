@@ -49,7 +49,7 @@ def certainty(
 
     # the engine on the mean phasors, and the change of z by half a path
     planes = np.stack([filtered.phasor.real, filtered.phasor.imag, amplitude], axis=1).astype(f4)
-    edge = np.where(np.isfinite(filtered.edge), filtered.edge, filtered.edge_least).astype(f4)
+    edge = filtered.edge_least.astype(f4)
     (z_m, reason, _), up, down = (
         ranging.ranges_of(planes, edge, lost.astype(np.uint8), engine, np.full(n, error_m))
         for error_m in (0.0, STEP_M, -STEP_M)
@@ -74,8 +74,10 @@ def certainty(
     slack_m = DEVIATIONS * deviation_m + farthest_error_m
     range_m = mean_m / engine.geometry[2]
     far_m = mean_m if gates.axial > 0 else range_m
-    steepest = filtered.edge + DEVIATIONS * filtered.edge_spread
-    steepest = steepest.mean(axis=0) if gates.edge_mean > 0 else steepest.max(axis=0)
+    if gates.edge_mean > 0:  # the frequencies' noise is independent
+        steepest = filtered.edge.mean(axis=0) + DEVIATIONS * np.sqrt((filtered.edge_spread**2).sum(axis=0)) / f
+    else:
+        steepest = (filtered.edge + DEVIATIONS * filtered.edge_spread).max(axis=0)
 
     def first_failed(end: int) -> np.ndarray:
         low, high = amplitude + end * DEVIATIONS * spread, amplitude - end * DEVIATIONS * spread
@@ -110,15 +112,12 @@ def certainty(
 
 def _edge_fails(filtered: Filtered, gates: ranging.Gates) -> np.ndarray:
     """Find pixels whose edge sum, in one frequency or in the mean of all, always exceeds the limit."""
-    limit, known = float(gates.edge), np.isfinite(filtered.edge)
+    limit, least, loose = float(gates.edge), filtered.edge_least, np.maximum(filtered.edge_loose, 1e-9)
     if np.isinf(limit):
-        return np.zeros(known.shape[1], bool)
-    sure = filtered.edge - DEVIATIONS * np.where(known, filtered.edge_spread, 0.0)
+        return np.zeros(least.shape[1], bool)
     if gates.edge_mean > 0:
-        loosest = np.maximum(filtered.edge_least - DEVIATIONS * filtered.edge_loose, 0.0)
-        return np.asarray(np.where(known, sure, loosest).mean(axis=0) > limit)
-    above = np.maximum((filtered.edge_least - limit) / np.maximum(filtered.edge_loose, 1e-9), 0.0)
-    return np.asarray(((sure > limit) & known).any(axis=0) | ((above**2).sum(axis=0) > DEVIATIONS**2))
+        return np.asarray(least.sum(axis=0) - DEVIATIONS * np.sqrt((loose**2).sum(axis=0)) > limit * len(least))
+    return np.asarray((np.maximum((least - limit) / loose, 0.0) ** 2).sum(axis=0) > DEVIATIONS**2)
 
 
 def _may_fly(
@@ -227,6 +226,5 @@ def fill_even(
     out.edge[:, at] = edge + 0.5 * kept * (1 - np.exp(-(own**2)))
     quadratic = (kept * 6 / 16 + kept**2 / 8) * own**4
     out.edge_spread[:, at] = np.sqrt(quadratic + (1 + kept) * edge * own**2)
-    out.edge_least[:, at] = 0.0
-    out.edge_loose[:, at] = np.sqrt(kept / 8)
+    out.edge_least[:, at], out.edge_loose[:, at] = out.edge[:, at], out.edge_spread[:, at]
     return each, centre

@@ -8,17 +8,17 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from scenes.sensor.normals import FAST, bits_float, float_bits
+from scenes.sensor.normals import FAST, bits_float, float_bits, fma
 
 f4 = np.float32
 ZERO, HALF, ONE = f4(0), f4(0.5), f4(1)
-C2, C3, C4, C5 = HALF, f4(1 / 6), f4(1 / 24), f4(1 / 120)
-SMALLEST = f4(1e-30)
+C3, C4 = f4(1 / 6), f4(1 / 24)
+SMALLEST, TINY = f4(1e-30), f4(2.0**-40)  # TINY: a concentration so small that all weights are 1
 OUTSIDE = f4(-1)  # amplitude beyond the border and of saturated pixels: below every floor, so always dropped
 
 STRIDE = 2128  # longest padded row of an image; a power of two would share cache lines, up to 4 times as slow
 LANES = 56  # frames of a listed pixel that are drawn together; loops over 8 n frames are vectorised from n = 4 on
-BLOCK = 3 * LANES  # numbers of one listed pixel and frequency: re, im and amplitude of all frames
+BESIDE = STRIDE // LANES  # listed pixels whose frames stand side by side, like the pixels of one row
 
 
 @numba.njit(**FAST)
@@ -63,89 +63,57 @@ def expose(  # type: ignore[no-untyped-def]
             amplitude[:, i] = OUTSIDE
 
 
+@numba.njit(inline="always", **FAST)
+def _place(j, f, n_frequencies):  # type: ignore[no-untyped-def]
+    """Return where the frames of listed pixel j stand in planes (rows, f, 3, stride), with `BESIDE` pixels a row."""
+    return (j // BESIDE * n_frequencies + f) * 3 * STRIDE + j % BESIDE * LANES
+
+
 @numba.njit(**FAST)
-def noisy_phasors(phasor, amplitude, turn, swell, normals, planes):  # type: ignore[no-untyped-def]
-    """Write phasors (f, g) with noise of ``normals`` (g, f, 2, lanes) into ``planes`` (g, f, 3 lanes): re, im, size."""
+def noisy_phasors(phasor, amplitude, turn, swell, shares, normals, planes, noise):  # type: ignore[no-untyped-def]
+    """Write phasors (f, g) with noise of ``normals`` (g, f, 2, lanes) into ``planes`` (rows, f, 3, stride), at `_place`
+    re, im, size; and into ``noise`` (g, lanes), zeros before, the sum of the phases' normals by ``shares`` (g, f)."""
     g, n_frequencies, _, _ = normals.shape
-    p1, p2 = np.uint64(LANES), np.uint64(2 * LANES)
+    flat, p1, p2 = planes.reshape(planes.size), np.uint64(STRIDE), np.uint64(2 * STRIDE)
     for j in range(g):
         for f in range(n_frequencies):
-            c, s = np.float32(phasor[f, j].real), np.float32(phasor[f, j].imag)
+            c, s, share = np.float32(phasor[f, j].real), np.float32(phasor[f, j].imag), shares[j, f]
             size = np.float32(amplitude[f, j])
             over = np.float32(amplitude[f, j] * turn[f, j])
             beside = np.float32(amplitude[f, j] * swell[f, j])
-            out = planes[j, f]
+            start = np.uint64(_place(j, f, n_frequencies))
             for t in range(np.uint64(LANES)):
                 along = size + beside * normals[j, f, 0, t]
                 across = over * normals[j, f, 1, t]
                 length = np.sqrt(along * along + across * across)
                 inverse = ONE / max(length, SMALLEST)
-                out[t] = (c * along - s * across) * inverse
-                out[p1 + t] = (s * along + c * across) * inverse
-                out[p2 + t] = length
+                flat[start + t] = (c * along - s * across) * inverse
+                flat[start + p1 + t] = (s * along + c * across) * inverse
+                flat[start + p2 + t] = length
+                noise[j, t] += share * normals[j, f, 1, t]
 
 
-def _filter_of(stride: int) -> Any:
-    """Compile the filter of one window for ``stride`` values side by side: pixels of a row, or frames of a pixel."""
-
-    @numba.njit(**FAST)
-    def filter_window(planes, centre, starts, length, settings, total, filtered, edge):  # type: ignore[no-untyped-def]
-        """Filter ``length`` values. ``planes``: flat, with re, im and amplitude ``stride`` apart. ``centre``,
-        ``starts`` (k,): start of the values and of their neighbours, -1 for none. ``total``: room for 7 planes. Writes
-        ``filtered`` (3, length) and ``edge`` (length,). Indices are unsigned: the compiler gathers by signed ones."""
-        weights, concentration, dim, drop_dim, dim_edges, by_amplitude = settings
-        space = weights.ravel()
-        p1, p2, p3, p4 = np.uint64(stride), np.uint64(2 * stride), np.uint64(3 * stride), np.uint64(4 * stride)
-        p5, p6 = np.uint64(5 * stride), np.uint64(6 * stride)
-        middle = np.uint64(centre)
-        # planes of ``total``: re, im, amplitude, weight, gap; a sixteenth of the concentration; the least amplitude of
-        # a neighbour that counts
-        for x in range(np.uint64(length)):
-            bright = planes[middle + p2 + x] > dim
-            total[x], total[p1 + x], total[p2 + x], total[p3 + x], total[p4 + x] = ZERO, ZERO, ZERO, ZERO, ZERO
-            total[p5 + x] = concentration / f4(16) if bright else ZERO
-            total[p6 + x] = dim if bright and drop_dim else ZERO
-        for q in range(starts.size):
-            if starts[q] < 0:
-                continue
-            neighbour = np.uint64(starts[q])
-            weight = space[q]
-            for x in range(np.uint64(length)):
-                r = planes[neighbour + x]
-                i = planes[neighbour + p1 + x]
-                amplitude = planes[neighbour + p2 + x]
-                gap = ONE - (planes[middle + x] * r + planes[middle + p1 + x] * i)
-                # exp(16 t) as the sixteenth power of five terms of the series: for -0.46 <= t <= 0 the relative error
-                # is below 2e-4 at the smallest value (7e-4), and below 1e-6 where the value exceeds 0.1
-                t = -total[p5 + x] * gap
-                e = ONE + t * (ONE + t * (C2 + t * (C3 + t * (C4 + t * C5))))
-                e = e * e
-                e = e * e
-                e = e * e
-                e = e * e
-                kept = amplitude >= total[p6 + x]
-                e = weight * e if kept else ZERO
-                a = e * amplitude
-                v = a if by_amplitude else e
-                total[x] += v * r
-                total[p1 + x] += v * i
-                total[p2 + x] += a
-                total[p3 + x] += e
-                total[p4 + x] += gap if kept and (dim_edges or amplitude >= dim) else ZERO
-        for x in range(np.uint64(length)):
-            a = total[x]
-            b = total[p1 + x]
-            size = np.sqrt(a * a + b * b) if by_amplitude else total[p2 + x]
-            filtered[0, x] = a
-            filtered[1, x] = b
-            # nothing is kept if the whole window is saturated
-            filtered[2, x] = size / max(total[p3 + x], SMALLEST)
-            edge[x] = HALF * total[p4 + x]
-
-    return filter_window
+TOGETHER = 5  # neighbours that are summed in one pass, which holds the sums in registers
 
 
-_filter_row, _filter_frames = _filter_of(STRIDE), _filter_of(LANES)
+@numba.njit(inline="always", **FAST)
+def _with_neighbour(planes, at, p1, p2, weight, centre, by_amplitude, sums):  # type: ignore[no-untyped-def]
+    """Return the sums over a window with one neighbour more: re, im, amplitude, weight, and minus the scaled gaps."""
+    re, im, minus_scale, least, least_of_edge = centre
+    r, i, amplitude = planes[at], planes[at + p1], planes[at + p2]
+    t = fma(re, r, fma(im, i, minus_scale))
+    # exp(16 t) as the sixteenth power of a series: for -0.46 <= t <= 0 the relative error is below 3e-3 at the smallest
+    # value (7e-4), and below 1e-5 where the value exceeds 0.1
+    e = fma(t, fma(t, fma(t, fma(t, C4, C3), HALF), ONE), ONE)
+    e = e * e
+    e = e * e
+    e = e * e
+    e = e * e
+    e = weight * e if amplitude >= least else ZERO
+    a = e * amplitude
+    v = a if by_amplitude else e
+    gap = t if amplitude >= least_of_edge else ZERO
+    return fma(v, r, sums[0]), fma(v, i, sums[1]), sums[2] + a, sums[3] + e, sums[4] + gap
 
 
 class FilterSettings(NamedTuple):
@@ -162,6 +130,52 @@ class FilterSettings(NamedTuple):
 
 
 @numba.njit(**FAST)
+def _filter_window(planes, centre, starts, space, length, settings, total, filtered, edge):  # type: ignore[no-untyped-def]
+    """Filter ``length`` values side by side: pixels of a row, or frames of a pixel. ``planes``: flat, with re, im and
+    amplitude `STRIDE` apart. ``centre``, ``starts`` (k,): start of the values and of their neighbours, of weights
+    ``space`` (k,), k a multiple of `TOGETHER`. ``total``: room for 5 planes. Writes ``filtered`` (3, length) and
+    ``edge`` (length,). Indices are unsigned: the compiler gathers by signed ones."""
+    _, concentration, dim, drop_dim, dim_edges, by_amplitude = settings
+    p1, p2, p3, p4 = np.uint64(STRIDE), np.uint64(2 * STRIDE), np.uint64(3 * STRIDE), np.uint64(4 * STRIDE)
+    middle, of_bright = np.uint64(centre), max(concentration / f4(16), TINY)
+    least_of_bright, edge_of_any = dim if drop_dim else ZERO, ZERO if dim_edges else dim
+    for x in range(np.uint64(length)):
+        total[x], total[p1 + x], total[p2 + x], total[p3 + x], total[p4 + x] = ZERO, ZERO, ZERO, ZERO, ZERO
+    for q in range(0, starts.size, TOGETHER):
+        first, second, third = np.uint64(starts[q]), np.uint64(starts[q + 1]), np.uint64(starts[q + 2])
+        fourth, fifth = np.uint64(starts[q + 3]), np.uint64(starts[q + 4])
+        w1, w2, w3, w4, w5 = space[q], space[q + 1], space[q + 2], space[q + 3], space[q + 4]
+        for x in range(np.uint64(length)):
+            bright = planes[middle + p2 + x] > dim
+            scale, least = of_bright if bright else TINY, least_of_bright if bright else ZERO
+            re, im = scale * planes[middle + x], scale * planes[middle + p1 + x]
+            own = (re, im, -scale, least, max(least, edge_of_any))
+            sums = (total[x], total[p1 + x], total[p2 + x], total[p3 + x], total[p4 + x])
+            sums = _with_neighbour(planes, first + x, p1, p2, w1, own, by_amplitude, sums)
+            sums = _with_neighbour(planes, second + x, p1, p2, w2, own, by_amplitude, sums)
+            sums = _with_neighbour(planes, third + x, p1, p2, w3, own, by_amplitude, sums)
+            sums = _with_neighbour(planes, fourth + x, p1, p2, w4, own, by_amplitude, sums)
+            sums = _with_neighbour(planes, fifth + x, p1, p2, w5, own, by_amplitude, sums)
+            total[x], total[p1 + x], total[p2 + x], total[p3 + x], total[p4 + x] = sums
+    for x in range(np.uint64(length)):
+        a, b = total[x], total[p1 + x]
+        size = np.sqrt(a * a + b * b) if by_amplitude else total[p2 + x]
+        filtered[0, x] = a
+        filtered[1, x] = b
+        # nothing is kept if the whole window is saturated
+        filtered[2, x] = size / max(total[p3 + x], SMALLEST)
+        edge[x] = -HALF * total[p4 + x] / (of_bright if planes[middle + p2 + x] > dim else TINY)
+
+
+@numba.njit(**FAST)
+def _padded(space):  # type: ignore[no-untyped-def]
+    """Return the weights of a window, flat, with zeros up to a multiple of `TOGETHER`."""
+    weights = np.zeros((space.size + TOGETHER - 1) // TOGETHER * TOGETHER, np.float32)
+    weights[: space.size] = space.ravel()
+    return weights
+
+
+@numba.njit(**FAST)
 def filter_image(unit, amplitude, settings, filtered, edge):  # type: ignore[no-untyped-def]
     """Filter the phasors of one frequency, ``unit`` (2, h, w) and ``amplitude`` (h, w), with weights space
     exp(-concentration (1 - cos dphi)); the window is clipped at the border. Writes ``filtered`` (3, h, w): phasor (re,
@@ -169,13 +183,14 @@ def filter_image(unit, amplitude, settings, filtered, edge):  # type: ignore[no-
     h, w = amplitude.shape
     side = settings.space.shape[0]
     half = side // 2
-    rows = np.zeros(3 * side * STRIDE, np.float32)
-    starts = np.empty(side * side, np.int64)
-    for dy in range(side):
+    # the last row stays outside, and so do the neighbours that fill up the list
+    rows, space = np.zeros(3 * (side + 1) * STRIDE, np.float32), _padded(settings.space)
+    starts = np.full(space.size, 3 * side * STRIDE)
+    for dy in range(side + 1):
         rows[(3 * dy + 2) * STRIDE : (3 * dy + 3) * STRIDE] = OUTSIDE
-        for dx in range(side):
+        for dx in range(side if dy < side else 0):
             starts[dy * side + dx] = 3 * dy * STRIDE + dx
-    total = np.empty(7 * STRIDE, np.float32)
+    total = np.empty(5 * STRIDE, np.float32)
     for y in range(h):
         for dy in range(-half, half + 1):
             re = 3 * (dy + half) * STRIDE + half
@@ -189,21 +204,22 @@ def filter_image(unit, amplitude, settings, filtered, edge):  # type: ignore[no-
             else:
                 rows[amp : amp + w] = OUTSIDE
         centre = 3 * half * STRIDE + half
-        _filter_row(rows, centre, starts, w, settings, total, filtered[:, y], edge[y])
+        _filter_window(rows, centre, starts, space, w, settings, total, filtered[:, y], edge[y])
 
 
 @numba.njit(**FAST)
 def filter_listed(planes, window, settings, filtered, edge):  # type: ignore[no-untyped-def]
-    """Filter listed pixels as `filter_image` does. ``planes`` (g, f, 3 lanes): from `noisy_phasors`. ``window`` (m, k):
-    indices into them, -1 for none. Writes ``filtered`` (f, 3, m, lanes) and ``edge`` (f, m, lanes)."""
+    """Filter listed pixels as `filter_image` does. ``planes`` (rows + 1, f, 3, stride): from `noisy_phasors`; the last
+    row is overwritten. ``window`` (m, k): indices of its pixels, -1 for none. Writes ``filtered`` (f, 3, m, lanes) and
+    ``edge`` (f, m, lanes)."""
     n_frequencies, _, m, _ = filtered.shape
-    flat = planes.reshape(planes.size)
-    k = window.shape[1]
-    starts = np.empty(k, np.int64)
-    total = np.empty(7 * LANES, np.float32)
+    planes[-1] = OUTSIDE
+    flat, space, k = planes.reshape(planes.size), _padded(settings.space), window.shape[1]
+    none, total = (len(planes) - 1) * n_frequencies * 3 * STRIDE, np.empty(5 * STRIDE, np.float32)
+    starts = np.full(space.size, none)
     for p in range(m):
         for f in range(n_frequencies):
             for q in range(k):
-                starts[q] = (window[p, q] * n_frequencies + f) * BLOCK if window[p, q] >= 0 else -1
-            centre = starts[k // 2]
-            _filter_frames(flat, centre, starts, LANES, settings, total, filtered[f, :, p], edge[f, p])
+                starts[q] = _place(window[p, q], f, n_frequencies) if window[p, q] >= 0 else none
+            out = filtered[f, :, p], edge[f, p]
+            _filter_window(flat, starts[k // 2], starts, space, LANES, settings, total, *out)

@@ -58,8 +58,9 @@ class Filtered(NamedTuple):
     """Each pixel after the filter, (f, n) float64: mean ``phasor`` (complex, length 1) and ``amplitude``; ``turned``
     and ``spread``: deviations of the phase in radians and of the amplitude. ``left_out``: share of the phase's variance
     that is not of first order; infinite if neighbours are too noisy, or if it is uncertain whether they count.
-    ``edge``, ``edge_spread``: mean and deviation of the sum over neighbours of (1 - cos)/2, infinite if unknown.
-    ``edge_least``: a lower bound of that mean, and ``edge_loose``, a bound of its deviation: they hold at any noise."""
+    ``edge``, ``edge_spread``: mean and deviation of the sum over neighbours of (1 - cos)/2, with those of which it is
+    uncertain whether they count; infinite if unknown. ``edge_least``, ``edge_loose``: the same without those; if
+    unknown, a lower bound of the mean and a bound of the deviation that hold at any noise."""
 
     phasor: np.ndarray
     amplitude: np.ndarray
@@ -207,41 +208,42 @@ def _look_around(i, light, window, shape, wild, lost, near):  # type: ignore[no-
 @numba.njit(**FAST)
 def _edge_of(i, light, window, near, out):  # type: ignore[no-untyped-def]
     """Write the edge sum's mean, deviation and bounds. Return whether the window is too noisy for mean and deviation,
-    and whether they are right: it is certain which neighbours count, and these are not too noisy."""
+    and whether they are right: no neighbour counts, or none is too noisy."""
     own = light.turn[i]
     noisy = own > NOISY
     mean, variance, sines, cosines = 0.0, 0.0, 0.0, 0.0
     longest, loose = 0.0j, 0.0
-    counted, doubtful = 0, False
+    counted, doubtful = 0, 0
     for q in near.others:
         j, between = near.at[q], near.between[q]
         turn = light.turn[j]
         noisy = noisy or turn > NOISY
-        if not window.dim_edges:
-            reach = DEVIATIONS * light.amplitude[j] * light.swell[j]
-            if light.bright[j] + reach < window.dim:
-                continue
-            if light.amplitude[j] - reach <= window.dim:
-                doubtful = True
-                continue
-        counted += 1
+        reach = 0.0 if window.dim_edges else DEVIATIONS * light.amplitude[j] * light.swell[j]
+        if not window.dim_edges and light.bright[j] + reach < window.dim:
+            continue
         shrunk = 1.0 - 0.5 * (turn * turn + own * own)
         mean += 0.5 * (1.0 - between.real * max(shrunk, 0.0))
         sines += 0.5 * between.imag
         cosines += 0.25 * between.real
         variance += (0.5 * between.imag * turn) ** 2
         variance += (0.25 * between.real) ** 2 * (2.0 * turn * turn * (turn * turn + 2.0 * own * own))
+        if not window.dim_edges and light.amplitude[j] - reach <= window.dim:
+            doubtful += 1
+            continue
+        counted += 1
         # a phase's mean resultant length is concave in 1 / turn, so its slope at 0, sqrt(pi / 8), bounds it
         longest += between * min(1.0, 0.6267 / max(turn, 1e-9))
         # (1 - cos)/2 of any phase scatters no more than that of a uniform one, 1/8; of a known phase, by half its noise
         loose += min(0.125, 0.25 * turn * turn) if turn < NOISY else 0.125
     out.edge[i] = mean
     out.edge_spread[i] = np.sqrt(variance + (sines * own) ** 2 + 2.0 * (cosines * own * own) ** 2)
+    known = counted + doubtful == 0 or not noisy
     # the centre's own noise turns it at most that far or, where that is large, to any angle
     away = max(abs(np.angle(longest)) - DEVIATIONS * own, 0.0) if own < NOISY else 0.0
-    out.edge_least[i] = 0.5 * (counted - abs(longest) * np.cos(away))
-    out.edge_loose[i] = np.sqrt(loose)
-    return noisy, not doubtful and (counted == 0 or not noisy)
+    exact = known and doubtful == 0
+    out.edge_least[i] = mean if exact else 0.5 * (counted - abs(longest) * np.cos(away))
+    out.edge_loose[i] = out.edge_spread[i] if exact else np.sqrt(loose)
+    return noisy, known
 
 
 @numba.njit(**FAST)

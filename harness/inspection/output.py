@@ -1,4 +1,4 @@
-"""Presents the results as text on the terminal, as facts for the JSON, and as a 3-D scene for the browser."""
+"""The results as text for the terminal, as facts for JSON files, and as a 3-D scene for the browser."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from detectors.recordings import Recording
     from detectors.views import PreparedView
 
-WIDEST_NATIVE_PX = 6.5  # Known cameras' own filters average 5 pixels at most; a measured reach scatters by a pixel
+WIDEST_NATIVE_PX = 6.5  # filters of known cameras average at most 5 pixels; a measured reach scatters by one
 
 
 def mm(metres: float) -> str:
@@ -35,19 +35,19 @@ def number(value: float | None, digits: int) -> str:
 
 
 def print_warnings(warnings: Iterable[str]) -> None:
-    """Print a line for each reason why the numbers are unreliable; call it before printing anything else."""
+    """Print one line for each reason why the numbers are unreliable, before anything else."""
     for warning in warnings:
         print(f"warning: {warning}")
 
 
 def print_notes(notes: Iterable[str]) -> None:
-    """Print a line for each fact that helps to interpret the numbers."""
+    """Print one line for each fact that helps to interpret the numbers."""
     for note in notes:
         print(f"note: {note}")
 
 
 def print_capture(recording: Recording, cloud: Cloud, name: str, kept: np.ndarray, crop: str) -> None:
-    """Print the frames, each frame left out, and the number of the cloud's points that the crop keeps (``kept``)."""
+    """Print the frames, those left out, and the points that the crop keeps (``kept``, of the cloud), one per line."""
     height, width = cloud.valid.shape
     size = f"{width} x {height} pixels" if cloud.organised else f"{width} points"
     print(f"{name}: {cloud.n_frames} frame{'s' * (cloud.n_frames != 1)} averaged, {size}")
@@ -86,24 +86,24 @@ def capture_facts(recording: Recording, cloud: Cloud) -> dict[str, Any]:
 
 
 def choice_by(settings: object, cloud: Cloud) -> Choice | None:
-    """Return the choice of the automatic crop in ``settings``, None for another crop. Raises UserError."""
+    """Return the automatic crop's choice by settings; None for another crop. Raises UserError as the crop does."""
     config = getattr(settings, "crop", None)
     return choice_of(cloud, config) if isinstance(config, AutoCrop) and cloud.valid.any() else None
 
 
 def print_choice(choice: Choice | None) -> None:
-    """Print the surface that was chosen, and a line for each other candidate with the option that chooses it."""
+    """Print the surface that was taken, and each other candidate with the option that takes it, one per line."""
     if choice is None or not choice.candidates:
         return
     texts = list(map(described_text, choice.candidates))
     print(f"target {choice.taken} of {len(texts)}: {texts[choice.taken - 1]}")
     for n, text in enumerate(texts, start=1):
         if n != choice.taken:
-            print(f"  alternative, with --target {n}: {text}")
+            print(f"  instead, with --target {n}: {text}")
 
 
 def choice_facts(choice: Choice | None) -> dict[str, Any] | None:
-    """Return the facts about a choice for the JSON; None if there was no choice."""
+    """Return the choice's facts for the JSON; None if there was none."""
     if choice is None:
         return None
     candidates = [
@@ -123,7 +123,7 @@ def choice_facts(choice: Choice | None) -> dict[str, Any] | None:
 
 
 def pictures(choice: Choice | None, name: str = "targets.png") -> dict[str, Callable[[Path], object]]:
-    """Return the function that writes the numbered candidates' picture, by name, for `write_findings`."""
+    """Return the writer of the candidates' numbered picture, by file name, for `report.findings.write_findings`."""
     if choice is None or not choice.candidates:
         return {}
     outlines = [candidate.outline for candidate in choice.candidates]
@@ -132,7 +132,7 @@ def pictures(choice: Choice | None, name: str = "targets.png") -> dict[str, Call
 
 
 def print_registrations(data: Mapping[str, Any]) -> None:
-    """Print the ``data`` of registrations.json: a table with a line per view, then notes."""
+    """Print ``data`` of registrations.json: a table with one view per line, then notes."""
     columns = {
         "residual mm": ("residual_mm", 3), "overlap": ("overlap", 2), "in plane mm": ("predicted_in_plane_mm", 3),
         "across mm": ("predicted_across_mm", 3), "held out mm": ("held_out_mark_mm", 3), "pairs": ("pairs", 0),
@@ -148,14 +148,14 @@ def print_registrations(data: Mapping[str, Any]) -> None:
 
 
 def threshold_text(threshold: float, evidence: Evidence) -> str:
-    """Return the threshold as text, with its length at a typical point if the score has one."""
+    """Return the threshold and, if a unit of score has a length, its length at a typical point."""
     if evidence.unit:
         return f"{threshold:.4g} units of score"
     return f"{threshold:.4g} x {mm(evidence.scale_m)} = {mm(threshold * evidence.scale_m)} at the median point"
 
 
 def print_findings(findings: Sequence[Finding], grid: str = "px") -> None:
-    """Print the findings, strongest first. ``grid`` is the unit of u and v."""
+    """Print the findings, strongest first. ``grid``: the unit of u and v."""
     if not findings:
         print("no findings")
         return
@@ -196,7 +196,7 @@ def scene_of(mapped: Mapped, judged: Judged) -> Scene3d:
         circles=tuple(circles),
         facts=(
             ("views", str(len(merged.views_used))),
-            ("frames in total", str(sum(view.view.cloud.n_frames for view in mapped.views))),
+            ("frames in all", str(sum(view.view.cloud.n_frames for view in mapped.views))),
             ("registration", mapped.registrations[-1].method),
             ("findings", str(len(judged.findings))),
         ),
