@@ -51,7 +51,7 @@ def programs() -> dict[str, str]:
     """Return the programs by name, with the first sentence of each description."""
     found = {}
     for path in sorted(Path(__file__).parent.glob("*.py")):
-        # read the source instead of importing it, so that the list appears at once
+        # reading the source is faster than importing it, so that the list appears at once
         source = path.read_text(encoding="utf-8")
         if "\ndef main(" in source and path.stem not in ("__main__", PART_OF_SET_UP):
             text = ast.get_docstring(ast.parse(source)) or ""

@@ -1,6 +1,6 @@
 """tofpod from Python, as ``import tofpod`` (or ``harness.api``): a facade over the programs.
 
-Build a target, render what a camera sees of it, draw noisy frames, average them, look for damage:
+Build a target, render what a camera sees of it, draw noisy frames, average them, and search for damage:
 
     >>> import tofpod
     >>> board = tofpod.target(
@@ -15,10 +15,10 @@ Build a target, render what a camera sees of it, draw noisy frames, average them
     >>> found = tofpod.detect(cloud, "thesis", threshold=8.0, crop={"kind": "auto", "inset_px": 4})
     >>> len(found.findings), found.findings[0].kind
     (1, 'hole')
-    >>> figure = tofpod.plot(found)  # a Figure of Matplotlib
+    >>> figure = tofpod.plot(found)  # a Matplotlib Figure
 
-Examples below go on from this one. A real capture goes the same way from `load`; whole experiments are run by `sweep`.
-A program's error message is a `UserError` here. Units are SI, unless names state another.
+The examples below continue this one. For a real capture, start with `load`; `sweep` runs whole experiments. A program's
+error message is raised as a `UserError`. Units are SI unless a name states another unit.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ __all__ = [
 
 
 def target(what: str | Path | Mapping[str, Any], board: int = 0, *, hole_free: bool = False) -> TargetConfig:
-    """Return a target: a named one, that of a YAML or JSON file, or that of a declaration as plain data. ``board``:
-    which damaged board of a family (``name: drawn``). Raises UserError with every mistake of the declaration.
+    """Return a target by its name, from a YAML or JSON file, or from a declaration as plain data. ``board`` selects a
+    damaged board of a family (``name: drawn``). Raises UserError with every mistake in the declaration.
 
     >>> len(tofpod.target("thesis").damages), len(tofpod.target("thesis", hole_free=True).damages)
     (11, 0)
@@ -79,8 +79,8 @@ def render(
     target: TargetConfig, camera: str, *, unit_seed: int = 1, cache: str | Path = "results/.cache/renders", **work: Any
 ) -> SimulatedUnit:
     """Render what a unit of a camera sees of a target, without noise. ``unit_seed`` draws the unit's fixed pattern;
-    ``cache``: the folder in which renders are kept; ``work``: settings of `scenes.optics.RenderConfig`, such as
-    ``bounces``. Raises UserError where the camera is unknown or does not see the target.
+    ``cache`` is the folder for stored renders; ``work`` holds settings of `scenes.optics.RenderConfig`, such as
+    ``bounces``. Raises UserError if the camera is unknown or does not see the target.
 
     >>> unit = tofpod.render(board, "kinect_v2", bounces=0)
     >>> unit.region.shape[1] > 50
@@ -93,7 +93,7 @@ def render(
 
 
 def frames(unit: SimulatedUnit, count: int, seed: int = 1) -> FrameSource:
-    """Return ``count`` simulated frames; they are drawn while they are read. ``seed`` draws the noise.
+    """Return ``count`` simulated frames, which are drawn while they are read. ``seed`` draws the noise.
 
     >>> [frame.z_m.shape == unit.region.shape for frame in tofpod.frames(unit, 2).frames()]
     [True, True]
@@ -104,14 +104,14 @@ def frames(unit: SimulatedUnit, count: int, seed: int = 1) -> FrameSource:
 
 
 def load(*paths: str | Path, unit: str | None = None) -> FrameSource:
-    """Open a real capture of any format that ``python -m harness.detect`` reads: files, or one folder. ``unit``: of
-    stored depth, such as ``mm`` or ``4000/m``, where the files do not say. Raises UserError as that program does."""
+    """Open a real capture (files or a folder) of any format that ``python -m harness.detect`` reads. ``unit`` is that
+    of the stored depth, such as ``mm`` or ``4000/m``, if the files do not state it. Raises UserError."""
     return open_capture([Path(path) for path in paths], unit=unit)
 
 
 def average(frames: FrameSource, method: str = "mean", **settings: Any) -> Cloud:
-    """Average all frames to one cloud, whose ``points_m`` (h, w, 3) are in the camera's frame, NaN where invalid.
-    ``settings`` as of `detectors.average.AverageConfig`. Raises UserError.
+    """Average all frames to a cloud, whose ``points_m`` (h, w, 3) are in the camera's frame, NaN where invalid.
+    ``settings`` are those of `detectors.average.AverageConfig`. Raises UserError.
 
     >>> tofpod.average(tofpod.frames(unit, 3), "median").n_frames
     3
@@ -120,10 +120,10 @@ def average(frames: FrameSource, method: str = "mean", **settings: Any) -> Cloud
 
 
 def detect(cloud: Cloud, detector: str = DEFAULT_DETECTOR, threshold: float | None = None, **settings: Any) -> Judged:
-    """Look for damage. Without a ``threshold`` (units of the detector's score) it is set by the cloud's own noise, as
-    ``python -m harness.detect`` does; the ``evidence.warnings`` of the answer say where that cannot be trusted.
-    ``settings``: the detector's; the default one's surface has a shape chosen by evidence, unless they state it.
-    Raises UserError where the cloud cannot be judged.
+    """Search for damage. Without a ``threshold`` (in units of the detector's score), the cloud's own noise sets it, as
+    in ``python -m harness.detect``; ``evidence.warnings`` of the result say if that is not reliable. ``settings`` are
+    those of the detector; the default detector chooses the shape of its surface by evidence unless they state it.
+    Raises UserError if the cloud cannot be judged.
 
     >>> tofpod.detect(cloud, "thesis", threshold=-1)
     Traceback (most recent call last):
@@ -141,7 +141,7 @@ def detect(cloud: Cloud, detector: str = DEFAULT_DETECTOR, threshold: float | No
 
 
 def findings_table(found: Judged) -> pd.DataFrame:
-    """Return the findings of `detect` as a DataFrame, strongest first; columns as of `Finding`.
+    """Return the findings of `detect` as a DataFrame, strongest first; the columns are the fields of `Finding`.
 
     >>> tofpod.findings_table(found)[["kind", "size_from"]].values.tolist()
     [['hole', 'model']]
@@ -157,9 +157,9 @@ def plot(found: Judged, title: str = "") -> Figure:
 
 
 def sweep(experiment: str | Path, *changes: str, out: str | Path = "results", jobs: int = 1) -> Path:
-    """Run an experiment, or what is missing of it, and return the folder of its results. ``changes``: as of ``--set``,
-    such as ``"repeats=5"``. With ``jobs`` above 1 it runs processes: a script then needs ``if __name__ ==
-    "__main__":``. Raises UserError for a wrong experiment, and where trials failed.
+    """Run an experiment, or its missing trials, and return its results folder. ``changes`` are those of ``--set``, such
+    as ``"repeats=5"``. With ``jobs`` above 1 it starts processes, so that a script needs ``if __name__ ==
+    "__main__":``. Raises UserError for a wrong experiment, or if trials failed.
 
     >>> tofpod.sweep("averaging", "repeats=0")
     Traceback (most recent call last):
@@ -173,12 +173,12 @@ def sweep(experiment: str | Path, *changes: str, out: str | Path = "results", jo
     if code == 130:
         raise KeyboardInterrupt
     if code:
-        raise UserError(f"{experiment}: trials failed, as printed above", fix="correct the cause, and run it again")
+        raise UserError(f"{experiment}: trials failed, as printed above", fix="correct the cause and run it again")
     return found.folder(out)
 
 
 def table(folder: str | Path, name: str) -> pd.DataFrame:
-    """Read a table of a folder of results (`results/README.md` explains them). Raises UserError where it has none."""
+    """Read a table of a results folder (`results/README.md` describes them). Raises UserError if it is missing."""
     import pandas as pd
 
     tables = {path.stem: path for path in sorted(Path(folder).glob("*.parquet"))}
@@ -188,13 +188,13 @@ def table(folder: str | Path, name: str) -> pd.DataFrame:
 
 
 def limits(folder: str | Path) -> tuple[SetUpLimit, ...]:
-    """Return the detection limits of a study, such as ``results/detection_limit/latest``: ``a90_mm``, ``a90_95``,
-    ``statement`` (the curve) and so on. Raises UserError where it is no study."""
+    """Return the detection limits of a study, such as ``results/detection_limit/latest``, with ``a90_mm``, ``a90_95``,
+    ``statement`` (the curve) and so on. Raises UserError if the folder holds no study."""
     return tuple(limit_of(record) for record in read_record(Path(folder)).set_ups)
 
 
 def plot_pod(limits: Sequence[SetUpLimit]) -> Figure:
-    """Draw curves of detection with their bands on one chart, for what `limits` returns."""
+    """Draw the POD curves of `limits` with their bands in a single chart."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8.6, 5.0), layout="constrained")

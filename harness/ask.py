@@ -1,4 +1,4 @@
-"""``python -m harness.ask``: which camera finds a damage, how far away, with how many frames, from stored limits."""
+"""``python -m harness.ask``: which camera finds a damage, at which distance, with how many frames, by stored limits."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ BEST = "matched"
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--damage", default="through", metavar="KIND", help="hole (through; the default), blind, dent, ...")
-    add("--size", metavar="LENGTH", help="size of the damage (of a hole: its diameter), such as 5mm or 0.25in")
-    add("--depth", metavar="LENGTH", help="the damage's depth, where the atlas has several")
+    add("--size", metavar="LENGTH", help="size of the damage (diameter of a hole), such as 5mm or 0.25in")
+    add("--depth", metavar="LENGTH", help="depth of the damage, if the atlas has several")
     add("--distance", metavar="LENGTH", help="distance from camera to target, such as 1m")
     add("--frames", type=int, metavar="N", help="frames averaged (default: the fewest and the most of the atlas)")
     add("--albedo", type=float, metavar="A", help="albedo of the target (default: the extremes of the atlas)")
     add("--camera", action="append", metavar="NAME", help="only this camera; may be repeated")
     add("--detector", metavar="NAME", help=f"only this detector (default: {BEST}, else the first)")
-    add("--atlas", type=Path, metavar="PATH", help="limits.parquet of a study, or its folder (default: the stored one)")
+    add("--atlas", type=Path, metavar="PATH", help="limits.parquet of a study, or its folder (default: tofpod's own)")
     add("--out", type=Path, metavar="DIR", help=f"folder for the whole atlas: {ATLAS_PAGE.name}, a picture, atlas.csv")
 
 
 @program(
     _options,
-    "State which cameras find damage of a given size nine times in ten at a given distance, with how many frames, "
+    "State which cameras find damage of a given size nine times out of ten at a given distance, with how many frames, "
     "from a stored table of limits of simulated set-ups (experiments/atlas.yaml), with intervals. Nothing is "
     "extrapolated.",
     epilog="example: python -m harness.ask --damage hole --size 5mm --distance 1m",
@@ -56,7 +56,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     ends = sum(given is not None for given in (options.size, options.distance))
     if ends == 1 or (not ends and options.out is None):
         legal = "--damage hole --size 5mm --distance 1m, or --out DIR for the whole atlas"
-        raise UserError("a question needs --size and --distance", legal=legal)
+        raise UserError("--size and --distance are needed", legal=legal)
     limits, about = _read(options.atlas or shipped("baselines") / STORED)
     surfaces = surfaces_of(limits)
     titles = {name: load_camera(name).title for name in dict.fromkeys(surface.camera for surface in surfaces)}
@@ -74,7 +74,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def _read(path: Path) -> tuple[Any, dict[str, Any]]:
-    """Return the table of limits and the data stored with it. Raises UserError if it is no such table."""
+    """Return the table of limits and the data that is stored with it. Raises UserError if it is no such table."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -83,19 +83,19 @@ def _read(path: Path) -> tuple[Any, dict[str, Any]]:
     file = path / "limits.parquet" if path.is_dir() else path
     legal = "limits.parquet of a study over cameras and distances, as experiments/atlas.yaml makes it"
     if not file.is_file():
-        raise UserError(f"{file}: there is no such table of limits", legal=legal, fix="tofpod sweep atlas computes it")
+        raise UserError(f"{file}: there is no such table of limits", legal=legal, fix="run tofpod sweep atlas")
     try:
         table = pq.read_table(file)
     except (OSError, pa.ArrowException) as error:
         raise UserError(f"{file}: cannot be read as a table of limits: {error}", legal=legal) from error
     needed = (atlas.CAMERA, atlas.DAMAGE, atlas.AXES["distance_m"], "frames", "a90_mm", "a90_low_mm", "largest_mm")
     if missing := [name for name in needed if name not in table.column_names]:
-        raise UserError(f"{file}: it lacks the columns {', '.join(missing)}", legal=legal)
+        raise UserError(f"{file}: lacks the columns {', '.join(missing)}", legal=legal)
     return table.to_pandas(), json.loads((table.schema.metadata or {}).get(b"tofpod", b"{}"))
 
 
 def _warnings(cameras: Iterable[str]) -> list[str]:
-    """Return warnings about cameras whose precision is a guess, one for all that are guessed in the same way."""
+    """Return warnings about cameras whose precision is a guess, with a common warning for equal guesses."""
     from scenes.sensor.camera import guessed_precision, load_camera
 
     alike: dict[str, list[str]] = {}
@@ -138,7 +138,7 @@ def _answer(options: argparse.Namespace, surfaces: Sequence[LimitSurface], title
     refused = [reason if of == all_chosen else f"{', '.join(sorted(of))}: {reason}" for reason, of in whose.items()]
     if not rows:
         fix = f"compute it: {_exactly(chosen[0], places[0], about)}"
-        raise UserError("the atlas does not reach so far: " + "; ".join(refused), fix=fix)
+        raise UserError("the atlas does not cover this: " + "; ".join(refused), fix=fix)
     for text in _warnings(row.surface.camera for row in rows):
         print(f"warning: {text}")
     verdicts = [row.answer.verdict(size_mm) for row in rows]
@@ -147,7 +147,7 @@ def _answer(options: argparse.Namespace, surfaces: Sequence[LimitSurface], title
     asked_for = f"{damage_words(kind).capitalize()}s of {size_mm:g} mm at {distance_m:g} m"
     answer = f"{asked_for} are found nine times out of ten in {of_all}"
     errors = [row.surface.error for row in rows if np.isfinite(row.surface.error)]
-    left_out = f"a90 of set-ups left out is predicted within {100 * max(errors, default=0):.0f} % (rms)"
+    left_out = f"the error of a90 at set-ups left out of the fit is {100 * max(errors, default=0):.0f} % (rms) at most"
     missed = f"; {left_out}" if errors else ""
     study, heads = about.get("experiment", "the study"), {} if len(given["albedo"]) > 1 else {"albedo": ""}
     notes = [f"Simulated: one unit of each camera, under the conditions of {study}.yaml{missed}."]
@@ -186,7 +186,7 @@ def length_m(option: str, text: str) -> float:
 
 
 def _exactly(surface: LimitSurface, place: Mapping[str, float], about: dict[str, Any]) -> str:
-    """Return the command that computes a set-up by its own study."""
+    """Return the command of a study that computes the set-up itself."""
     from harness.evaluation import atlas
 
     axes: dict[str, Any] = {atlas.CAMERA: surface.camera, "capture.frames": int(place["frames"])}

@@ -12,7 +12,7 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
 
 CAMERA_FILE = "my_camera.yaml"
-REPEATED = 0.15  # relative error of the simulated noise from which on the camera file counts as wrong
+REPEATED = 0.15  # relative error of the simulated noise above which the camera file counts as wrong
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -27,19 +27,19 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--rate", type=float, metavar="FPS", help="frames per second (default: that of --like, or 30)")
     add("--title", default="my camera", help="the camera's and the unit's name on page and certificate")
     add("--certificate", action="store_true", help="write also a certificate of two pages, certificate.html and .json")
-    study = "results of harness.sweep with a study, or of harness.implant, whose limits the certificate quotes"
+    study = "results folder of a study (harness.sweep or harness.implant), whose limits the certificate quotes"
     add("--study", type=Path, metavar="DIR", help=study)
-    about = "what to state about the unit, such as serial=1234, firmware=1.6, warm-up='40 minutes'; may be repeated"
+    about = "a fact about the unit, such as serial=1234, firmware=1.6, warm-up='40 minutes'; may be repeated"
     add("--about", action="append", default=[], metavar="KEY=TEXT", help=about)
 
 
 @program(
     _options,
-    "Measure a depth camera on static captures, best of a matte wall that fills the view: noise "
+    "Measure a depth camera on static captures, preferably of a matte wall that fills the view: noise "
     "against range, angle and amplitude, correlation, dropouts, displaced frames, fixed pattern, fill rate, edges. "
     "Write a page, tables, and my_camera.yaml, a camera for experiments (source.camera.name: ./my_camera.yaml). "
-    "Each PATH is one capture of 50 frames or more, in any format that harness.detect reads, in the order of time; "
-    "captures at several distances, moved by 30 mm or more, tell most.",
+    "Each PATH is a capture of 50 frames or more, in any format that harness.detect reads, in order of time. Captures "
+    "at several distances, with the camera moved sideways by 30 mm or more, show the most.",
     epilog="example: python -m harness.characterise near far --like azure_kinect_nfov --out my_camera",
 )
 def main(options: argparse.Namespace, command: str) -> int:
@@ -55,13 +55,13 @@ def main(options: argparse.Namespace, command: str) -> int:
     from scenes.sensor.camera import load_camera
 
     if not 0 < options.albedo <= 1:
-        raise UserError(f"--albedo {options.albedo:g}", legal="above 0 and up to 1")
+        raise UserError(f"--albedo {options.albedo:g}", legal="a number above 0, up to 1")
     if not options.certificate and (options.study or options.about):
         raise UserError("--study and --about need --certificate", fix="add --certificate, or leave them out")
-    if odd := [text for text in options.about if not text.partition("=")[2]]:
-        raise UserError(f"--about {odd[0]}: is not KEY=TEXT", legal="such as --about firmware=1.6")
+    if malformed := [text for text in options.about if not text.partition("=")[2]]:
+        raise UserError(f"--about {malformed[0]}: is not KEY=TEXT", legal="such as --about firmware=1.6")
     if options.rate is not None and not options.rate > 0:
-        raise UserError(f"--rate {options.rate:g}", legal="above 0 frames per second")
+        raise UserError(f"--rate {options.rate:g}", legal="a number above 0 (frames per second)")
     study = read_record(options.study) if options.study else None
     poses = read_poses(options.poses, len(options.paths)) if options.poses else None
     refuse_repeats(options.paths)
@@ -69,7 +69,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     recordings = [opened_as(options.like, [path], options.intrinsics, **reading) for path in options.paths]
     captures = list(map(read_still, recordings))
     if options.like:
-        with_lens(options.like, captures[0].lens)  # a camera of another image size cannot be refitted
+        with_lens(options.like, captures[0].lens)  # a camera with another image size cannot be refitted
     found = characteristics(captures, poses)
     rate_of = (options.rate, "stated by the user", "U") if options.rate else (30.0, "assumed", "M")
     if options.like and not options.rate:
@@ -82,11 +82,11 @@ def main(options: argparse.Namespace, command: str) -> int:
     twin = characteristics(simulated(camera, found, options.albedo), poses)
     sources = {MEASURED: found, SIMULATED: twin}
     known = options.like
-    with suppress(UserError):  # no camera has so large an image, or it sees none of the surfaces
+    with suppress(UserError):  # no camera has this image size, or it sees none of the surfaces
         known = known or camera_of_size(captures[0].lens)
         sources[KNOWN] = characteristics(simulated(with_lens(known, captures[0].lens), found, options.albedo), poses)
     rows, label = beside(found, twin, sources.get(KNOWN)), load_camera(known).title if known else ""
-    noise = ", ".join(f"{one.temporal.value:.3g} mm at {one.distance_m:.2f} m" for one in found.surfaces[:3])
+    noise = ", ".join(f"{face.temporal.value:.3g} mm at {face.distance_m:.2f} m" for face in found.surfaces[:3])
     answer = f"Temporal noise of single pixels: {noise}." if noise else "No flat surface was found."
     warnings = [*(warning for recording in recordings for warning in recording.warnings), *found.doubts]
     repeated = []
@@ -94,11 +94,11 @@ def main(options: argparse.Namespace, command: str) -> int:
         off = [abs(row.ratio - 1) for row in rows if row.figure == figure]
         worst = max(np.nan_to_num(off, nan=1.0), default=0.0)
         if worst > REPEATED:
-            wrong = f"{CAMERA_FILE} misses the captures' {figure} by up to {100 * worst:.0f} %"
-            warnings.insert(0, f"{wrong}: limits that are simulated with it are wrong, too")
+            wrong = f"the {figure} of {CAMERA_FILE} differs from the captures by up to {100 * worst:.0f} %"
+            warnings.insert(0, f"{wrong}: limits that are simulated with it are also wrong")
         elif noise:
             repeated.append(f"the {figure} within {100 * worst:.1g} %")
-    answer += f" {CAMERA_FILE} repeats {' and '.join(repeated)}." if repeated else ""
+    answer += f" {CAMERA_FILE} reproduces {' and '.join(repeated)}." if repeated else ""
     print_warnings(warnings)
     for recording, capture in zip(recordings, captures, strict=True):
         print(f"{recording.name}: {len(capture.z_m)} frames, {recording.unit_text}")

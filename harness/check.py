@@ -1,15 +1,15 @@
 """``python -m harness.check experiments/regression.yaml``: a gate that fails if a detection limit has become worse.
 
 The study is run and compared with a committed baseline by `harness.evaluation.study.verdict`. A set-up fails if its a90
-or its rate of false calls has grown, or its signals relative to the threshold have fallen, by more than 10 % and not by
-chance, as the tests show (at 0.1 % for the whole check). It also fails if its limit is lost, if more trials failed, or
-if it is missing. With the same seed and code nothing fails.
+or its rate of false calls has grown, or its signals relative to the threshold have fallen, by more than 10 % and the
+tests show that this is not by chance (at 0.1 % for the whole check). It also fails if its limit is lost, if more trials
+failed, or if it is missing. With the same seed and code nothing fails.
 
 Of 20 checks each with 1.2 and 1.4 times the camera's noise and with 1.2 times the threshold, all fail; of 25 whose a90
-grows by 20 % about the same a50, 11 fail; with another draw of all noise alone, 3 of 250 fail (95 %: 0.2 to 3.5 %), all
-by the signals (`tests/validation/gate_power.py`, boards as in regression.yaml). The diameter of through-holes hardly
-follows noise and threshold; the depth of blind holes is proportional to them. If both thresholds were calibrated anew,
-a90 must grow by two standard errors more (`verdict.limit_margin`)."""
+grows by 20 % at the same a50, 11 fail; with only another draw of all noise, 3 of 250 fail (95 %: 0.2 to 3.5 %), all by
+the signals (`tests/validation/gate_power.py`, boards as in regression.yaml). The limit of through-holes (a diameter)
+hardly depends on noise and threshold; that of blind holes (a depth) is proportional to them. If both thresholds were
+calibrated again, a90 must grow by two more standard errors (`verdict.limit_margin`)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ BASELINES = shipped("baselines")  # folder of the committed baselines, one ``<na
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("experiment", type=Path, help="a YAML file with a `study`, such as experiments/regression.yaml")
-    change = "change one value of the file, such as seed=7 for another draw of the noise; may be repeated"
+    change = "change a value of the file, such as seed=7 for another draw of the noise; may be repeated"
     add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
     add("--baseline", type=Path, metavar="FILE", help="default: results/baselines/<name of the experiment>.json")
     add("--update", action="store_true", help="write a new baseline, and print what changes")
@@ -42,9 +42,9 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Run a study of detection limits and compare it with its baseline. Fails (exit code 1) where a "
-    "limit, or the rate of false calls, has grown by more than 10 % and a paired test says that it is not by "
-    "chance, where a set-up has no limit any more, or where more trials fail.",
+    "Run a study of detection limits and compare it with its baseline. The check fails (exit code 1) if a "
+    "limit or the rate of false calls has grown by more than 10 % and a paired test shows that this is not by "
+    "chance, if a set-up no longer has a limit, or if more trials fail.",
     epilog="Finished trials are kept: the same command resumes after Ctrl-C or a fault.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
@@ -60,7 +60,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     experiment = load_experiment(options.experiment, options.overrides)
     study, set_ups = experiment.config.study, len(experiment.points)
     if study is None:
-        raise UserError(f"{options.experiment}: has no `study`", fix="name an experiment with one: it measures limits")
+        raise UserError(f"{options.experiment}: has no `study`", fix="name an experiment with a study of limits")
     needed = fewest_boards(set_ups)
     if study.boards < needed:  # no loss could ever be significant, so the gate would pass everything
         what = f"with {study.boards} boards no loss is significant at {100 * ALPHA:g} %: the check cannot fail"
@@ -84,15 +84,15 @@ def main(options: argparse.Namespace, command: str) -> int:
         print(f"comparison with the baseline: {folder / FILES[1]}")
     if options.update or comparison is None:
         if code == 1:
-            raise UserError(f"{path}: is unchanged, as trials failed", fix="correct the cause of the failures")
+            raise UserError(f"{path}: is unchanged, because trials failed", fix="correct the cause of the failures")
         write_text(path, record_text(found))
         print(f"wrote {path}")
         return 0
     missing = [row.label for row in comparison.marked("only in first")]
     if missing:
-        print(f"missing, and in the baseline: {'; '.join(missing)}", file=sys.stderr)
+        print(f"missing, although in the baseline: {'; '.join(missing)}", file=sys.stderr)
     if missing or any(row.is_worse for row in comparison.rows):
-        print("the check fails: if it is intended, run it again with --update and commit the baseline", file=sys.stderr)
+        print("the check fails; if this is intended, run it with --update and commit the baseline", file=sys.stderr)
         return 1
     if apart := comparison.marked("not comparable"):
         what = "; ".join(f"{row.label}: {row.why}" for row in apart)

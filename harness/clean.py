@@ -1,4 +1,4 @@
-"""``python -m harness.clean``: removes stored renders or folders of results, after a question."""
+"""``python -m harness.clean``: removes stored renders or results folders, after confirmation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from harness.vocabulary.program import program
 
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    what = "cache: stored renders, which are made again when they are needed; results: folders of results"
+    what = "cache: stored renders, which are made again when they are needed; results: results folders"
     add("what", choices=("cache", "results"), help=what)
     which = "name of the results, as listed by python -m harness.ls results"
     add("name", nargs="?", default="", metavar="NAME[/DIGEST]", help=which)
@@ -27,8 +27,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Remove stored renders or results. Only what tofpod wrote below --out is removed, links are never "
-    "followed, and what a running sweep uses is left alone.",
+    "Remove stored renders or results. Only files that tofpod wrote below --out are removed, links are never "
+    "followed, and files of a running sweep are kept.",
     epilog="examples: python -m harness.clean cache --limit 5GB; "
     "python -m harness.clean results averaging/69346a82f4194e03 --dry-run",
 )
@@ -98,7 +98,7 @@ def _agreed(options: argparse.Namespace, what: str, count: int) -> bool:
     if options.yes:
         return True
     if not sys.stdin.isatty():
-        raise UserError(f"this would remove {what}", fix="add --yes where nobody can confirm, or --dry-run to look")
+        raise UserError(f"cannot ask whether to remove {what}", fix="add --yes to confirm, or --dry-run to look")
     try:
         return input(f"remove {what}? [y/N] ").strip().lower() in ("y", "yes")
     except EOFError:

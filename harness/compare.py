@@ -19,10 +19,10 @@ FILES = (COMPARISON.name, COMPARISON_PAGE.name)
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("first", type=Path, metavar="A", help="a result folder of a sweep with a `study`, or its study.json")
-    add("second", type=Path, metavar="B", help="the other study, of the same form: is B worse or better than A?")
+    add("second", type=Path, metavar="B", help="the other study, in the same form: is B worse or better than A?")
     level = "significance level of the tests, for all set-ups together (default: 0.05)"
     add("--alpha", type=float, default=0.05, metavar="P", help=level)
-    add("--out", type=Path, metavar="DIR", help=f"write {' and '.join(FILES)} there as well")
+    add("--out", type=Path, metavar="DIR", help=f"also write {' and '.join(FILES)} to this folder")
 
 
 @program(
@@ -30,8 +30,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "Compare the detection limits of two studies: a90 and its change with an interval over boards, "
     "hits and false calls with tests, and a mark for each set-up: + worse, - better, ~ not significant, ! newly "
     "failing, x not comparable.",
-    epilog="Set-ups are paired by name and frames; where each study has one only, by that. Tests are paired where "
-    "both studies have the same boards. python -m harness.check fails if a detection limit grew.",
+    epilog="Set-ups are paired by name and frames; if each study has a single set-up, the two are paired. Tests are "
+    "paired if both studies have the same boards. python -m harness.check fails if a detection limit grew.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 for any result of the comparison, 2 for a user's mistake, 130 after Ctrl-C."""
@@ -44,9 +44,9 @@ def main(options: argparse.Namespace, command: str) -> int:
         raise UserError(f"--alpha {options.alpha:g}", legal="1e-6 to 0.5")
     first, second = read_record(options.first), read_record(options.second)
     if not any(one is not None and other is not None for one, other in paired_set_ups(first, second)):
-        both = " / ".join("; ".join(one.label for one in study.set_ups) for study in (first, second))
-        what = f"no set-ups can be paired: none has the same name and frames in both studies: {both}"
-        legal = "set-ups of the same name, or at the same values on the axes, and frames; or one set-up in each"
+        both = " / ".join("; ".join(set_up.label for set_up in study.set_ups) for study in (first, second))
+        what = f"no set-ups can be paired, since none has the same name and frames in both studies: {both}"
+        legal = "set-ups with the same frames and the same name or values on the axes; or a single set-up in each"
         raise UserError(what, legal=legal, fix="run both studies with the same `sweep`, or each with a single set-up")
     comparison = compare_studies(first, second, options.alpha)
     show(compare_parts(comparison))

@@ -1,4 +1,4 @@
-"""``python -m harness.dataset EXPERIMENT --boards 500 --out DIR``: writes boards with masks, to train and score on."""
+"""``python -m harness.dataset EXPERIMENT --boards 500 --out DIR``: writes boards with masks to train and score on."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ MOST = 10_000
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("experiment", type=Path, help="a YAML file, or the name of one that comes with tofpod, with random boards")
-    change = "change one value of the file, such as source.target.distance_m=0.9; may be repeated"
+    change = "change a value of the file, such as source.target.distance_m=0.9; may be repeated"
     add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
     add("--boards", type=int, required=True, metavar="N", help="boards for each set-up (camera, frames and so on)")
-    add("--out", type=Path, required=True, metavar="DIR", help="a new folder, or one that this command has begun")
+    add("--out", type=Path, required=True, metavar="DIR", help="a new folder, or the one of an unfinished run")
     add("--licence", default="CC-BY-4.0", metavar="NAME", help="the licence that the card states (default: CC-BY-4.0)")
-    results = "where experiments' results go: renders are taken from there, and kept there (default: results)"
+    results = "results folder of experiments, whose stored renders are used and extended (default: results)"
     add("--results", type=Path, default=Path("results"), metavar="DIR", help=results)
     add("--jobs", type=int, default=2, metavar="N", help="processes (default: 2)")
     add("--serial", action="store_true", help="run everything in this process, for a debugger")
@@ -37,8 +37,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Write a data set of simulated boards: organised clouds, depth, intensity, validity, masks and "
-    "truth, as NPZ and PNG, in the layout of MVTec 3D-AD, and as COCO masks.",
+    "Write a data set of simulated boards with organised clouds, depth, intensity, validity, masks and "
+    "truth: as NPZ and PNG, in the layout of MVTec 3D-AD, and as COCO masks.",
     epilog="Finished boards are kept: the same command resumes after Ctrl-C or a fault. "
     "python -m harness.score states the detection limit of any anomaly maps on it.",
 )
@@ -66,8 +66,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     with in_use(cache), locked(out), engine_of(EngineOptions(jobs=options.jobs, serial=options.serial)) as engine:
         failures = _written(out, samples, engine)
     if failures:
-        print(f"{len(failures)} jobs failed, the first: {failures[0]}", file=sys.stderr)
-        print("the same command continues with what is missing", file=sys.stderr)
+        print(f"{len(failures)} jobs failed; the first failure: {failures[0]}", file=sys.stderr)
+        print("run the same command again to write the missing boards", file=sys.stderr)
         return 1
     _finish(out, samples, about)
     print(f"wrote {out}: {len(samples)} boards in {len(about['categories'])} categories; README.md there explains them")
@@ -75,7 +75,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def _about(experiment: Experiment, licence: str, samples: list[Sample], command: str) -> dict[str, Any]:
-    """Return the header of ``dataset.json``; ``content`` is a digest of all that determines the files."""
+    """Return the header of ``dataset.json``; ``content`` is a digest of everything that determines the files."""
     from harness.engine.boards import DATASET_VERSION, categories_of
     from harness.engine.plan import PACKAGES
     from harness.vocabulary.provenance import record, source_digest
@@ -108,7 +108,7 @@ def _about(experiment: Experiment, licence: str, samples: list[Sample], command:
 
 
 def _written(out: Path, samples: list[Sample], engine: JobEngine) -> list[str]:
-    """Render missing views and write missing boards; return why jobs failed. Progress is shown on stderr."""
+    """Render missing views and write missing boards; return why jobs failed. Progress is printed to stderr."""
     from harness.engine.boards import TRUTH, joined, seen_region, write_board
     from harness.engine.estimate import progress_display
     from harness.engine.run import carried_out
@@ -143,7 +143,7 @@ def _written(out: Path, samples: list[Sample], engine: JobEngine) -> list[str]:
 
 
 def _finish(out: Path, samples: list[Sample], about: dict[str, Any]) -> None:
-    """Write the COCO files, the card and, last, the index, which marks the data set as complete."""
+    """Write the COCO files, the card, and finally the index, which marks the data set as complete."""
     from harness.engine.boards import INDEX, INSET_PX, SPLITS, read_truth
     from harness.exchange import coco_data
     from harness.report.blocks import template

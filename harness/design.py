@@ -16,7 +16,7 @@ LINKS = ("logit", "probit", "cloglog", "loglog")
 FILES = ("design.json", "design.png", "design.html")
 TARGETS = (30, 40, 60, 120)
 MOST_STUDIES = 100_000  # limited because simulated studies are kept in memory
-LEAST, MOST = 10, 10_000  # targets of a study: as many rows as python -m harness.pod requires; nobody makes more
+LEAST, MOST = 10, 10_000  # targets of a study: the rows that python -m harness.pod requires; nobody makes more
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -37,7 +37,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     put = parser.add_argument_group("hole-free boards").add_argument
     put("--false-calls-per-m2", type=float, metavar="RATE", help="wanted rate: states how much to inspect for it")
     put("--board-m2", type=float, metavar="AREA", help="face of one hole-free board (default: the study's)")
-    add("--out", type=Path, metavar="DIR", help=f"write {', '.join(FILES)} there as well")
+    add("--out", type=Path, metavar="DIR", help=f"also write {', '.join(FILES)} to this folder")
 
 
 # a curve and its origin, sizes to choose from, and the face of a hole-free board in m2 (None if unknown)
@@ -49,8 +49,8 @@ Guess = tuple["PodCurve", str, tuple[float, float], float | None]
     "Plan a hit/miss study from a guess of its probability of detection curve: simulate studies, "
     "analyse them like real ones, and state which a90/95 to expect, how many targets it takes, and which "
     "sizes to make.",
-    epilog="example: python -m harness.design --a50 5 --a90 7 --sizes 2 12 --goal 9. Takes about 5 ms a "
-    "simulated study.",
+    epilog="example: python -m harness.design --a50 5 --a90 7 --sizes 2 12 --goal 9. A simulated study takes about "
+    "5 ms.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 (also if no plan shows a limit), 2 for a user's mistake, 130 after Ctrl-C."""
@@ -84,11 +84,11 @@ def _refuse_what_does_not_belong(options: argparse.Namespace) -> None:
     belonging = [f"--{name}" for name in ("a50", "a90", "link", "log", "unit") if getattr(options, name) is not None]
     if options.study is not None and belonging:
         fix = f"leave one out: {belonging[0]} or --study"
-        raise UserError(f"{belonging[0]} and --study: the study has a curve, in mm", fix=fix)
+        raise UserError(f"{belonging[0]} and --study both state the curve (a study's is in mm)", fix=fix)
     missing = [f"--{name}" for name in ("a50", "a90", "sizes") if getattr(options, name) is None]
     if options.study is None and missing:
         legal = "--a50 SIZE --a90 SIZE --sizes FROM TO, or --study DIR"
-        fix = "guess from what is known; a study planned for too good a guess demonstrates nothing"
+        fix = "make a careful guess; a study that is planned for an optimistic guess demonstrates nothing"
         raise UserError(f"{', '.join(missing)}: not stated", legal=legal, fix=fix)
     for name, owner in (("set-up", "study"), ("board-m2", "false-calls-per-m2")):
         given, of = (getattr(options, each.replace("-", "_")) for each in (name, owner))
@@ -104,13 +104,13 @@ def _guess(options: argparse.Namespace) -> Guess:
 
     if options.study is None:
         curve = curve_through(options.a50, options.a90, options.link or "logit", log_size=bool(options.log))
-        return curve, "as told", tuple(options.sizes), None
+        return curve, "as stated", tuple(options.sizes), None
     study = read_record(options.study)
     record = set_up_named(study, options.set_up)
     limit = limit_of(record)
     if limit.statement is None:
-        fix = "state a guess in place of --study: --a50 SIZE --a90 SIZE --sizes FROM TO; or name another set-up"
-        raise UserError(f"{options.study}: {record.label} has no curve to guess from: {limit.why}", fix=fix)
+        fix = "state a guess instead of --study: --a50 SIZE --a90 SIZE --sizes FROM TO; or name another set-up"
+        raise UserError(f"{options.study}: {record.label} has no curve: {limit.why}", fix=fix)
     curve, origin = limit.statement.curve, f"fitted to {study.name}, {record.label}"
     seen, boards = record.inspected.size_mm, record.unflawed.area_m2
     sizes = options.sizes or (float(seen.min()), float(seen.max()))
@@ -118,15 +118,15 @@ def _guess(options: argparse.Namespace) -> Guess:
 
 
 def _check(options: argparse.Namespace, guess: Guess) -> None:
-    """Refuse arguments that would fail after minutes, or give nonsense."""
+    """Refuse arguments that would fail after minutes or give meaningless results."""
     curve, _, (low, high), board_m2 = guess
     a50, a90 = curve.size_at(0.5), curve.size_at(0.9)
     wrong = next((number for number in options.targets if not LEAST <= number <= MOST), None)
     # NaN compares false with everything, so every rule states the condition that must hold
     rules = (
         (0 <= low < high < float("inf"), f"--sizes {low:g} {high:g}: not a range", "0 <= FROM < TO"),
-        (low < a50 < high, f"sizes of {low:g} to {high:g} do not hold a50 = {a50:.4g}", "--sizes FROM < a50 < TO"),
-        (not curve.log_size or low > 0, "--sizes from 0 under a logarithm", "FROM above 0"),
+        (low < a50 < high, f"sizes of {low:g} to {high:g} do not include a50 = {a50:.4g}", "--sizes FROM < a50 < TO"),
+        (not curve.log_size or low > 0, "--sizes from 0 have no logarithm", "FROM above 0"),
         (wrong is None, f"--targets {wrong}", f"{LEAST} to {MOST}; MIL-HDBK-1823A asks for 60 at least"),
         (LEAST <= options.studies <= MOST_STUDIES, f"--studies {options.studies}", f"{LEAST} to {MOST_STUDIES}"),
     )

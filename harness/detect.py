@@ -1,11 +1,11 @@
-"""``python -m harness.detect``: finds the damage in a real capture; prints a table and, with --out, writes files."""
+"""``python -m harness.detect``: finds the damage in a real capture, prints a table and, with --out, writes files."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from harness.inspection import arguments as asked
+from harness.inspection import arguments as cli
 from harness.vocabulary.program import program, whole_number
 
 
@@ -17,12 +17,12 @@ def _options(parser: argparse.ArgumentParser) -> None:
     )
     add("paths", nargs="+", type=Path, metavar="PATH", help=formats)
     add("--out", type=Path, metavar="DIR", help="folder for tables, pictures and clouds (docs/recordings.md)")
-    asked.add_reading(add)
-    crop = f"the target: {asked.LEGAL_CROP}; auto: the nearest large smooth surface without its rim (crop.inset_px)"
+    cli.add_reading(add)
+    crop = f"the target: {cli.LEGAL_CROP}; auto: the nearest large smooth surface without its rim (crop.inset_px)"
     add("--crop", default="auto", metavar="KIND", help=crop)
-    target = "with --crop auto: inspect surface N of those that a run lists and targets.png shows"
+    target = "with --crop auto: inspect surface N of the list that a run prints and targets.png shows"
     add("--target", type=whole_number(10**9), metavar="N", help=target)
-    add("--detector", default=asked.DEFAULT_DETECTOR, help=f"name of the detector (default: {asked.DEFAULT_DETECTOR})")
+    add("--detector", default=cli.DEFAULT_DETECTOR, help=f"name of the detector (default: {cli.DEFAULT_DETECTOR})")
     setting = "a setting of the detector by dotted path: surface.degree=5"
     add("--set", action="append", default=[], metavar="KEY=VALUE", help=setting)
     mesh = "mesh of the undamaged part, registered to the cloud; --set surface.reference.unit=m, .front=-y"
@@ -30,7 +30,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     averages = ("mean", "median", "clipped")
     add("--average", choices=averages, default="mean", help="how frames are averaged (default: mean)")
     add("--max-frames", type=whole_number(10**9), metavar="N", help="use only the first N frames")
-    calls = f"expected number of false calls, by the noise towards the camera (default: {asked.DEFAULT_FALSE_CALLS:g})"
+    calls = f"expected number of false calls, by the noise towards the camera (default: {cli.DEFAULT_FALSE_CALLS:g})"
     add("--false-calls", type=float, metavar="N", help=calls)
     add("--threshold", type=float, metavar="K", help="threshold in units of score, instead of --false-calls")
     flat = "subtract this unit's fixed pattern, measured by harness.flatfield, from each capture"
@@ -42,27 +42,27 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group(
         "several views of one target",
         "Each PATH is one view. --crop cuts the target out of each view, and the detector judges the merged cloud (or"
-        " --set crop.kind=..). --set mapping.KEY=VALUE sets the rest: mapping.merge.cell_mm=1,"
-        " mapping.marks.dictionary=DICT_4X4_50, mapping.registration.points=target (icp and cpd on the whole target,"
-        " not on the points of the marks).",
+        " --set crop.kind=..). --set mapping.KEY=VALUE changes other settings: mapping.merge.cell_mm=1,"
+        " mapping.marks.dictionary=DICT_4X4_50, mapping.registration.points=target (icp and cpd use the whole target"
+        " instead of the points of the marks).",
     ).add_argument
-    add("--register", choices=asked.METHODS, metavar="METHOD", help=f"register the views by {', '.join(asked.METHODS)}")
+    add("--register", choices=cli.METHODS, metavar="METHOD", help=f"register the views by {', '.join(cli.METHODS)}")
     add(
         "--merge",
-        choices=asked.MERGES,
+        choices=cli.MERGES,
         metavar="KIND",
-        help=f"merge them by {', '.join(asked.MERGES)} (default: fusion)",
+        help=f"merge them by {', '.join(cli.MERGES)} (default: fusion)",
     )
-    marks = "marks: colour (strips that stand apart; default), red (the thesis' rule), coded (ArUco, AprilTag)"
-    add("--marks", choices=asked.MARKS, metavar="KIND", help=marks)
+    marks = "marks: colour (separate coloured strips; default), red (the thesis' rule), coded (ArUco, AprilTag)"
+    add("--marks", choices=cli.MARKS, metavar="KIND", help=marks)
     poses = "poses from which registration starts: JSON with 4x4 matrices in metres, or TUM's groundtruth.txt"
     add("--poses", type=Path, metavar="FILE", help=poses)
 
 
 @program(
     _options,
-    "Find damage in a real capture: average its frames, fit the surface, list what departs from it."
-    " With --register, each PATH is one view of the same target, and all of them become one cloud.",
+    "Find damage in a real capture: average its frames, fit the surface, and list what deviates from it."
+    " With --register, each PATH is one view of the same target, and all views are merged into one cloud.",
     epilog="examples: python -m harness.detect recording.mkv --crop box:-200,200,-150,150,400,900 --out found/"
     "; python -m harness.detect left.mcap right.mcap --register marks --merge fusion --out found/",
 )

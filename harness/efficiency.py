@@ -19,11 +19,11 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Compare the detectors of a simulated study with the ideal observer, which knows each damage's exact "
-    "signature and the covariance of the noise over units of the camera, but not the place: its a50 and a90 at the "
-    f"study's rate of false calls, and every detector's efficiency. Writes {EFFICIENCY_PAGE.name} and tables into "
+    "Compare the detectors of a simulated study with the ideal observer, which knows each damage's exact signature "
+    "and the covariance of the noise over units of the camera, but not the place of the damage. State its a50 and a90 "
+    f"at the study's rate of false calls, and every detector's efficiency. Write {EFFICIENCY_PAGE.name} and tables to "
     "the study's folder.",
-    epilog="It takes some seconds per damaged board. Views that are not in the store of renders are rendered again.",
+    epilog="The program takes some seconds per damaged board. Views without a stored render are rendered again.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""
@@ -52,7 +52,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     experiment, rate = load_experiment(folder / EXPERIMENT.name), study.false_calls_per_m2
     if any(point.config.mapping is not None or point.config.simulated.views for point in experiment.points):
         fix = "name a study of single views"
-        raise UserError(f"{study.name}: judges maps of several views, for which there is no ideal observer", fix=fix)
+        raise UserError(f"{study.name}: is a study of maps, for which there is no ideal observer", fix=fix)
     if rate is None:
         fix = "run the study with threshold.calibrate"
         raise UserError(f"{study.name}: its threshold was given, so there is no wanted rate of false calls", fix=fix)
@@ -61,20 +61,20 @@ def main(options: argparse.Namespace, command: str) -> int:
     detectors = {point.config.detector.name for point in experiment.points}
     with in_use(cache), locked(folder), engine_of(run_options, detectors) as engine:
         ideal = ideal_of_set_ups(plan, engine, rate)
-        if unknown := [one.label for one in study.set_ups if (one.variant, one.frames) not in ideal]:
-            what = f"{folder}: {EXPERIMENT.name} has no set-up {unknown[0]}, which {STUDY.name} has"
-            raise UserError(what, fix="name a folder as the sweep left it, or run the study again")
-        rows = [efficiency_of(limit_of(one), ideal[one.variant, one.frames]) for one in study.set_ups]
+        if unknown := [set_up.label for set_up in study.set_ups if (set_up.variant, set_up.frames) not in ideal]:
+            what = f"{folder}: {EXPERIMENT.name} lacks the set-up {unknown[0]} of {STUDY.name}"
+            raise UserError(what, fix="name an unchanged results folder, or run the study again")
+        rows = [efficiency_of(limit_of(set_up), ideal[set_up.variant, set_up.frames]) for set_up in study.set_ups]
         cameras, warnings = [point.config.simulated.camera for point in experiment.points], warnings_of(rows)
-        names = ", ".join(dict.fromkeys(one.name for one in cameras))
-        seeds = ", ".join(dict.fromkeys(str(one.unit_seed) for one in cameras))
+        names = ", ".join(dict.fromkeys(camera.name for camera in cameras))
+        seeds = ", ".join(dict.fromkeys(str(camera.unit_seed) for camera in cameras))
         first = (
-            f"The ideal observer is for a new unit of {names}, by the noise of {rows[0].ideal.units} units, at "
-            f"{rate:g} false call{'' if rate == 1 else 's'} per m², size and depth known; the detectors' hits are on "
-            f"unit {seeds}. Not modelled: missing returns, non-Gaussian tails, noise that differs within damage."
+            f"The ideal observer judges a new unit of {names} by the noise of {rows[0].ideal.units} units, at "
+            f"{rate:g} false call{'' if rate == 1 else 's'} per m², with known size and depth; the detectors' hits are "
+            f"on unit {seeds}. Not modelled: missing returns, non-Gaussian tails, noise that differs within damage."
         )
         if study.digest != experiment.digest:
-            changed = "hits are those of another version of the camera or of a detector than the one installed now"
+            changed = "the hits come from another version of the camera or of a detector than the installed version"
             warnings.insert(0, f"{changed}: run the study again")
         provenance = {**record(command), "results_version": RESULTS_VERSION, "experiment": study.name}
         provenance |= {"digest": study.digest, "seed": experiment.config.seed}

@@ -1,4 +1,4 @@
-"""Simulated captures in formats of other programs: TUM RGB-D, ROS 2, MCAP; pictures and masks of data sets."""
+"""Writes simulated captures in formats of other programs: TUM RGB-D, ROS 2, MCAP; images and masks of data sets."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Frame, FrameSource, Lens, Reason, Region, invert
 
 START_NS = 1_000_000_000 * 10**9  # time of the first frame, in 2001; 0 would mean "the latest" to ROS's tf
-PAUSE_NS = 10**9  # time between two views, in which the camera is moved
+PAUSE_NS = 10**9  # time between two views to move the camera
 BOARD_FRAME = "board"  # the world frame: x along the row of holes, y up the face, z out of it, origin at its centre
 
 
 @dataclass(frozen=True)
 class ExportedView:
-    """Frames of one view. ``source`` has a lens and a pixel grid. ``T_board_camera`` (4, 4): the camera's pose."""
+    """Frames of a view. ``source`` has a lens and a pixel grid; ``T_board_camera`` (4, 4) is the camera's pose."""
 
     name: str
     source: FrameSource
@@ -44,7 +44,7 @@ class ExportedView:
         return self.start_ns + round(frame * 1e9 / self.frames_per_second)
 
     def exposures(self) -> Iterator[tuple[int, Frame]]:
-        """Yield time and frame on the whole sensor, float32; beyond the simulated region without range, and black."""
+        """Yield (time, frame on the whole sensor in float32), without range and black outside the simulated region."""
         lens, region = self.lens, self.source.region
 
         def on_sensor(values: np.ndarray, outside: float) -> np.ndarray:
@@ -59,7 +59,7 @@ class ExportedView:
 
 
 def on_window(values: np.ndarray, region: Region, window: Region, outside: float) -> np.ndarray:
-    """Return values (h, w, ...) of a region of the sensor on a ``window`` that contains it; elsewhere ``outside``."""
+    """Return values (h, w, ...) of a sensor region on a ``window`` that contains it, with ``outside`` elsewhere."""
     whole = np.full((*window.shape, *values.shape[2:]), outside, values.dtype)
     whole[region.within(window)] = values
     return whole
@@ -68,7 +68,7 @@ def on_window(values: np.ndarray, region: Region, window: Region, outside: float
 def in_turn(
     sources: Sequence[FrameSource], poses: Sequence[np.ndarray], n_frames: int, frames_per_second: float
 ) -> tuple[ExportedView, ...]:
-    """Put views one after the other in time, named ``view_00`` and so on; ``poses`` are their ``T_camera_board``."""
+    """Put views in sequence, named ``view_00`` and so on; ``poses`` are their ``T_camera_board``."""
     digits = max(2, len(str(len(sources) - 1)))
     length_ns = round(n_frames * 1e9 / frames_per_second) + PAUSE_NS
     starts_ns = (START_NS + number * length_ns for number in range(len(sources)))
@@ -95,10 +95,10 @@ OPTICAL_ROTATION = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0]])
 
 
 def write_tum(folder: Path, views: Sequence[ExportedView]) -> None:
-    """Write a sequence of all views into an empty folder. Raises UserError if two views have different lenses."""
+    """Write a sequence of all views to an empty folder. Raises UserError if two views have different lenses."""
     lens = views[0].lens
     if any(view.lens != lens for view in views):
-        raise UserError("the TUM RGB-D layout has one lens for all frames, and these views have several")
+        raise UserError("the TUM RGB-D layout allows a single lens, but these views have several")
     for name in ("rgb", "depth"):
         (folder / name).mkdir()
         (folder / f"{name}_sync").symlink_to(name, target_is_directory=True)
@@ -131,7 +131,7 @@ def depth_units(z_m: np.ndarray) -> np.ndarray:
 
 
 def undistorted(lens: Lens, picture: np.ndarray) -> np.ndarray:
-    """Return a picture (h, w[, 3]) for the pinhole camera: the nearest pixel of the lens's own image, else 0."""
+    """Return a picture (h, w[, 3]) for the pinhole camera, from the nearest pixels of the lens's own image, else 0."""
     matrix, size = lens.matrix, (lens.width, lens.height)
     u, v = cv2.initUndistortRectifyMap(matrix, np.array(lens.distortion), np.eye(3), matrix, size, cv2.CV_32FC1)
     return cv2.remap(np.ascontiguousarray(picture), np.rint(u), np.rint(v), cv2.INTER_NEAREST)
@@ -144,7 +144,7 @@ def seconds_text(stamp_ns: int) -> str:
 
 
 def calibration_text(lens: Lens) -> str:
-    """Return the pinhole as RTAB-Map's calibration file (OpenCV's YAML with ROS' names)."""
+    """Return the pinhole camera as RTAB-Map's calibration file (OpenCV's YAML with ROS names)."""
     storage = cv2.FileStorage(".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     facts: dict[str, Any] = {"camera_name": "rtabmap_calib", "image_width": lens.width, "image_height": lens.height}
     facts |= {"camera_matrix": lens.matrix, "distortion_model": "plumb_bob"}
@@ -169,7 +169,7 @@ FOREVER = (9223372036, 854775807)  # seconds and nanoseconds of an unlimited dur
 
 
 def write_bag(folder: Path, view: ExportedView, is_mcap: bool) -> None:
-    """Write one view's bag into a new ``folder``, as compressed MCAP or as SQLite. Raises OSError as files do."""
+    """Write a view's bag to a new ``folder``, as compressed MCAP or as SQLite. Raises OSError as files do."""
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -199,7 +199,7 @@ def write_bag(folder: Path, view: ExportedView, is_mcap: bool) -> None:
                 write(INFO_TOPIC, stamp_ns, _info_message(types.types, view.lens, header))
                 write(POINTS_TOPIC, stamp_ns, _cloud_message(types.types, frame, slopes, header))
     except sqlite3.OperationalError as error:
-        # SQLite hides the system's error number; for a new file in our own folder, only lack of space is an error
+        # SQLite hides the system's error number; for a new file in a writable folder, only a full disk is an error
         raise OSError(errno.ENOSPC, str(error), str(folder)) from error
 
 
@@ -297,8 +297,8 @@ def run_lengths(mask: np.ndarray) -> list[int]:
 
 
 def coco_data(pictures: Sequence[dict[str, Any]], kinds: Sequence[str], about: dict[str, Any]) -> dict[str, Any]:
-    """Return a COCO file's content. ``pictures``: each with ``file_name``, ``width``, ``height`` and ``damages``, which
-    have ``kind``, ``run_lengths``, ``bbox`` (left, top, width, height) and ``pixels``."""
+    """Return a COCO file's content. Each of the ``pictures`` has ``file_name``, ``width``, ``height`` and ``damages``,
+    which have ``kind``, ``run_lengths``, ``bbox`` (left, top, width, height) and ``pixels``."""
     numbers = {kind: number for number, kind in enumerate(kinds, start=1)}
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []

@@ -17,28 +17,28 @@ if TYPE_CHECKING:
     from scenes.target.custom import TargetConfig
 
 FORMATS = ("tum", "ros2", "mcap")
-REPEAT = 0  # the trial whose noise is exported: the same frames as in an experiment's first repeat
+REPEAT = 0  # the repeat whose noise is exported, so that the frames equal those of an experiment's first repeat
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("experiment", type=Path, metavar="EXPERIMENT.yaml", help="an experiment's file or name")
     add("--format", required=True, choices=FORMATS, help="tum: one sequence; ros2 (sqlite3), mcap: one bag per view")
-    add("--out", required=True, type=Path, metavar="DIR", help="a folder that does not exist yet, or is empty")
-    change = "change one value of the file, such as source.target.distance_m=0.9; may be repeated"
+    add("--out", required=True, type=Path, metavar="DIR", help="a new or empty folder")
+    change = "change a value of the file, such as source.target.distance_m=0.9; may be repeated"
     add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
     add("--views", type=whole_number(10_000), metavar="N", help="export only the first N views (default: all)")
     frames = "frames of each view (default: the experiment's capture.frames)"
     add("--frames", type=whole_number(10_000), metavar="N", help=frames)
     add("--hole-free", action="store_true", help="export the same target without its damage")
-    results = "where experiments' results go: renders are taken from there, and kept there (default: results)"
+    results = "results folder of experiments, whose stored renders are used and extended (default: results)"
     add("--results", type=Path, default=Path("results"), metavar="DIR", help=results)
 
 
 @program(
     _options,
     "Render and simulate the views of an experiment, and write them with their true poses and damages"
-    " as a TUM RGB-D sequence, or as ROS 2 bags with PointCloud2, CameraInfo and tf_static, one a view.",
+    " as a TUM RGB-D sequence, or as a ROS 2 bag per view with PointCloud2, CameraInfo and tf_static.",
     epilog="example: python -m harness.export experiments/perspectives.yaml --format mcap --views 3 --out bags/",
 )
 def main(arguments: argparse.Namespace, command: str) -> int:
@@ -76,7 +76,7 @@ def main(arguments: argparse.Namespace, command: str) -> int:
         _write_beside(folder, arguments, experiment, targets, views, command)
     swept = [path for path in experiment.config.sweep if path.startswith("source.")]
     if swept:
-        print(f"note: {', '.join(swept)} as the file's source states it, not as swept; --set chooses another value")
+        print(f"note: {', '.join(swept)}: the value of `source` is used, not the axis; --set chooses another value")
     size_mb = sum(path.stat().st_size for path in arguments.out.rglob("*") if path.is_file()) / 1e6
     print(f"wrote {arguments.out}: {len(views)} views of {frames} frames, {size_mb:.0f} MB, with truth.json")
     return 0
@@ -105,7 +105,7 @@ def _write_beside(
         nominal = [guessed_T_reference_view(source.views, poses, n, role, REPEAT) for n in range(len(poses))]
     frames = {
         "board": "x along the row of holes, y up the face, z out of it to the camera, origin at its centre",
-        "camera": "x right, y down, z along the optical axis; of damages, the first view's camera",
+        "camera": "x right, y down, z along the optical axis; for damages, the first view's camera",
     }
     damages = truth_of(targets[0], targets[0].pose.T_camera_board)
     files: dict[str, dict[str, Any]] = {
@@ -123,8 +123,8 @@ def _write_beside(
             "frames_per_second": views[0].frames_per_second,
             "rounding_step_mm": 1e3 * views[0].source.z_step_m,
             "notes": [
-                "The target turns as on a turntable: only the target agrees with the poses of all views, not the room.",
-                "Outside the simulated region of each image, pixels have no range and are black.",
+                "The target turns as on a turntable: the poses of all views hold for the target, not for the room.",
+                "Pixels outside the simulated region of each image have no range and are black.",
                 "Colour is the surfaces' albedo, evenly lit, on the depth camera's own pixels.",
             ],
         },

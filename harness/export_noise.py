@@ -1,8 +1,8 @@
-"""``python -m harness.export_noise CAMERA --out DIR``: a camera's noise as a table and one file of code.
+"""``python -m harness.export_noise CAMERA --out DIR``: writes a camera's noise as a table and a file of code.
 
-For simulators that render ideal depth (Isaac Sim, Gazebo, MuJoCo, BlenderProc): ``NAME.npz`` with the table, and
-``depth_noise.py`` (NumPy, or torch), a copy of `scenes.sensor.tabled`, which says what is not modelled. The full model
-is measured before planes of many brightnesses: deviation, returns, correlation of neighbours, fixed pattern."""
+The files are for simulators that render ideal depth (Isaac Sim, Gazebo, MuJoCo, BlenderProc): ``NAME.npz`` with the
+table, and ``depth_noise.py`` (NumPy or torch), a copy of `scenes.sensor.tabled`, which states what is not modelled. The
+full model is measured on planes of many brightnesses: deviation, returns, correlation of neighbours, fixed pattern."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from harness.vocabulary.program import program
 if TYPE_CHECKING:
     from scenes.sensor.camera import AnyCamera
 
-ALBEDO = 0.6  # Albedo of the planes; beyond the range of the camera, darker and brighter planes stand for distance
+ALBEDO = 0.6  # Albedo of the planes; outside the camera's range, darker or brighter planes stand for other distances
 DARKEST = 0.02
-MEASURED, PER_OCTAVE = 2, 16  # Brightnesses measured in each octave; entries of the table, of which the nearest counts
+MEASURED, PER_OCTAVE = 2, 16  # Brightnesses measured per octave; table entries per octave, of which the nearest counts
 FRAMES, FRAMES_OF_CORRELATION = 40, 100  # Frames of 3,000 pixels give a deviation to 1 %
-LONGEST_LAG = 12  # Pixels to which the correlation of neighbours is followed
+LONGEST_LAG = 12  # Largest lag in pixels of the correlation of neighbours
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -37,7 +37,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     epilog="example: python -m harness.export_noise azure_kinect_nfov --out noise",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Returns 0, 2 on a mistake of the user, 130 after Ctrl-C."""
+    """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""
     from harness.vocabulary.files import write_bytes, write_text
     from scenes.sensor import tabled
     from scenes.sensor.camera import load_camera
@@ -58,10 +58,10 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def noise_table(camera: AnyCamera) -> dict[str, np.ndarray]:
-    """Return the arrays that `scenes.sensor.tabled.DepthNoise` takes: ``sigma_m``, ``seen`` (n,), deviation and chance
-    of a return at log2 of intensity / range^2, from ``first`` on, ``per_octave`` entries each; filters of the noise and
-    of the pattern, whose deviation is ``pattern_m``; ``slopes`` (h, w, 2); ``falloff`` (h, w): each pixel's light
-    relative to the axis; ``step_m``, ``nearest_m``, ``farthest_m``."""
+    """Return the arrays of `scenes.sensor.tabled.DepthNoise`. ``sigma_m`` and ``seen`` (n,) are the deviation and the
+    probability of a return over log2 of intensity / range^2, from ``first`` on, with ``per_octave`` entries each. There
+    are filters of the noise and of the pattern, whose deviation is ``pattern_m``; ``slopes`` (h, w, 2); ``falloff``
+    (h, w), each pixel's light relative to the axis; ``step_m``, ``nearest_m``, ``farthest_m``."""
     from scenes.sensor.calibration import with_number
 
     optics, fine = camera.optics, with_number(camera, "engine", "output_step_mm", 1e-3)  # the table rounds by itself
@@ -94,7 +94,7 @@ def noise_table(camera: AnyCamera) -> dict[str, np.ndarray]:
 
 
 def _stack_m(camera: AnyCamera, level: float, nearest_m: float, farthest_m: float, frames: int) -> np.ndarray:
-    """Return ranges (frames, h, w), NaN without a return, before a plane whose light has this level."""
+    """Return ranges (frames, h, w), NaN without a return, of a plane whose light has this level."""
     from scenes.sensor.calibration import unit_before_plane
 
     distance_m = float(np.clip(np.sqrt(ALBEDO / 2.0**level), nearest_m, farthest_m))
@@ -104,13 +104,13 @@ def _stack_m(camera: AnyCamera, level: float, nearest_m: float, farthest_m: floa
 
 
 def _before_plane(camera: AnyCamera, level: float, nearest_m: float, farthest_m: float) -> tuple[float, float]:
-    """Return the deviation of a pixel's range, NaN where hardly anything returns, and the share of returns."""
+    """Return the deviation of a pixel's range (NaN if there are hardly any returns) and the share of returns."""
     range_m = _stack_m(camera, level, nearest_m, farthest_m, FRAMES)
     there = np.isfinite(range_m)
     often = there.sum(axis=0) > FRAMES // 4
     if not often.any():
         return float("nan"), float(there.mean())
-    # the robust deviation: a wrong period, far away and rare, is no noise of the table
+    # a robust deviation excludes ranges with a wrong period, which are rare and far off
     middle = np.nanmedian(range_m[:, often], axis=0)
     apart = np.abs(range_m[:, often] - middle)
     kept = apart < 8.0 * np.nanmedian(apart) / 0.6745
@@ -118,7 +118,7 @@ def _before_plane(camera: AnyCamera, level: float, nearest_m: float, farthest_m:
 
 
 def _pattern_m(camera: AnyCamera) -> np.ndarray:
-    """Return the range (units, h, w) that the fixed pattern of some units adds before a plane."""
+    """Return the range (units, h, w) that the fixed pattern of several units adds on a plane."""
     from harness.vocabulary.geometry import Region
     from scenes.closed_form import plane_view
     from scenes.sensor.camera import NO_EFFECTS, CameraConfig
@@ -140,7 +140,7 @@ def _pattern_m(camera: AnyCamera) -> np.ndarray:
 
 
 def _filter(images: np.ndarray, axis: int) -> np.ndarray:
-    """Return the taps that give white noise the images' (n, h, w) mean correlation along an axis."""
+    """Return the filter taps that give white noise the mean correlation of the images (n, h, w) along an axis."""
     from scenes.sensor.unit import taps_of
 
     images = np.moveaxis(np.nan_to_num(images), axis, -1)
@@ -149,7 +149,7 @@ def _filter(images: np.ndarray, axis: int) -> np.ndarray:
 
 
 def _pixels(camera: AnyCamera) -> tuple[np.ndarray, np.ndarray]:
-    """Return the slopes (h, w, 2) of every pixel and its light relative to the axis (h, w); 0 where none comes."""
+    """Return each pixel's slopes (h, w, 2) and its light relative to the axis (h, w), 0 for unlit pixels."""
     from scenes.sensor.amcw.facts import AmcwCamera
     from scenes.sensor.amcw.imager import AmcwImager
     from scenes.sensor.camera import CameraConfig

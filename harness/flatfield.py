@@ -1,4 +1,4 @@
-"""``python -m harness.flatfield``: a unit's fixed pattern from captures of a flat surface."""
+"""``python -m harness.flatfield``: measures a unit's fixed pattern on captures of a flat surface."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Measure the fixed pattern of one unit of a camera: the range error at each pixel that is the same in every "
-    "frame. Each PATH is one capture, 50 frames or more of a matte wall that fills the view, taken with a warm "
-    "camera, moved by 30 mm or more between captures, at two distances, some captures at each. Name the "
+    "Measure the fixed pattern of a camera's unit, which is the range error of each pixel that is the same in every "
+    "frame. Each PATH is a capture of 50 frames or more of a matte wall that fills the view. Record with a warm "
+    "camera, several times at each of two distances, and move it by 30 mm or more between captures. Name the "
     "captures in the order of recording.",
     epilog="example: python -m harness.flatfield near1 near2 far1 far2 --out unit.npz, then "
     "python -m harness.detect captures/board --flat-field unit.npz",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Returns 0 (also where the pattern is not stable), 2 on a mistake of the user, 130 after Ctrl-C."""
+    """Run the program. Returns 0 (also if the pattern is not stable), 2 for a user's mistake, 130 after Ctrl-C."""
     from detectors.flat_captures import separated
     from detectors.flat_field import save_flat_field
     from harness.inspection.output import mm, print_warnings
@@ -87,9 +87,8 @@ def _draw(figure: Figure, error_m: np.ndarray, title: str) -> None:
 
 
 def _captures(options: argparse.Namespace) -> tuple[Lens, list[FlatCapture], list[str]]:
-    """Return the lens, the captures less their smooth fits (a lone capture as its two halves, which show whether the
-    pattern is stable), and doubts about the recordings. Raises UserError for faults of the files, and for captures of
-    different cameras."""
+    """Return the lens, the captures minus their smooth fits (a single capture as two halves, which show whether the
+    pattern is stable), and warnings about the recordings. Raises UserError for faulty files or different cameras."""
     from detectors.average import RECORDED, average
     from detectors.crop import crop
     from detectors.flat_captures import flattened
@@ -103,7 +102,7 @@ def _captures(options: argparse.Namespace) -> tuple[Lens, list[FlatCapture], lis
     first = recordings[0]
     for path, recording in zip(options.paths, recordings, strict=True):
         if recording.lens is None:
-            raise UserError(f"{path}: the lens is not known", fix="name a file or a camera with --intrinsics")
+            raise UserError(f"{path}: its lens is unknown", fix="name a file or a camera with --intrinsics")
         if recording.lens != first.lens:
             what = f"{path}: has another lens than {options.paths[0]}"
             raise UserError(what, legal="captures of one unit and mode")

@@ -1,4 +1,4 @@
-"""``python -m harness.gauge``: a board with holes that checks a detection limit, as drilling template and truth."""
+"""``python -m harness.gauge``: designs boards with holes to check a detection limit: drilling template and truth."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ if TYPE_CHECKING:
     from harness.inspection.gauge import Gauge
 
 DICTIONARY, CODES = "DICT_6X6_50", 50
-MARK_MM, DRILLS_MM, SEED = 32.0, 0.5, 1  # Side of a mark, step of the drills, seed of which size goes where
-CLEAR_MM, EDGE_MM = 6.0, 18.0  # White around a mark, for its code; from a hole's rim to the board's edge at least
-LARGEST_MM = 5e3  # as the truth file takes it
-HIT_SHARE = 0.4  # Hit radius as a share of the distance between holes, so that no finding can count for two
+MARK_MM, DRILLS_MM, SEED = 32.0, 0.5, 1  # Side of a mark, step of drill sizes, seed of the order of sizes
+CLEAR_MM, EDGE_MM = 6.0, 18.0  # White margin of a mark; least distance from a hole's rim to the board's edge
+LARGEST_MM = 5e3  # the largest size that the truth file allows
+HIT_SHARE = 0.4  # Hit radius as a share of the distance between holes, so that no finding can hit two holes
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--diameters", required=True, type=span, metavar="FROM:TO", help="range of drill diameters, mm")
     add("--depths", type=span, metavar="FROM:TO", help="depths of blind holes, mm (default: all are through-holes)")
-    add("--study", type=Path, metavar="DIR", help="plan by the curve of this study, simulated or implanted")
+    add("--study", type=Path, metavar="DIR", help="plan with the curve of this study, simulated or implanted")
     add("--set-up", metavar="NAME", help='set-up of that study: "50 frames"')
-    add("--a50", type=float, metavar="MM", help="plan by a guess: the size found half the time")
-    add("--a90", type=float, metavar="MM", help="and the size found nine times out of ten")
+    add("--a50", type=float, metavar="MM", help="plan with a guess: the size that is found half the time")
+    add("--a90", type=float, metavar="MM", help="and the size that is found nine times out of ten")
     add("--targets", type=int, default=36, metavar="N", help="total number of holes (default: 36)")
     add("--board", default="270x175", metavar="WxH", help="size of a board, mm (default: 270x175, one sheet of A4)")
     add("--apart", type=float, default=30.0, metavar="MM", help="distance between holes (default: 30)")
@@ -41,14 +41,14 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Design gauge boards: holes of sizes spread evenly over a range, with the limit that harness.design expects of "
-    "them, on boards with coded corner marks. Writes template.pdf (1:1, in tiles of the paper), one SVG for each "
-    "board, and gauge.json, the truth that harness.detect --gauge reads.",
+    "Design gauge boards with coded corner marks and holes of evenly spread sizes, and state the limit that "
+    "harness.design expects of them. Write template.pdf (1:1, in tiles of the paper), an SVG for each board, and "
+    "gauge.json, the truth that harness.detect --gauge reads.",
     epilog="example: python -m harness.gauge --diameters 2:12 --study results/implant --set-up '50 frames' --out "
     "gauge, then drill, record, and python -m harness.detect captures/gauge --gauge gauge/gauge.json --out found",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Returns 0, 2 on a mistake of the user, 130 after Ctrl-C."""
+    """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""
     from harness.evaluation.pod import design as plan
     from harness.evaluation.pod.transfer import PRIOR_SIZE
     from harness.inspection.gauge import GAUGE_VERSION
@@ -63,11 +63,11 @@ def main(options: argparse.Namespace, command: str) -> int:
     if not 10 <= options.targets <= 600:
         raise UserError(f"--targets {options.targets}", legal="10 to 600 holes")
     curve = _curve(options)
-    # evenly spread: sizes crowded where the study's curve rises tell nothing where the real curve rises elsewhere
+    # sizes are spread evenly: sizes only where the study's curve rises show nothing if the real curve rises elsewhere
     (chosen,) = plan.design(curve, [options.targets], (low, high), studies=100, seed=SEED)
     if not low < (wrong_mm := PRIOR_SIZE * curve.size_at(0.9)) < high:
         were = f"if the curve's a90 is too small by a factor of {PRIOR_SIZE:g}, the true a90 is {wrong_mm:.3g} mm"
-        print(f"warning: {were}, and no hole of {low:g} to {high:g} mm would show it: choose other --diameters")
+        print(f"warning: {were}, which no hole of {low:g} to {high:g} mm would show; choose other --diameters")
     gauge = _laid_out(options, chosen.sizes)
     text = json.dumps({"gauge_version": GAUGE_VERSION, **gauge.to_data()}, indent=1)
     write_text(options.out / "gauge.json", text + "\n")
@@ -78,31 +78,31 @@ def main(options: argparse.Namespace, command: str) -> int:
     sheets = len(tiles_of(first.width_mm, first.height_mm, options.paper)[1])
     expected = "no a90/95" if chosen.bound == float("inf") else f"a90/95 of about {chosen.bound:.3g} mm"
     print(f"holes: {chosen.targets}; boards: {len(gauge.boards)}; sheets of {options.paper} for each: {sheets}")
-    print(f"real hits and misses alone would show {expected}; harness.pod --prior says what they add to a study")
+    print(f"expected from real hits and misses alone: {expected}; harness.pod --prior combines them with a study")
     print(f"a finding within {gauge.hit_radius_mm:g} mm of a hole is a hit")
-    print(f"wrote {options.out / 'template.pdf'}, {len(gauge.boards)} SVG, gauge.json: print at 100 %, check the bar")
+    print(f"wrote {options.out / 'template.pdf'}, {len(gauge.boards)} SVG, gauge.json; print at 100 %")
     return 0
 
 
 def _curve(options: argparse.Namespace) -> PodCurve:
-    """Return the curve to plan by. Raises UserError where it is told twice or not at all."""
+    """Return the curve for planning. Raises UserError if it is stated twice or not at all."""
     from harness.evaluation.pod.design import curve_through
     from harness.evaluation.study.limit import limit_of
     from harness.evaluation.study.record import read_record, set_up_named
 
     guessed = options.a50 is not None and options.a90 is not None
     if guessed == (options.study is not None):
-        raise UserError("state exactly one curve by which to plan", legal="--study DIR, or --a50 MM --a90 MM")
+        raise UserError("planning needs exactly one curve", legal="--study DIR, or --a50 MM --a90 MM")
     if guessed:
         return curve_through(options.a50, options.a90)
     limit = limit_of(set_up_named(read_record(options.study), options.set_up))
     if limit.statement is None:
-        raise UserError(f"{options.study}: has no curve: {limit.why}", fix="guess one with --a50 and --a90")
+        raise UserError(f"{options.study}: has no curve: {limit.why}", fix="state a guess with --a50 and --a90")
     return limit.statement.curve
 
 
 def _laid_out(options: argparse.Namespace, sizes: np.ndarray) -> Gauge:
-    """Return boards with these holes: as many boards as hold them, sizes spread over all boards, in random order."""
+    """Return as few boards as can hold these holes, with sizes spread over all boards in random order."""
     from harness.inspection.gauge import Gauge, GaugeBoard, GaugeHole, GaugeMark
     from harness.vocabulary.seeds import random_stream
 

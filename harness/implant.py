@@ -1,4 +1,4 @@
-"""``python -m harness.implant``: the detection limit of your camera on your part, by virtual damage in captures."""
+"""``python -m harness.implant``: states your camera's detection limit on your part, by virtual damage in captures."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harness.inspection import arguments as asked
+from harness.inspection import arguments as cli
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM
 from harness.vocabulary.program import program
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
     from scenes.target.drawn import DrawnTargetConfig
 
 DAMAGES = ("through", "blind", "dent", "pressed_dent", "pressed_bump", "protrusion", "slot")
-MOST_AT_ONCE, FILLED = 8, 0.25  # Damages of one placement; share of the scan within half of --apart from them
+MOST_AT_ONCE, FILLED = 8, 0.25  # Most damages of a placement, and share of the scan within half of --apart from them
 COMPARED = (
-    "virtual damage may be harder to find than real damage: on the one drilled plate where both were compared 7 of 23"
-    " virtual holes were found, and 50 of 56 real ones that looked as wide; check the limit with a gauge board"
+    "virtual damage may be harder to find than real damage: on the only drilled plate where both were compared, 7 of 23"
+    " virtual holes and 50 of 56 real holes of the same apparent width were found; check the limit with a gauge board"
 )
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("paths", nargs="+", type=Path, metavar="PATH", help="captures, in any format that harness.detect reads")
-    add("--camera", required=True, metavar="NAME|FILE.yaml", help="the camera that took them, or the most similar one")
+    add("--camera", required=True, metavar="NAME|FILE.yaml", help="the captures' camera, or the most similar one")
     add("--damage", required=True, choices=DAMAGES, help="kind of damage, as on the drawn boards of an experiment")
     add("--diameters", required=True, type=span, metavar="FROM:TO", help="diameters, mm; for slots their widths")
     add("--depths", type=span, metavar="FROM:TO", help="depths, mm (for bumps and protrusions, heights)")
@@ -44,13 +44,13 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--hit-radius", type=float, default=15.0, metavar="MM", help="largest distance of a hit (default: 15)")
     add("--apart", type=float, metavar="MM", help="least distance of damages (default: 2 hit radii plus 10)")
     add("--seed", type=int, default=1, help="seed of places, sizes and noise (default: 1)")
-    calls = f"expected number, which sets the threshold as in harness.detect (default: {asked.DEFAULT_FALSE_CALLS:g})"
+    calls = f"expected number, which sets the threshold as in harness.detect (default: {cli.DEFAULT_FALSE_CALLS:g})"
     add("--false-calls", type=float, metavar="N", help=calls)
     add("--threshold", type=float, metavar="K", help="threshold in units of score, instead of --false-calls")
-    add("--detector", default=asked.DEFAULT_DETECTOR, help=f"detector's name (default: {asked.DEFAULT_DETECTOR})")
+    add("--detector", default=cli.DEFAULT_DETECTOR, help=f"detector's name (default: {cli.DEFAULT_DETECTOR})")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of the detector: surface.degree=5")
-    add("--crop", default="auto", metavar="KIND", help=f"the target: {asked.LEGAL_CROP}")
-    asked.add_reading(add)
+    add("--crop", default="auto", metavar="KIND", help=f"the target: {cli.LEGAL_CROP}")
+    cli.add_reading(add)
     add("--out", type=Path, default=Path("results/implant"), metavar="DIR", help="default: results/implant")
 
 
@@ -73,7 +73,7 @@ def span(text: str) -> tuple[float, float]:
     "--diameters 2:10 --out implanted",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Returns 0 (also where no limit is demonstrated), 2 on a mistake of the user, 130 after Ctrl-C."""
+    """Run the program. Returns 0 (also if no limit is demonstrated), 2 for a user's mistake, 130 after Ctrl-C."""
     from harness.engine.implants import Judging, Scan, judge_scans, placements
     from harness.engine.tables import write_tables
     from harness.evaluation.study.record import StudyRecord, record_text
@@ -90,14 +90,14 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.vocabulary.seeds import canonical_json, digest
     from scenes.render.scene import load_mitsuba
 
-    load_mitsuba()  # before anything loads Open3D, with which LLVM cannot be
-    options.quiet_capture = options.target = None  # what harness.detect has, and this program has not
+    load_mitsuba()  # must precede Open3D, after which LLVM cannot be loaded
+    options.quiet_capture = options.target = None  # options of harness.detect that this program lacks
     refuse_thresholds(options)
     numbers = [("targets", options.targets), ("hit-radius", options.hit_radius)]
     for name, number in [*numbers, *(("frames", each) for each in options.frames or ())]:
         if not 0 < number < math.inf:
             raise UserError(f"--{name} {number:g}", legal="above 0")
-    detector, settings = asked.detector_of(options, options.crop, options.set)
+    detector, settings = cli.detector_of(options, options.crop, options.set)
 
     def own_threshold(cloud: Any) -> tuple[float, tuple[str, ...]]:
         value, _, evidence = threshold_of(options, detector, cloud, analysed(detector, cloud), lambda: (0.0, ""))
@@ -105,8 +105,8 @@ def main(options: argparse.Namespace, command: str) -> int:
 
     how = (options.hit_radius * MM, options.threshold, own_threshold)
     judging = Judging(options.detector, canonical_json(settings), *how)
-    asked.refuse_repeats(options.paths)
-    reading = asked.reading_of(options)
+    cli.refuse_repeats(options.paths)
+    reading = cli.reading_of(options)
     opened = [opened_as(options.camera, [path], options.intrinsics, **reading) for path in options.paths]
     scans = [Scan(recording, judging) for recording in opened]
     family = _family(options, scans)
@@ -136,9 +136,9 @@ def main(options: argparse.Namespace, command: str) -> int:
     }
     origin = record(command) | {"warnings": [COMPARED, *warnings], "seed": options.seed, "failures": []}
     title = f"Virtual damage in {recordings}"
-    expected = options.false_calls or asked.DEFAULT_FALSE_CALLS
+    expected = options.false_calls or cli.DEFAULT_FALSE_CALLS
     calls = f"{expected:g} false calls a capture: the median over groups of frames."
-    own = f"Set by the undamaged frames as harness.detect sets it, by noise towards the camera, for {calls}"
+    own = f"Set by the undamaged frames, as in harness.detect, by noise towards the camera, for {calls}"
     thresholds = f"Given as {options.threshold:g}." if options.threshold else own
     known = {key: origin[key] for key in ("commit", "dirty", "versions", "seed", "command")}
     study = StudyRecord(
@@ -162,7 +162,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def _family(options: argparse.Namespace, scans: list[Scan]) -> DrawnTargetConfig:
-    """Return the damage as a family of boards as large as the largest scan. Raises UserError for what is not legal."""
+    """Return the damage as a family of boards as large as the largest scan. Raises UserError for illegal options."""
     from harness.vocabulary.declaration.diagnose import settings_of
     from scenes.sensor.camera import CameraConfig, camera_of
     from scenes.target.drawn import DrawnTargetConfig
@@ -195,20 +195,20 @@ def _family(options: argparse.Namespace, scans: list[Scan]) -> DrawnTargetConfig
 
 
 def _shares(options: argparse.Namespace, recordings: str, peaks_mm: list[float]) -> list[str]:
-    """Return sentences on what is measured and simulated, and for what the limit holds; ``peaks_mm``: depths shown."""
+    """Return sentences on what is measured and simulated, and on the limit's validity; ``peaks_mm``: visible depths."""
     low, middle, high = np.quantile(peaks_mm, (0.1, 0.5, 0.9))
     return [
         f"Measured: {recordings}, with their surface, noise, fixed pattern, texture and missing returns.",
         f"Simulated: the damage, by the model of {options.camera}, on the tangent plane at its place, with an albedo "
-        f"of {options.albedo:g}; noise is added where the damage weakens the light, never taken off.",
-        f"Virtual damage shows a depth of {middle:.2g} mm at the median ({low:.2g} to {high:.2g} mm for eight in ten). "
-        "If real damage of such sizes shows more or less in recordings of this camera, the limit is wrong by as much: "
-        "check it with a gauge board.",
-        "A board, here, is one placement of damage in a group of recorded frames. Placements share the recording's "
-        "surface and fixed pattern, and its noise where it has few frames: intervals are over places and sizes in this "
-        "recording, not over other parts, units or days.",
+        f"of {options.albedo:g}; noise is added where the damage weakens the light, but never removed.",
+        f"Virtual damage shows a median depth of {middle:.2g} mm ({low:.2g} to {high:.2g} mm for eight in ten). If "
+        "real damage of such sizes shows more or less depth in recordings of this camera, the limit is wrong "
+        "accordingly: check it with a gauge board.",
+        "Here, a board is a placement of damage in a group of recorded frames. Placements share the recording's "
+        "surface and fixed pattern, and also its noise if it has few frames: intervals are over places and sizes in "
+        "this recording, not over other parts, units or days.",
         "No damage was placed within the hit radius of a finding in the average of all undamaged frames. The undamaged "
-        "recording is the hole-free board; a warning says where the same frames set the threshold.",
+        "recording is the hole-free board; a warning is given if the same frames set the threshold.",
     ]
 
 

@@ -1,4 +1,4 @@
-"""Entries that `harness.ls` lists and `harness.clean` removes: tofpod's own in ``--out``, never through a link."""
+"""Finds what `harness.ls` lists and `harness.clean` removes: tofpod's own entries in ``--out``, never behind a link."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def plug_ins(kind: str) -> PlugIns:
 
 
 def offered(kind: str) -> list[Row]:
-    """Return a row for each offer; an unusable one has ``broken``, which states the reason, and ``fix``."""
+    """Return a row for each offer; that of an unusable offer has ``broken`` with the reason, and ``fix``."""
     rows: list[Row] = []
     for offer in plug_ins(kind).offers():
         try:
@@ -120,7 +120,7 @@ def _facts(kind: str, name: str) -> Row:
 
 
 def _detector_settings(name: str) -> list[dict[str, Any]]:
-    """Yield every setting with default and legal values; for one of several kinds, those of the default kind."""
+    """Return every setting with default and legal values; of several kinds, only the settings of the default kind."""
     settings_type = detector_type(name).settings_type
     try:
         defaults = settings_type().to_data()
@@ -139,7 +139,7 @@ def _detector_settings(name: str) -> list[dict[str, Any]]:
 
 
 def _numbers(name: str) -> list[dict[str, Any]]:
-    """Yield every number of the camera's file with its tag and source."""
+    """Return every number of the camera's file with its tag and source."""
     data = load_camera(name).to_data()
     numbers = {path: get(data, tuple(path.split("."))) for path in number_paths(data)}
     return [{"path": path, "value": n["value"], "about": f"{n['tag']}: {n['source']}"} for path, n in numbers.items()]
@@ -155,7 +155,7 @@ def leaves(data: Mapping[str, Any], path: tuple[str, ...] = ()) -> Iterator[tupl
 
 
 def reference() -> str:
-    """Return every key of an experiment and of tofpod's detectors in Markdown: legal, default, meaning."""
+    """Return every key of an experiment and of tofpod's detectors in Markdown: legal values, default, meaning."""
     from harness.experiment.schema import ExperimentConfig
 
     sections = {"Experiments": every_key(ExperimentConfig)}
@@ -188,7 +188,7 @@ SHOWN_SETTINGS = 6
 
 
 def result_folders(out: Path, experiment: str | None = None) -> list[dict[str, Any]]:
-    """Return `described` of every folder, with ``limits``, settings in which it ``differs``, and ``is_latest``."""
+    """Return `described` for every folder, with its ``limits``, the settings in which it ``differs``, ``is_latest``."""
     found = []
     for parent in folders_in(out, EXPERIMENT_NAME):
         if experiment is not None and parent.name != experiment:
@@ -207,7 +207,7 @@ def result_folders(out: Path, experiment: str | None = None) -> list[dict[str, A
 
 
 def limit_text(limits: list[dict[str, Any]]) -> str:
-    """Return the detection limit with its set-up, or the range of several; "" if there is no study."""
+    """Return the detection limit with its set-up, or the range of several limits; "" if there is no study."""
     found = [row for row in limits if row["a90_95_mm"] is not None and row["verdict"] == "demonstrated"]
     if not found:
         return "a90/95 not demonstrated" if limits else ""
@@ -251,7 +251,7 @@ def _limits(run: Path) -> list[dict[str, Any]]:
 
 
 def described(run: Path) -> dict[str, Any]:
-    """Describe a folder of results as JSON's types. ``state``: complete, unfinished, running or broken."""
+    """Describe a results folder as JSON types. ``state`` is complete, unfinished, running or broken."""
     size_bytes = 0
     for path in files_below(run):
         with contextlib.suppress(OSError):
@@ -264,7 +264,7 @@ def described(run: Path) -> dict[str, Any]:
             raise ValueError("is no provenance")
     except FileNotFoundError:  # the run is not finished
         records = 0
-        with contextlib.suppress(UserError):  # of a newer tofpod, or reached through a link
+        with contextlib.suppress(UserError):  # written by a newer tofpod, or reached through a link
             records = len(Journal(run / "journal"))
         if not records and not (run / EXPERIMENT.name).is_file():
             return row | {"note": "broken: it has neither an experiment nor records"}
@@ -297,7 +297,7 @@ def in_use(run: Path) -> bool:
 
 
 def folders_in(folder: Path, names: re.Pattern[str]) -> list[Path]:
-    """Return folders with such names, without links, sorted."""
+    """Return the folders with such names, sorted and without links."""
     with contextlib.suppress(FileNotFoundError, NotADirectoryError), os.scandir(folder) as entries:
         found = [entry for entry in entries if names.fullmatch(entry.name) and entry.is_dir(follow_symlinks=False)]
         return sorted(Path(entry.path) for entry in found)
@@ -310,14 +310,14 @@ def files_below(folder: Path) -> Iterator[Path]:
 
 
 def latest_run(parent: Path) -> str | None:
-    """Return the name of the run to which ``parent/latest`` points; None without such a link by tofpod."""
+    """Return the name of the run to which ``parent/latest`` points; None without a link that tofpod made."""
     path = Path(parent) / LATEST
     target = os.readlink(path) if path.is_symlink() else ""
     return target if DIGEST_NAME.fullmatch(target) else None
 
 
 def point_to(run: Path) -> None:
-    """Let the link ``latest`` beside a run point to it, unless tofpod did not make it; print failures on stderr."""
+    """Point the link ``latest`` beside a run to it, unless somebody else made the link; print failures to stderr."""
     path = Path(run).parent / LATEST
     if os.path.lexists(path) and latest_run(path.parent) is None:
         print(f"{path}: was not written by tofpod and is left unchanged; the newest run is {run}", file=sys.stderr)
@@ -327,7 +327,7 @@ def point_to(run: Path) -> None:
         os.symlink(Path(run).name, part)
         os.replace(part, path)
     except (OSError, NotImplementedError) as error:
-        print(f"{path}: cannot be made ({error}); the newest run is {run}", file=sys.stderr)
+        print(f"{path}: cannot be created ({error}); the newest run is {run}", file=sys.stderr)
 
 
 # ---------------------------------------------------------------- removal
@@ -336,22 +336,22 @@ UNFINISHED = re.compile(r"^\.(.+)\.\w{8}\.part(\.\w+)$")  # name of a file that 
 
 
 def refuse_links(*paths: Path) -> None:
-    """Raise UserError where a path is a link."""
+    """Raise UserError if a path is a link."""
     for path in paths:
         if path.is_symlink():
             fix = "remove it there by hand"
-            raise UserError(f"{path}: is a link to another place, where nothing is removed", fix=fix)
+            raise UserError(f"{path}: is a link to another place, from which nothing is removed", fix=fix)
 
 
 def cache_removal(folder: Path, limit_bytes: int | None) -> list[StoredFile]:
-    """Return the longest unused renders to remove so that the rest fits, and old leftovers; for None all of both."""
+    """Return the longest unused renders to remove so that the rest fits the limit, and leftovers; None: all of both."""
     if limit_bytes is None:
         return stored_renders(folder) + leftovers(folder, 0.0)
     return longest_unused(stored_renders(folder), limit_bytes, ()) + leftovers(folder)
 
 
 def chosen_results(out: Path, name: str) -> list[Path]:
-    """Return the folders of results named ``NAME`` or ``NAME/DIGEST``. Raises UserError if there are none."""
+    """Return the results folders named ``NAME`` or ``NAME/DIGEST``. Raises UserError if there are none."""
     experiment, slash, digest = name.partition("/")
     if not EXPERIMENT_NAME.fullmatch(experiment) or (slash and not DIGEST_NAME.fullmatch(digest)):
         legal = "NAME or NAME/DIGEST, as python -m harness.ls results shows them"
@@ -363,26 +363,26 @@ def chosen_results(out: Path, name: str) -> list[Path]:
         # every sweep first writes its declaration, whose first line identifies tofpod
         declared = folder / EXPERIMENT.name
         if not declared.is_file() or not bounded_bytes(declared, TEXT_BYTES).startswith(b"# tofpod experiment "):
-            raise UserError(f"{folder}: is not a folder of results", fix="python -m harness.ls results shows them")
+            raise UserError(f"{folder}: is not a results folder", fix="see the list of python -m harness.ls results")
     return found
 
 
 def removable(folder: Path) -> list[StoredFile]:
-    """Return the files of a folder of results that tofpod wrote, locks last."""
+    """Return the files of a results folder that tofpod wrote, with locks last."""
     found = []
     for path in sorted(files_below(folder), key=lambda path: LOCK_NAME.fullmatch(path.name) is not None):
         above, name = path.parent.relative_to(folder), UNFINISHED.sub(r"\1\2", path.name)
-        ours = {
+        own_files = {
             Path(): is_output(name, "results") or LOCK_NAME.fullmatch(name),
             Path(JOURNAL): SEGMENT_NAME.fullmatch(name),
         }.get(above, re.fullmatch(r"point-[0-9]{3,6}", str(above)) and is_output(name, "capture"))
-        if ours and not path.is_symlink():
+        if own_files and not path.is_symlink():
             found.append(StoredFile(path, path.lstat().st_size, path.lstat().st_mtime))
     return found
 
 
 def remove_empty(folder: Path) -> None:
-    """Remove a folder of results if nothing is left in it, and ``latest`` if it pointed to it."""
+    """Remove a results folder if nothing is left in it, and the link ``latest`` if it pointed to it."""
     for inner, _, _ in os.walk(folder, topdown=False):
         with contextlib.suppress(OSError):
             os.rmdir(inner)

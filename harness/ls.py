@@ -1,4 +1,4 @@
-"""``python -m harness.ls``: lists detectors and cameras with their settings, folders of results, and stored renders."""
+"""``python -m harness.ls``: lists detectors and cameras with their settings, results folders, and stored renders."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("what", nargs="?", help="detectors, cameras, results, cache, keys (of experiments); or a detector or camera")
     add("name", nargs="?", help="a detector or camera, to show all its settings; with results, the experiment")
     add("--out", type=Path, default=Path("results"), metavar="DIR", help="folder of results (default: results)")
-    add("--json", action="store_true", help="as JSON, for programs")
+    add("--json", action="store_true", help="print JSON, for programs")
 
 
 @program(
     _options,
-    "List detectors and cameras: tofpod's own and those that installed packages offer through the "
-    "entry point groups tofpod.detectors and tofpod.cameras. Or folders of results, the cache of renders, or every "
-    "key of an experiment.",
+    "List detectors and cameras: tofpod's own and those that installed packages offer through the entry point "
+    "groups tofpod.detectors and tofpod.cameras. Or list results folders, the cache of renders, or all keys of an "
+    "experiment.",
     epilog="examples: python -m harness.ls; python -m harness.ls thesis; python -m harness.ls cameras kinect_v2; "
     "python -m harness.ls --json; python -m harness.ls results; python -m harness.ls results averaging; "
     "python -m harness.ls cache",
@@ -43,7 +43,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def _list_offers(options: argparse.Namespace) -> int:
-    """List detectors and cameras, or the settings of those with a name. Raises UserError for an unknown name."""
+    """List detectors and cameras, or the settings of a named one. Raises UserError for an unknown name."""
     from harness.listing import SETTABLE, grid_of, offered, plug_ins, shown
     from harness.tables.text import Grid, show
     from harness.vocabulary.declaration.diagnose import nearest
@@ -63,7 +63,7 @@ def _list_offers(options: argparse.Namespace) -> int:
         legal = [*SETTABLE, "results", "cache", "keys", *names]
         near = nearest(word, legal)
         meant = f"; did you mean {near!r}?" if near else ""
-        fix = "python -m harness.ls lists all"
+        fix = "run python -m harness.ls for a list"
         raise UserError(f"there is nothing called {word!r} to list{meant}", legal=", ".join(legal), fix=fix)
     details = {kind: shown(kind, name or word) for kind in named}
     if options.json:
@@ -76,13 +76,13 @@ def _list_offers(options: argparse.Namespace) -> int:
 
 
 def _list_results(options: argparse.Namespace) -> int:
-    """List every folder of results with state, limit and differences. Raises UserError for an unknown experiment."""
+    """List every results folder with its state, limit and differences. Raises UserError for an unknown experiment."""
     from harness.listing import differs_text, limit_text, result_folders
     from harness.tables.text import Grid
 
     folders = result_folders(options.out, options.name)
     if options.name is not None and not folders:
-        fix = "python -m harness.ls results lists all"
+        fix = "run python -m harness.ls results for a list"
         raise UserError(f"{options.out}: has no results of {options.name!r}", fix=fix)
     if options.json:
         return _print_json(folders)
@@ -120,9 +120,9 @@ def _list_cache(options: argparse.Namespace) -> int:
         return _print_json(facts | {"longest_unused_days": unused_days})
     print(f"cache {folder}\n  renders: {len(renders)}, {size_text(size_bytes)}")
     if renders:
-        print(f"  not used for the longest time: {unused_days:.1f} days")
+        print(f"  longest time without use: {unused_days:.1f} days")
     if left:
-        print(f"  left by processes that were killed: {len(left)} files")
+        print(f"  left by killed processes: {len(left)} files")
     return 0
 
 

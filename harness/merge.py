@@ -1,4 +1,4 @@
-"""``python -m harness.merge``: joins the journals of shards and machines into one folder of results."""
+"""``python -m harness.merge``: joins the journals of shards and machines in one results folder."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Copy the trials of one or more folders of results (as `harness.sweep --shard` leaves them) into "
-    "another. Nothing is run; if a trial is in several folders, a finished one is used.",
+    "Copy the trials of results folders (such as those of `harness.sweep --shard`) to another folder. "
+    "Nothing is run; if several folders hold a trial, a finished record is used.",
     epilog="example: python -m harness.merge shard1/averaging/0123456789abcdef shard2/averaging/0123456789abcdef "
     "--into results/averaging/0123456789abcdef; then the sweep's own command, without --shard, writes the report",
 )
@@ -34,8 +34,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     _refuse_others(folders, into)
     declared = next((path for folder in folders if (path := folder / "experiment.yaml").is_file()), None)
     if declared is None:
-        raise UserError(f"{folders[0]}: has no experiment.yaml", fix="name folders as sweeps leave them")
-    # written even if it exists: this shows whether the folder is writable before anything is copied
+        raise UserError(f"{folders[0]}: has no experiment.yaml", fix="name the results folders of sweeps")
+    # writing an existing file again shows whether the folder is writable before anything is copied
     write_bytes(into / "experiment.yaml", bounded_bytes(declared, TEXT_BYTES))
     counts: Counter[str] = Counter()
     different, damaged = [], []
@@ -48,24 +48,24 @@ def main(options: argparse.Namespace, command: str) -> int:
             print(f"{folder}: {counts['copied'] - before} trials copied")
     print(f"{goal.folder}: {counts['copied']} trials copied, {counts['known']} were already there")
     if damaged:
-        note = f"{len(damaged)} damaged or older records left out, to be run again"
+        note = f"{len(damaged)} damaged or older records were left out and must be run again"
         print(f"{note}: {', '.join(damaged[:3])}", file=sys.stderr)
     if counts["alike"]:
         alike = f"{counts['alike']} trials differ in the last digits, as between different processors"
-        print(f"{alike}; the first copied was kept")
+        print(f"{alike}; the record that was copied first was kept")
     if different:
-        note = f"{len(different)} trials have different results in different folders, the first copied was kept"
-        why = "The machines disagree (different processors or versions?)"
+        note = f"{len(different)} trials have different results in different folders; the first record was kept"
+        why = "The machines may have different processors or versions"
         print(f"{note}: {', '.join(different[:3])}. {why}", file=sys.stderr)
         return 1
     out = into.parent.parent
-    print(f"next: the sweep's command without --shard, with --out {out}: it runs what is missing and writes the report")
+    print(f"next: run the sweep without --shard, with --out {out}, to run missing trials and write the report")
     return 0
 
 
 def merge_into(into: Journal, other: Journal, counts: Counter[str]) -> list[str]:
-    """Copy trials that ``into`` lacks or has not finished; count those copied, known, and equal but for last digits.
-    Return the keys of those that differ. Raises UserError if a newer tofpod wrote either journal."""
+    """Copy trials that ``into`` lacks or has not finished; count copied, known and alike trials (equal but for the last
+    digits). Return the keys of trials that differ. Raises UserError if a newer tofpod wrote either journal."""
     different = []
     for key, entry in other.entries():
         known = into.read(key)
@@ -85,7 +85,7 @@ def merge_into(into: Journal, other: Journal, counts: Counter[str]) -> list[str]
 
 
 def _without_seconds(value: object) -> object:
-    """Return a record without timings and learned arrays, whose last digits differ; results are compared."""
+    """Return a record without timings and learned arrays, whose last digits differ, so that results can be compared."""
     if isinstance(value, dict):
         kept = {name: each for name, each in value.items() if not name.startswith("seconds") and name != "arrays"}
         return {name: _without_seconds(each) for name, each in kept.items()}
@@ -93,7 +93,7 @@ def _without_seconds(value: object) -> object:
 
 
 def _alike(first: Any, second: Any, *, in_tenth_um: bool = False) -> bool:
-    """Return whether values agree as between different processors: to a thousandth, or 1 um; counts must be equal."""
+    """Return whether values agree within what processors differ: a thousandth, or 1 um; counts must be equal."""
     if isinstance(first, dict) and isinstance(second, dict) and first.keys() == second.keys():
         return all(_alike(first[name], second[name], in_tenth_um=name == "error_tenth_um") for name in first)
     if isinstance(first, list) and isinstance(second, list) and len(first) == len(second):
@@ -106,13 +106,13 @@ def _alike(first: Any, second: Any, *, in_tenth_um: bool = False) -> bool:
 
 
 def _refuse_others(folders: list[Path], into: Path) -> None:
-    """Raise UserError unless all journals belong to one experiment, whose digest is its folder's name."""
+    """Raise UserError unless all journals belong to the same experiment, whose digest is the folder's name."""
     for folder in folders:
         if not (folder / "journal").is_dir():
             fix = "name folders that python -m harness.ls results lists"
             raise UserError(f"{folder}: has no journal", fix=fix)
         if folder.resolve() == into.resolve():
-            raise UserError(f"{folder}: is the folder to merge into", fix="name it with --into only")
+            raise UserError(f"{folder}: is the folder to merge into", fix="name it only with --into")
     names = {"/".join(folder.resolve().parts[-2:]) for folder in folders}
     if len(names) > 1:
         what = f"these are results of different experiments: {', '.join(sorted(names))}"

@@ -1,4 +1,4 @@
-"""``python -m harness.pod``: the probability of detection from the user's own inspections (MIL-HDBK-1823A)."""
+"""``python -m harness.pod``: fits the probability of detection to the user's own inspections (MIL-HDBK-1823A)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add, switch = parser.add_argument, argparse.BooleanOptionalAction
     add("file", type=Path, metavar="FILE", help="CSV or Excel (.xlsx): a header row, then one row per inspection")
     add("--size", required=True, metavar="COL", help="column of the flaws' true sizes")
-    hits = "column of 1 (found) and 0 (missed), yes and no, hit and miss; once for each inspector"
+    hits = "column with 1 (found) and 0 (missed), yes and no, or hit and miss; give it once for each inspector"
     add("--hit", metavar="COL", action="append", help=hits)
     add("--ahat", metavar="COL", help="column of signals, instead of --hit; needs --decision")
     add("--target", metavar="COL", help="column of the flaws' names, if some were inspected more than once")
@@ -32,9 +32,9 @@ def _options(parser: argparse.ArgumentParser) -> None:
     least = "(default: the choice with the lower deviance)"
     add("--log", action=switch, help=f"use the logarithm of the sizes, or not {least}")
     put = parser.add_argument_group("with --hit").add_argument
-    put("--link", choices=LINKS, help="shape of the curve (default: the one with the least deviance)")
+    put("--link", choices=LINKS, help="shape of the curve (default: the shape with the least deviance)")
     put = parser.add_argument_group("with --ahat").add_argument
-    put("--decision", type=float, metavar="Y", help="a flaw is called where the signal is higher than this")
+    put("--decision", type=float, metavar="Y", help="a flaw is called if its signal is higher than this")
     put("--left", type=float, metavar="Y", help="signals at or below this value are censored (noise)")
     put("--right", type=float, metavar="Y", help="signals at or above this value are censored (saturation)")
     put("--log-signal", action=switch, help=f"use the logarithm of the signals, or not {least}")
@@ -48,8 +48,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Fit a probability of detection curve to inspections, one per row of a table, and state the size "
-    "found 90 % of the time with 95 % confidence (a90/95). Writes pod.json, pod.png and pod.html.",
+    "Fit a probability of detection curve to inspections, one per row of a table, and state the size that is "
+    "found 90 % of the time with 95 % confidence (a90/95). Write pod.json, pod.png and pod.html.",
     epilog="example: python -m harness.pod blades.csv --hit found --size length --target blade --unit mm",
 )
 def main(options: argparse.Namespace, command: str) -> int:
@@ -82,10 +82,10 @@ def _corrected(options: argparse.Namespace) -> Mapod:
 
     for name in ("ahat", "decision", "left", "right", "log_signal", "link", "log"):
         if getattr(options, name) is not None:
-            fix = "leave it out: the study's curve decides it"
-            raise UserError(f"--{name.replace('_', '-')} and --prior: not both", fix=fix)
+            fix = "leave it out, since the study's curve determines it"
+            raise UserError(f"--{name.replace('_', '-')} cannot be combined with --prior", fix=fix)
     if not options.hit or len(options.hit) != 1 or options.unit not in ("", "mm"):
-        legal = "--hit COL once, with sizes in mm, as a study's are"
+        legal = "--hit COL once, with sizes in mm like those of a study"
         raise UserError("--prior corrects a curve by hits and misses", legal=legal)
     study = read_record(options.prior)
     limit = limit_of(set_up_named(study, options.set_up))
@@ -99,12 +99,12 @@ def _corrected(options: argparse.Namespace) -> Mapod:
 
 
 def _unlike(read: Inspections, study: SetUpRecord, radius_mm: float) -> str:
-    """Return a remark if the real hits were counted otherwise than the study's, or if the table does not show it."""
+    """Return a remark if the real hits were counted differently from the study's, or if the table does not show how."""
     from harness.evaluation.pod.inspections import texts_of
 
     counted = "by {} at a threshold of {:.3g}, within {:.3g} mm"
     own = counted.format(f"{study.detector} {study.detector_version}", study.threshold, radius_mm)
-    real = {f"in a way that {read.path.name} does not tell"}
+    real = {f"in a way that {read.path.name} does not state"}
     with suppress(UserError, ValueError):
         columns = [texts_of(read, name) for name in ("detector", "threshold", "hit_radius_mm")]
         real = {counted.format(by, float(k), float(mm)) for by, k, mm in zip(*columns, strict=True)}
@@ -121,7 +121,7 @@ def _stated(options: argparse.Namespace) -> PodStatement:
     of_hits, legal = options.hit is not None, "--hit COL with 0 and 1, or --ahat COL with signals and --decision Y"
     if of_hits == (options.ahat is not None):
         what = "one of them, not both" if of_hits else "no column states what was found"
-        raise UserError(f"--hit and --ahat: {what}", legal=legal, fix="name one column; none is guessed")
+        raise UserError(f"--hit and --ahat: {what}", legal=legal, fix="name one column; the program does not guess")
     other = "--ahat" if of_hits else "--hit"
     for name in ("decision", "left", "right", "log_signal") if of_hits else ("link",):
         if getattr(options, name) is not None:
@@ -129,13 +129,13 @@ def _stated(options: argparse.Namespace) -> PodStatement:
     if not of_hits and options.decision is None:
         legal = "a signal, in the column's unit"
         fix = "add --decision Y; a value for a wanted rate of false calls comes from hole-free runs"
-        raise UserError("--ahat needs --decision: the POD is that of a signal above it", legal=legal, fix=fix)
+        raise UserError("--ahat needs --decision, the signal above which a flaw is called", legal=legal, fix=fix)
     responses = options.hit if of_hits else [options.ahat]
     read = table.read_inspections(options.file, options.size, responses, options.target, hits=of_hits)
     if of_hits and read.response.min() == read.response.max():
         kind = "hits" if read.response[0] else "misses"
         what = f"{read.path}: all {len(read.response)} rows of {read.response_column} are {kind}"
-        raise UserError(f"{what}, and a curve needs both hits and misses", fix="add targets of other sizes")
+        raise UserError(f"{what}, but a curve needs both hits and misses", fix="add targets of other sizes")
     if options.log:
         table.require_positive(read, response=False, why="--log")
     if of_hits:

@@ -1,4 +1,4 @@
-"""``python -m harness.prepare``: compiles the inner loops once, as a part of the installation."""
+"""``python -m harness.prepare``: compiles the inner loops once, as part of the installation."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def draw_frames() -> None:
-    """Draw a frame with every camera, and average frames in every way."""
+    """Draw a frame with every camera, and average frames with every method."""
     from detectors.average import AverageConfig, prefix_averages
     from harness.vocabulary.geometry import Region
     from scenes.closed_form import plane_view
@@ -43,7 +43,7 @@ def draw_frames() -> None:
 
 
 def analyse() -> None:
-    """Draw an average at once, and look for damage on every kind of surface."""
+    """Draw an average at once, and search for damage on every kind of surface."""
     from detectors import load_detector
     from detectors.average import AverageConfig
     from harness.engine.trial import FEWEST_FRAMES, averages_of
@@ -61,7 +61,7 @@ def analyse() -> None:
     surfaces += [{"shape": shape} for shape in ("auto", "free_form")]
     for settings in ({"crop": {"kind": "auto"}}, *({"crop": {"kind": "none"}, "surface": each} for each in surfaces)):
         detector = load_detector("thesis", settings)
-        with suppress(UserError):  # such a small capture may show no target to the crop; its loops have run by then
+        with suppress(UserError):  # the crop may find no target in so small a capture, but its loops have run by then
             evidence = detector.analyse(cloud)
             for detection in detector.find(cloud, evidence, detector.quiet_threshold(cloud, evidence) / 2):
                 detector.measure(cloud, evidence, detection)

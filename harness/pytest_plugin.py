@@ -1,9 +1,9 @@
-"""A pytest plug-in, loaded where tofpod is installed: the fixture ``tofpod_gate`` guards the limit of a detector.
+"""A pytest plug-in that is installed with tofpod. Its fixture ``tofpod_gate`` guards the limit of a detector:
 
     def test_the_limit_holds(tofpod_gate):
         tofpod_gate("limit.yaml")
 
-runs the study beside the test and compares it with ``limit.baseline.json`` there, as `harness.check` does. ``pytest
+This test runs the study beside it and compares it with ``limit.baseline.json`` there, as `harness.check` does. ``pytest
 --tofpod-update`` writes the baseline. Renders and finished trials are kept in pytest's cache folder."""
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ import pytest
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add ``--tofpod-update``."""
-    help = "write the baselines of tofpod_gate anew; commit them with the reason"
+    """Add the option ``--tofpod-update``."""
+    help = "write new baselines for tofpod_gate; commit them with the reason"
     parser.getgroup("tofpod").addoption("--tofpod-update", action="store_true", help=help)
 
 
 @pytest.fixture
 def tofpod_gate(request: pytest.FixtureRequest) -> Callable[..., Path]:
-    """Return ``gate(experiment, *changes)``: it returns a study's folder, or fails as `harness.check` does."""
+    """Return ``gate(experiment, *changes)``, which returns a study's folder or fails as `harness.check` does."""
 
     def gate(experiment: str, *changes: str) -> Path:
         from harness import check

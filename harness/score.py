@@ -1,12 +1,12 @@
-"""``python -m harness.score PREDICTIONS --dataset DIR``: the detection limit of a method's anomaly maps.
+"""``python -m harness.score PREDICTIONS --dataset DIR``: states the detection limit of a method's anomaly maps.
 
-A map is judged like a detector's score in a study: the threshold is the lowest with the wanted rate of false calls on
-the good boards of ``validation``; pixels above it, connected by steps of at most `LINK_M`, are a finding, which hits a
-damage by the experiment's rule (`harness.engine.judge.matched`). Limits follow from ``test``. Only inspected pixels
-count.
+A map is judged like a detector's score in a study. The threshold is the lowest with the wanted rate of false calls on
+the good boards of ``validation``. Pixels above it that are connected by steps of at most `LINK_M` form a finding, which
+hits a damage by the experiment's rule (`harness.engine.judge.matched`). Limits follow from ``test``. Only inspected
+pixels count.
 
 AU-PRO is the area under the mean overlap of damages against the share of false pixels, up to `PRO_LIMIT` and divided by
-it (Bergmann et al., Int. Journal of Computer Vision 129 (2021), 1038), with each damage as a region."""
+`PRO_LIMIT` (Bergmann et al., Int. Journal of Computer Vision 129 (2021), 1038); each damage is a region."""
 
 from __future__ import annotations
 
@@ -40,17 +40,17 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("predictions", type=Path, metavar="PREDICTIONS", help="a folder with the anomaly maps")
     add("--dataset", type=Path, required=True, metavar="DIR", help="a folder that harness.dataset wrote")
-    rate = "wanted false calls a square metre, which sets the threshold (default: the data set's)"
+    rate = "wanted false calls per square metre, which sets the threshold (default: the data set's)"
     add("--false-calls", type=float, metavar="RATE", help=rate)
-    add("--name", default="maps", help="of the method, for tables and comparisons (default: maps)")
+    add("--name", default="maps", help="name of the method in tables and comparisons (default: maps)")
     add("--out", type=Path, default=Path("results/score"), metavar="DIR", help="default: results/score")
 
 
 @program(
     _options,
     "State the detection limit (a90, a90/95) of anomaly maps on a data set of harness.dataset, with "
-    "AU-PRO and AUROC. PREDICTIONS holds one map for each board of validation and test: "
-    "<category>/<split>/<label>/<number>.npy or .tiff, of the pictures' size, higher where damage is likelier.",
+    "AU-PRO and AUROC. PREDICTIONS holds a map for each board of validation and test: "
+    "<category>/<split>/<label>/<number>.npy or .tiff, with the size of the pictures, higher for likely damage.",
     epilog="example: python -m harness.score maps --dataset boards --out scores; harness.compare compares two such "
     "folders of results.",
 )
@@ -68,7 +68,7 @@ def main(options: argparse.Namespace, command: str) -> int:
         raise UserError(f"{options.dataset}: is not finished", fix="run the command that wrote it again; it continues")
     rate = index["false_calls_per_m2"] if options.false_calls is None else options.false_calls
     if not 0 < rate <= 1e6:
-        raise UserError(f"--false-calls {rate:g}", legal="above 0, up to 1e6 a square metre")
+        raise UserError(f"--false-calls {rate:g}", legal="above 0, up to 1e6 per square metre")
     maps = _found(options.predictions, options.dataset, index["samples"])
     judged = [_judged(category, maps, options, index, rate) for category in index["categories"]]
     limits, rows, origin = [limit for limit, _ in judged], [row for _, row in judged], record(command)
@@ -95,7 +95,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def _found(predictions: Path, dataset: Path, samples: list[str]) -> dict[str, Path]:
-    """Return the file of each board's map. Raises UserError that names all missing, extra or wrong files."""
+    """Return the file of each board's map. Raises a UserError that names all missing, extra or wrong files."""
     from harness.engine.boards import read_arrays
 
     wanted = {name for name in samples if name.split("/")[1] in JUDGED}
@@ -118,8 +118,8 @@ def _found(predictions: Path, dataset: Path, samples: list[str]) -> dict[str, Pa
             f"{len(names)} maps are {what}: {', '.join(names[:MOST_NAMED])}{', ...' * (len(names) > MOST_NAMED)}"
             for what, names in faults.items()
         ]
-        legal = "for each board of validation and test one .npy or .tiff of real numbers, of the pictures' size"
-        raise UserError(f"{predictions}: {'; '.join(lines)}", legal=legal, fix="write maps for all boards anew")
+        legal = "a .npy or .tiff of real numbers with the pictures' size for each board of validation and test"
+        raise UserError(f"{predictions}: {'; '.join(lines)}", legal=legal, fix="write maps for all boards again")
     return {name: files[name][0] for name in wanted}
 
 
@@ -132,7 +132,7 @@ def _fault(path: Path, inspected: np.ndarray) -> str:
     if scores.shape != inspected.shape:
         return f"{' x '.join(map(str, scores.shape))} instead of {' x '.join(map(str, inspected.shape))}"
     lacking = int((~np.isfinite(scores[inspected])).sum())
-    return f"no finite number on {lacking} inspected pixels; give the lowest score there" if lacking else ""
+    return f"no finite number at {lacking} inspected pixels; write the lowest score there" if lacking else ""
 
 
 def _read(path: Path) -> np.ndarray:
@@ -167,7 +167,7 @@ def _judged(
 
     def boards(split: str) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray, float]]:
         """Yield the boards of a split: name, scores (NaN if not inspected), places, damage, inspected area."""
-        for each in sorted(one for one in maps if one.startswith(f"{category}/{split}/")):
+        for each in sorted(name for name in maps if name.startswith(f"{category}/{split}/")):
             inspected, places, damage = read_arrays(options.dataset, each, *JUDGED_BY)
             scores, places_m = np.where(inspected, _read(maps[each]), np.nan), places.astype(float)
             yield each, scores, places_m, damage, float(np.nansum(pixel_areas(places_m)[inspected]))
@@ -202,7 +202,7 @@ def _judged(
         tops.append((float(np.nanmax(scores)), bool(damages)))
 
     if not holes:
-        raise UserError(f"{options.dataset}: {category} has no damage in view, so that there is no limit to state")
+        raise UserError(f"{options.dataset}: {category} has no damage in view, so there is no limit to state")
     record = set_up_of(
         pd.DataFrame(holes),
         pd.DataFrame(runs),
@@ -237,8 +237,8 @@ def _findings(places_m: np.ndarray, above: np.ndarray) -> Findings:
 
 
 def area_under(scores: np.ndarray, found: np.ndarray, false: np.ndarray, limit: float = 1.0) -> float:
-    """Return the area under the share of the weights ``found`` (n,) above a threshold against that of ``false`` (n,),
-    up to ``limit`` and divided by it; NaN if either has no weight. Equal scores make one threshold."""
+    """Return the area under the share of the weights ``found`` (n,) above a threshold against the share of ``false``
+    (n,), up to ``limit`` and divided by it; NaN if either has no weight. Equal scores form a single threshold."""
     order = np.argsort(-scores, kind="stable")
     last = np.append(np.flatnonzero(np.diff(scores[order])), len(scores) - 1)
     up, across = (np.append(0.0, np.cumsum(each[order])[last]) for each in (found, false))

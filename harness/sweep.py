@@ -1,4 +1,4 @@
-"""``python -m harness.sweep experiments/averaging.yaml``: run an experiment and write its report."""
+"""``python -m harness.sweep experiments/averaging.yaml``: runs an experiment and writes its report."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from harness.vocabulary.program import program
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("experiment", type=Path, help="a YAML file, or the name of one that comes with tofpod, such as averaging")
-    help = "change one value of the file, such as repeats=5 or source.target.distance_m=0.9; may be repeated"
+    help = "change a value of the file, such as repeats=5 or source.target.distance_m=0.9; may be repeated"
     add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=help)
     help = "a recording (.mkv) whose own lens replaces the camera's nominal one, so that your unit is simulated"
     add("--calibration", type=Path, metavar="FILE", help=help)
@@ -25,11 +25,11 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Run an experiment: render its targets, simulate the camera, detect, measure, report.",
+    "Run an experiment: render its targets, simulate the camera, detect and measure damage, and write a report.",
     epilog="Finished trials are kept: the same command resumes after Ctrl-C or a fault.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
-    """Returns 0, 1 where trials failed, 2 on a mistake of the user, 130 after Ctrl-C."""
+    """Run the program. Returns 0, 1 if trials failed, 2 for a user's mistake, 130 after Ctrl-C."""
     from harness.experiment.load import load_experiment
     from harness.experiment.schema import CaptureSource
 

@@ -1,4 +1,4 @@
-"""Small synthetic clouds, with and without known damage, to test detectors (`harness.testing`)."""
+"""Small synthetic clouds with known damage for tests of detectors (`harness.testing`)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DAMAGE = ((-0.04, -0.02, 0.010, 0.012), (0.03, 0.02, 0.007, 0.008), (0.05, -0.03
 
 
 def synthetic_clouds() -> tuple[Cloud, ...]:
-    """Return a tilted plane, a cylinder's face, and a tilted plane with pixels without range; each with `DAMAGE`."""
+    """Return a tilted plane, a cylinder's face, and a tilted plane with missing pixels, each with `DAMAGE`."""
     return plane(seed=1), cylinder(seed=2), with_gaps(plane(seed=3), seed=4)
 
 

@@ -1,4 +1,4 @@
-"""The contract of detectors as checks for a plug-in author's own tests.
+"""Checks of the contract of detectors, for the tests of a plug-in's author.
 
     from harness.testing import check_detector
     from acme.detector import AcmeDetector
@@ -34,11 +34,11 @@ def check_detector(
     settings: Mapping[str, Any] | None = None,
     clouds: Sequence[Cloud] | None = None,
 ) -> None:
-    """Run every check on every cloud. Raises AssertionError where the contract of `detectors.interface` is broken; what
-    the detector itself raises is passed on. A note on the exception names the check. ``make``: a detector's class,
-    whose ``settings`` (plain data, as YAML holds it) its ``settings_type`` validates; or a function that makes a
-    detector anew at each call. ``clouds``: by default `harness.synthetic_clouds`, three clouds 0.7 m before the camera,
-    each with damage of centimetres, some of which must be found at some threshold. A study measures how good it is."""
+    """Run every check on every cloud. Raises AssertionError if the contract of `detectors.interface` is broken, and
+    passes on the detector's own exceptions, with a note that names the check. ``make`` is a detector's class, whose
+    ``settings_type`` validates ``settings`` (plain data as in YAML), or a function that makes a new detector at each
+    call. ``clouds`` are by default the three of `harness.synthetic_clouds`, 0.7 m from the camera, each with damage of
+    centimetres, some of which must be found at some threshold. Use a study to measure how good a detector is."""
     settings_type, build = getattr(make, "settings_type", None), cast("Callable[..., Detector]", make)
     if settings_type is None and settings is not None:
         raise TypeError("`settings` belong to a detector's class with a `settings_type`, not to a function")
@@ -56,31 +56,31 @@ def check_detector(
             raise
     detector = made()
     loud = any(detector.quiet_threshold(cloud, detector.analyse(cloud)) > 0 for cloud in tried)
-    require(loud, "nothing was found on any cloud at any threshold, so that next to nothing was checked")
+    require(loud, "nothing was found on any cloud at any threshold, so that hardly anything was checked")
 
 
-STRONGEST = 5  # findings of one cloud that are looked at one by one
+STRONGEST = 5  # findings of a cloud that are checked individually
 CENTRE_MARGIN_M = 0.02  # distance outside the cloud's extent up to which the centre of a finding may lie
-SCORE_TOLERANCE = 0.01  # share of the highest score: robust fits stop early, sums in another order round otherwise
-CROP_TOLERANCE = 0.01  # share of the pixels: a crop may come to another decision at the target's rim
+SCORE_TOLERANCE = 0.01  # share of the highest score: robust fits stop early, and the order of sums affects rounding
+CROP_TOLERANCE = 0.01  # share of the pixels: a crop may decide differently at the target's rim
 PLACE_TOLERANCE_M = 1e-4
 SHIFT_M = 0.037
 QUARTER_TURN = np.array([[0.0, 1.0, 0, 0], [-1.0, 0.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]])
-"""T_turned_cloud: what `numpy.rot90` makes of a picture with x right and y down."""
+"""T_turned_cloud of `numpy.rot90`, for an image with x right and y down."""
 
 Make = Callable[[], Detector]
 T = TypeVar("T")
 
 
 def require(kept: bool | np.bool_, what: str) -> None:
-    """Raise AssertionError unless this part of the contract is kept; python -O does not switch it off."""
+    """Raise AssertionError unless this part of the contract is kept; unlike assert, it also works with python -O."""
     if not kept:
         raise AssertionError(what)
 
 
 @dataclass(frozen=True)
 class Look:
-    """One detector's evidence on one cloud."""
+    """A detector's evidence on a cloud."""
 
     detector: Detector
     cloud: Cloud
@@ -101,20 +101,20 @@ class Look:
         return tuple(self.detector.find(self.cloud, self.evidence, threshold))
 
     def thresholds(self) -> tuple[float, ...]:
-        """Return rising thresholds from 0 to the quiet threshold at scores of pixels, where findings change."""
+        """Return ascending thresholds from 0 to the quiet threshold, at the scores of pixels, where findings change."""
         scores, quiet = self.evidence.score[np.isfinite(self.evidence.score)], self.quiet
         high = np.quantile(scores, [0.5, 0.9, 0.99, 0.999]).tolist() if len(scores) else []
         steps = {0.0, *high, *(share * quiet for share in (0.25, 0.5, 0.75, 0.95))}
         return tuple(sorted(step for step in steps if 0.0 <= step < quiet))
 
     def measured(self, finding: Detection) -> Measurement:
-        """Measure a finding; the numbers must be sound."""
+        """Measure a finding, and check that the numbers are valid."""
         found = self.detector.measure(self.cloud, self.evidence, finding)
         diameter, centre = found.extent_diameter_m, np.asarray(found.extent_centre_m)
         require(np.isfinite(diameter) and diameter >= 0, f"`extent_diameter_m` is {diameter:g}")
         require(centre.shape == (3,) and np.isfinite(centre).all(), "`extent_centre_m` is not 3 finite numbers")
-        require(found.score == finding.score, f"`measure` says score {found.score:g} of a finding of {finding.score:g}")
-        require(found.points >= 1, f"`measure` says {found.points} points")
+        require(found.score == finding.score, f"`measure` gives score {found.score:g}, the finding {finding.score:g}")
+        require(found.points >= 1, f"`measure` gives {found.points} points")
         return found
 
     def everything(self) -> tuple[Any, ...]:
@@ -125,9 +125,9 @@ class Look:
 
 
 def declares_itself(make: Make, cloud: Cloud) -> None:
-    """A name, a version from 1, and settings that are a Config whose defaults are legal and survive being stored."""
+    """Check the name, the version (at least 1), and the settings: a Config with legal defaults that can be stored."""
     detector = make()
-    require(isinstance(detector.name, str) and detector.name != "", "`name` is no text")
+    require(isinstance(detector.name, str) and detector.name != "", "`name` is not a text")
     version = detector.version
     require(type(version) is int and version >= 1, f"`version` is {version!r}: it must be a whole number, 1 or more")
     settings_type: Any = getattr(type(detector), "settings_type", None)
@@ -139,23 +139,23 @@ def declares_itself(make: Make, cloud: Cloud) -> None:
 
 
 def gives_sound_evidence(make: Make, cloud: Cloud) -> None:
-    """Images of the cloud's size, no score where there is no point, none infinite, some finite, a scale above 0."""
+    """Check that images have the cloud's size, that only points have scores, some finite, and that the scale is > 0."""
     _sound(Look.at(make(), cloud))
 
 
 def gives_the_same_twice(make: Make, cloud: Cloud) -> None:
-    """The same bits for the same cloud: again, after another cloud, and from a detector made anew."""
+    """Check that the same cloud gives the same bits: again, after another cloud, and with a new detector."""
     detector = make()
     first = Look.at(detector, cloud).everything()
     require(_same(first, Look.at(detector, cloud).everything()), "the same cloud gave another result the second time")
     Look.at(detector, with_gaps(cloud, seed=9)).everything()
     again = Look.at(detector, cloud).everything()
     require(_same(first, again), "the same cloud gave another result after another cloud")
-    require(_same(first, Look.at(make(), cloud).everything()), "a detector made anew gave another result")
+    require(_same(first, Look.at(make(), cloud).everything()), "a new detector gave another result")
 
 
 def keeps_its_input(make: Make, cloud: Cloud) -> None:
-    """Neither the cloud nor the evidence is written to, not even for a moment."""
+    """Check that the detector never writes to the cloud or the evidence, not even temporarily."""
     given = _with_arrays(cloud, np.ndarray.copy)
     look = Look.at(make(), given)
     require(_same(given, cloud), "`analyse` changed the cloud that it was given")
@@ -168,7 +168,7 @@ def keeps_its_input(make: Make, cloud: Cloud) -> None:
 
 
 def orders_findings_by_score(make: Make, cloud: Cloud) -> None:
-    """Strongest first, each above the threshold; at its own score a finding is gone, just below it is there."""
+    """Check that findings are sorted by score, exceed the threshold, and vanish at a threshold equal to their score."""
     look = Look.at(make(), cloud)
     for threshold in look.thresholds():
         found = look.find(threshold)
@@ -187,10 +187,10 @@ def orders_findings_by_score(make: Make, cloud: Cloud) -> None:
 
 
 def is_silent_at_the_quiet_threshold(make: Make, cloud: Cloud) -> None:
-    """Nothing is found there, something just below; it is the strongest finding's score, or 0 for none."""
+    """Check that the quiet threshold is the strongest finding's score (0 for none): silent there, but not below it."""
     look = Look.at(make(), cloud)
     quiet = look.quiet
-    require(np.isfinite(quiet) and quiet >= 0, f"the quiet threshold is {quiet:g}: a number from 0 is wanted")
+    require(np.isfinite(quiet) and quiet >= 0, f"the quiet threshold is {quiet:g}; it must be finite and at least 0")
     loud = len(look.find(quiet))
     require(loud == 0, f"at the quiet threshold of {quiet:g} there are {loud} findings")
     below = look.find(float(np.nextafter(quiet, 0.0))) if quiet > 0 else ()
@@ -203,7 +203,7 @@ def is_silent_at_the_quiet_threshold(make: Make, cloud: Cloud) -> None:
 
 
 def finds_no_more_at_higher_thresholds(make: Make, cloud: Cloud) -> None:
-    """Raising the threshold takes pixels away from the findings and adds none."""
+    """Check that a higher threshold only removes pixels from the findings."""
     look = Look.at(make(), cloud)
     lower, thresholds = _pixels_of(look.find(0.0)), (*look.thresholds(), look.quiet)
     for before, threshold in pairwise(thresholds):
@@ -214,13 +214,13 @@ def finds_no_more_at_higher_thresholds(make: Make, cloud: Cloud) -> None:
 
 
 def finds_valid_pixels(make: Make, cloud: Cloud) -> None:
-    """Pixels are ascending flat indices of valid points; centres are finite and lie within the cloud."""
+    """Check that pixels are ascending flat indices of valid points, and that centres lie within the cloud."""
     look = Look.at(make(), cloud)
     _sound_findings(look, *look.thresholds())
 
 
 def survives_missing_pixels(make: Make, cloud: Cloud) -> None:
-    """Evidence and findings stay sound where a twentieth of the pixels, a block and a column are gone."""
+    """Check evidence and findings on a cloud without 5 % of its pixels, a block and a column."""
     look = Look.at(make(), with_gaps(cloud, seed=5))
     _sound(look)
     _sound_findings(look, look.quiet / 2)
@@ -228,7 +228,7 @@ def survives_missing_pixels(make: Make, cloud: Cloud) -> None:
 
 
 def refuses_an_empty_cloud(make: Make, cloud: Cloud) -> None:
-    """A cloud without any point raises a UserError; a cloud with a single point causes no crash."""
+    """Check that a cloud without points raises a UserError, and that a cloud with a single point causes no crash."""
     detector, gone = make(), np.ones_like(cloud.valid)
     for points in (0, 1):
         gone.reshape(-1)[np.flatnonzero(cloud.valid)[:points]] = False
@@ -246,7 +246,7 @@ def refuses_an_empty_cloud(make: Make, cloud: Cloud) -> None:
 
 
 def survives_pickling(make: Make, cloud: Cloud) -> None:
-    """The detector, unused and used, and all that it gives can be sent to another process and is the same there."""
+    """Check that the detector (unused and used) and its results are the same in another process."""
 
     def sent(value: Any) -> Any:
         return pickle.loads(pickle.dumps(value))
@@ -259,7 +259,7 @@ def survives_pickling(make: Make, cloud: Cloud) -> None:
 
 
 def learns_plain_arrays(make: Make, cloud: Cloud) -> None:
-    """Learning returns arrays that can be stored, the same twice; with them the detector is sound on the cloud."""
+    """Check that learning returns reproducible arrays that can be stored, and that the detector works with them."""
     detector = make()
     if not isinstance(detector, Calibratable):
         return
@@ -271,23 +271,23 @@ def learns_plain_arrays(make: Make, cloud: Cloud) -> None:
     file.seek(0)
     with np.load(file, allow_pickle=False) as stored:
         restored = dict(stored)
-    require(_same(learned, restored), "what was learned changes when it is stored: it must be plain arrays")
+    require(_same(learned, restored), "the learned state changes when it is stored: it must be plain arrays")
     taught: Any = detector.calibrated(restored)
     require((taught.name, taught.version) == (detector.name, detector.version), "learning changed name or version")
-    require(_same(before, Look.at(detector, cloud).everything()), "learning changed the detector that was asked")
+    require(_same(before, Look.at(detector, cloud).everything()), "learning changed the detector itself")
     for check in (gives_sound_evidence, is_silent_at_the_quiet_threshold, survives_pickling):
         check(lambda: taught, cloud)
 
 
 def turns_with_the_cloud(make: Make, cloud: Cloud) -> None:
-    """The camera turned about its optical axis by 90 degrees, grid and lens with it."""
+    """Check the results for a camera that is turned by 90 degrees about its optical axis, with its grid and lens."""
     pixels = _grid_turned(cloud, np.arange(cloud.valid.size).reshape(cloud.valid.shape))
     turned = Look.at(make(), turned_once(cloud))
     _compare(Look.at(make(), cloud), turned, pixels, QUARTER_TURN, "turned by 90 degrees")
 
 
 def moves_with_the_cloud(make: Make, cloud: Cloud) -> None:
-    """The cloud moved away by 37 mm along its axis, as a map (whose grid samples space in parallel) can be."""
+    """Check the results for a map (a cloud with parallel samples) that is moved away by 37 mm along its axis."""
     base = replace(cloud, projection="parallel", lens=None, map_views=None)
     step = cloud.z_step_m
     shift = np.eye(4)
@@ -308,13 +308,13 @@ def _sound(look: Look) -> None:
     shape, evidence = look.cloud.valid.shape, look.evidence
     for name in ("score", "residual_m", "surface_z_m"):
         image = np.asarray(getattr(evidence, name))
-        require(image.shape == shape, f"`{name}` is an array of {image.shape}; the cloud's grid is {shape}")
+        require(image.shape == shape, f"`{name}` has the shape {image.shape}; the cloud's grid is {shape}")
         require(image.dtype.kind == "f", f"`{name}` holds {image.dtype}, which cannot hold NaN")
     score, scale = evidence.score, float(evidence.scale_m)
     count = int(np.isfinite(score[~look.cloud.valid]).sum())
-    require(count == 0, f"{count} pixels without a point have a score; NaN is wanted there")
+    require(count == 0, f"{count} pixels without a point have a score; it must be NaN")
     require(not np.isinf(score).any(), "a score is infinite")
-    require(np.isfinite(score).any(), "no pixel has a score; where a cloud cannot be judged, a UserError is wanted")
+    require(np.isfinite(score).any(), "no pixel has a score; a cloud that cannot be judged must raise a UserError")
     require(np.isfinite(scale) and scale > 0, f"`scale_m` is {scale:g}: it must be a length above 0")
 
 
@@ -326,7 +326,7 @@ def _sound_findings(look: Look, *thresholds: float) -> None:
         pixels, centre = np.asarray(finding.pixels), np.asarray(finding.centre_m)
         require(pixels.ndim == 1 and pixels.dtype.kind in "iu", "a finding's pixels are not a row of whole numbers")
         require(len(pixels) > 0, "a finding has no pixels")
-        require((np.diff(pixels.astype(np.int64)) > 0).all(), "a finding's pixels do not ascend, or one is named twice")
+        require((np.diff(pixels.astype(np.int64)) > 0).all(), "a finding's pixels are not in strictly ascending order")
         require(pixels[0] >= 0 and pixels[-1] < cloud.valid.size, "a finding's pixels reach beyond the cloud's grid")
         invalid = int((~cloud.valid.reshape(-1)[pixels]).sum())
         require(invalid == 0, f"{invalid} pixels of a finding have no point")
@@ -354,7 +354,7 @@ def _same(a: Any, b: Any) -> bool:
 
 
 def _with_arrays(value: T, change: Callable[[np.ndarray], np.ndarray]) -> T:
-    """A dataclass whose arrays are changed."""
+    """Return a copy of a dataclass with changed arrays."""
     held = {field.name: getattr(value, field.name) for field in fields(cast(Any, value))}
     changed = {name: change(array) for name, array in held.items() if isinstance(array, np.ndarray)}
     return cast(T, replace(cast(Any, value), **changed))
@@ -387,12 +387,12 @@ def turned_once(cloud: Cloud) -> Cloud:
 
 
 def _grid_turned(cloud: Cloud, image: np.ndarray) -> np.ndarray:
-    """A cloud without a grid keeps the order of its points."""
+    """Return an image turned by 90 degrees; a cloud without a grid keeps the order of its points."""
     return np.ascontiguousarray(np.rot90(image)) if cloud.organised else image
 
 
 def _compare(before: Look, after: Look, pixels: np.ndarray, T_after_before: np.ndarray, how: str) -> None:
-    """Compare scores and findings; ``pixels`` (h, w): of each pixel afterwards, its flat index before."""
+    """Compare scores and findings; ``pixels`` (h, w) holds the flat index before of each pixel afterwards."""
     was, now = before.evidence.score.reshape(-1)[pixels], after.evidence.score
     changed = int((np.isfinite(was) != np.isfinite(now)).sum())
     require(changed <= CROP_TOLERANCE * now.size, f"{how}, {changed} of {now.size} pixels gained or lost their score")
@@ -401,8 +401,8 @@ def _compare(before: Look, after: Look, pixels: np.ndarray, T_after_before: np.n
     for what, difference in changes.items():
         require(difference <= tolerance, f"{how}, {what} changed by {difference:g} (allowed {tolerance:g})")
 
-    # findings in the middle of the widest gap between scores from a fifth of the quiet threshold to it; where none is
-    # wider than the tolerance on both sides, a tolerable change of a score can change findings
+    # findings are compared in the middle of the widest gap between scores from a fifth of the quiet threshold to it; if
+    # no gap is wider than the tolerance on both sides, a tolerable change of a score can change findings
     scores = np.unique(before.evidence.score[np.isfinite(before.evidence.score)])
     scores = scores[(scores >= 0.2 * before.quiet) & (scores <= before.quiet)]
     gaps = np.diff(scores)
@@ -416,7 +416,7 @@ def _compare(before: Look, after: Look, pixels: np.ndarray, T_after_before: np.n
     for key, finding in of_before.items():
         moved_to = transform_points(T_after_before, finding.centre_m)
         apart = float(np.linalg.norm(np.asarray(moved_to) - np.asarray(of_after[key].centre_m)))
-        require(apart <= PLACE_TOLERANCE_M, f"{how}, a finding's centre lies {1e3 * apart:.2f} mm off")
+        require(apart <= PLACE_TOLERANCE_M, f"{how}, a finding's centre moved by {1e3 * apart:.2f} mm")
         sizes = before.measured(finding).extent_diameter_m, after.measured(of_after[key]).extent_diameter_m
         grown = abs(sizes[1] - sizes[0])
         require(grown <= PLACE_TOLERANCE_M, f"{how}, a finding's extent changed by {1e3 * grown:.2f} mm")

@@ -28,9 +28,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Measure the simulated cameras as real cameras are measured, and set each published figure beside "
-    "the simulated figure. With --capture: set a real capture of a static scene beside the simulation of the "
-    "planes and edges in it.",
+    "Measure the simulated cameras like real cameras, and compare each published figure with the simulated figure. "
+    "With --capture: compare a real capture of a static scene with the simulation of the planes and edges in it.",
     epilog="The exit code is 1 if a figure fails and its entry in the file of figures gives no reason.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
@@ -45,13 +44,13 @@ def main(options: argparse.Namespace, command: str) -> int:
         from harness.scorecard.board import run_board
 
         if options.camera or options.mask:
-            raise UserError("--camera and --mask do not go with --board: the experiment names the camera")
+            raise UserError("--camera and --mask cannot be combined with --board: the experiment names the camera")
         reading = {**reading_of(options), "frames": slice(options.frames) if options.frames else None}
         recording = opened(options.capture, options.intrinsics, **reading) if options.capture else None
         return run_board(options, recording, command)
     for name in (*READING, "intrinsics", "frames", "mask"):
         if getattr(options, name) is not None:
-            raise UserError(f"--{name} belongs to a capture, and none is named", fix="add --capture PATH")
+            raise UserError(f"--{name} belongs to a capture, but none is named", fix="add --capture PATH")
     from harness.scorecard.program import run_scorecard
 
     return run_scorecard(options, command)

@@ -193,9 +193,9 @@ def test_the_exact_command_is_a_valid_experiment(stored: Path, capsys: pytest.Ca
 @pytest.mark.parametrize(
     ("asked", "said"),
     [
-        (["--size", "5mm"], "a question needs --size and --distance"),
+        (["--size", "5mm"], "--size and --distance are needed"),
         (["--size", "5", "--distance", "1m"], "--size 5: is not a length with a unit"),
-        (["--size", "5mm", "--distance", "9m"], "not reach so far: distance 9 m: the atlas has 0.5 to 1.5 m\n"),
+        (["--size", "5mm", "--distance", "9m"], "not cover this: distance 9 m: the atlas has 0.5 to 1.5 m\n"),
         (["--size", "5mm", "--distance", "1m", "--camera", "kinect"], "--camera kinect: not in the atlas"),
         (["--size", "5mm", "--distance", "1m", "--damage", "crack"], "--damage crack: not in the atlas\n  legal: hole"),
         (["--size", "5mm", "--distance", "1m", "--damage", "crak"], "did you mean 'crack'?"),

@@ -162,7 +162,7 @@ def test_edges_and_a_single_distance_without_amplitude(truth, tmp_path, capsys):
     given = [str(path), "--intrinsics", str(tmp_path / "lens.json"), "--out", str(tmp_path / "out"), "--rate", "15"]
     given.append("--certificate")
     assert characterise.main(given) == 0
-    assert "the mean of 12 recorded frames shows" in (tmp_path / "out" / "certificate.html").read_text()
+    assert "the mean of 12 recorded frames reveals" in (tmp_path / "out" / "certificate.html").read_text()
     printed = capsys.readouterr().out
     assert printed.index("no amplitude is recorded") < printed.index("temporal noise")
     own = read_camera(tmp_path / "out" / "my_camera.yaml")
@@ -224,7 +224,7 @@ def test_bad_input_is_one_message(tmp_path, capsys):
     lens = ["--intrinsics", str(tmp_path / "lens.json"), "--out", str(tmp_path / "out")]
     for name, more, message in (
         ("equal.npz", [], "all frames are equal"),
-        ("short.npz", [], "2 frames; temporal noise needs repeats"),
+        ("short.npz", [], "2 frames: too few to measure temporal noise"),
         ("equal.npz", ["--albedo", "0"], "--albedo 0"),
         ("equal.npz", ["--rate", "-1"], "--rate -1"),
         ("equal.npz", ["--about", "firmware=1"], "need --certificate"),

@@ -126,7 +126,7 @@ def test_failed_trials_and_missing_set_ups_fail(program, capsys):
     assert program(record(SetUp(), SetUp(frames=5)), "--update") == 0
     assert program(record(SetUp(), SetUp(frames=5), SetUp(frames=9))) == 0, "a further one is no fault"
     assert program(one) == 1
-    assert "missing, and in the baseline: 5 frames" in capsys.readouterr().err
+    assert "missing, although in the baseline: 5 frames" in capsys.readouterr().err
     broken = replace(one, set_ups=(replace(one.set_ups[0], failed=1), *record(SetUp(frames=5)).set_ups))
     assert program(broken, code=1) == 1
     assert "1 trials failed, 0 before" in capsys.readouterr().out

@@ -104,7 +104,7 @@ def test_c8(world, expected):
     assert verdict("C8", in_units(worlds(world))).verdict == expected
     alone = verdict("C8", worlds(world))
     assert alone.verdict == "undecided"
-    told = f"1 unit of the camera only, so nothing follows for others; there: {expected}"
+    told = f"Judged on only 1 unit of the camera, so nothing follows for others: {expected}"
     assert expected == "undecided" or told in alone.evidence
 
 

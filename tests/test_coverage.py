@@ -118,7 +118,7 @@ def test_the_program_says_where_the_camera_is_blind(
     ("arguments", "said"),
     [
         (["plate", "--set", "sweep={}"], "is not a study of drawn damage"),
-        (["detection_limit", "--size", "5mm"], "set-ups, and coverage is of one"),
+        (["detection_limit", "--size", "5mm"], "set-ups, but only --goal can compare several"),
         (["pipe", "--size", "5"], "not a length with a unit"),
         (["pipe", "--goal", "5mm", "--suggest", "2"], "leave out --size"),
         (["pipe", "--size", "99mm"], "inspects no damage of that size"),

@@ -137,7 +137,7 @@ def test_no_unit_and_no_board_is_in_two_splits(home):
         units.setdefault("/".join(name.split("/")[1:3]), set()).add(truth["unit_seed"])
         poses.add(str(truth["T_camera_board"]))
     assert len(poses) == 10 and sum(map(len, units.values())) == len(set().union(*units.values())) == 3 + 2 + 1 + 2
-    assert "No unit of the camera stands before boards of two splits" in (folder / "README.md").read_text()
+    assert "No unit of the camera captures boards of two splits" in (folder / "README.md").read_text()
 
 
 def test_a_killed_run_goes_on_and_writes_equal_bytes(home, tmp_path, capsys):

@@ -32,7 +32,7 @@ def test_detectors_stand_beside_the_ideal_observer(
     assert main([str(results), "--serial"]) == 0
     told = capsys.readouterr().out
     assert told.startswith(
-        "The ideal observer is for a new unit of azure_kinect_nfov, by the noise of 8 units, at 4 false"
+        "The ideal observer judges a new unit of azure_kinect_nfov by the noise of 8 units, at 4 false"
     )
     tables = [pd.read_parquet(results / table.files[1]) for table in EFFICIENCY_TABLES]
     efficiency, damages = tables
@@ -77,7 +77,7 @@ def of_another_study(results: Path) -> None:
         (without_experiment, "has no experiment.yaml"),
         (without_study, "cannot be read"),
         (with_a_given_threshold, "no wanted rate of false calls"),
-        (of_another_study, "which study.json has"),
+        (of_another_study, "lacks the set-up"),
     ],
 )
 def test_mistakes_are_one_message(results, change, said, monkeypatch, capsys) -> None:

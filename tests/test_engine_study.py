@@ -45,7 +45,7 @@ def written(folder: Path, text: str = STUDY) -> Path:
     [
         ("study=null", "a family of boards needs a study"),
         ("source.target={name: thesis}", "a study needs a family of boards"),
-        ("threshold.calibrate={repeats: 5}", "a study's threshold is set on boards of their own"),
+        ("threshold.calibrate={repeats: 5}", "a study calibrates its threshold on separate boards"),
         ("threshold.calibrate={boards: 5, false_calls_per_m2: 1.0}", "cannot show 1 false calls per m2"),
         ("threshold.calibrate={repeats: 5, false_calls_per_m2: 1.0}", "needs `boards`"),
         ("threshold.calibrate={repeats: 5, boards: 5}", "not both"),

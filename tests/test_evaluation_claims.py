@@ -127,7 +127,7 @@ def test_evidence_carries_the_numbers() -> None:
     assert "42 of 50 (3)" in more.evidence
     assert "hole 4 +2.0 (1.5 to 2.5)" in verdict("C3", World(size_bias_mm=lambda diameter: 2.4)).evidence
     assert "that it falls with the diameter" in verdict("C4").evidence
-    assert "ratio position to size 4.00" in verdict("C5").evidence
+    assert "ratio of the variances of position and size 4.00" in verdict("C5").evidence
 
 
 def test_sizes_are_held_against_the_scatter_between_units_too() -> None:

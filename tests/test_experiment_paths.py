@@ -148,7 +148,7 @@ def test_override_values_are_yaml_and_have_their_place() -> None:
         ("target.distances.4=1", "the list has no item 4; it has 1, counted from 0"),
         ("target.nothing.albedo=1", "--set: `target.nothing` is null here, which has no `albedo`"),
         ("frames", "--set: not of the form path=value"),
-        ("frames=", "to do: write null for no value"),
+        ("frames=", "to do: write null to state no value"),
         ("=3", "--set: not of the form path=value"),
         ("frames={a: 1, a: 2}", "--set: duplicate key `a`\n      | frames={a: 1, a: 2}\n      |               ^"),
     ],
@@ -165,7 +165,7 @@ def test_a_bad_override_points_to_itself(option: str, expected: str) -> None:
 def test_a_swept_key_cannot_be_overridden_in_vain(text: str, overrides: list[str]) -> None:
     _, (problem,) = override(text, *overrides)
     assert problem == (
-        "--set: `frames` is swept, so this value would never be used\n"
+        "--set: `frames` is an axis of the sweep, so this value would never be used\n"
         "      | frames=5\n"
         "      | ^~~~~~\n"
         "  to do: --set 'sweep.frames=[5]'"

@@ -230,7 +230,7 @@ def test_settings_that_are_varied_are_resolved_as_they_were_written(folder: Path
         ("{calibrate: {repeats: 4}}", "{}", ["x.yaml:9:12: `threshold`: give either `k` or `calibrate`"]),
         ("{calibrate:", "{k: 3.0, calibrate:", ["x.yaml:9:12: `threshold`: give either `k` or `calibrate`"]),
         ("{frames: 5}", "{frames: 20000}", ["x.yaml:7:19: `capture.frames` is 20000", "from 1 to 10000"]),
-        ("{frames: 5}", "{frames: 5, average: {frames: 2}}", ["x.yaml:7:32: an experiment counts its frames by"]),
+        ("{frames: 5}", "{frames: 5, average: {frames: 2}}", ["x.yaml:7:32: the number of frames is set by"]),
         (
             "azure_kinect_nfov",
             "azure_kinect",
@@ -243,7 +243,7 @@ def test_settings_that_are_varied_are_resolved_as_they_were_written(folder: Path
             ["x.yaml:8:44: `detector.settings.degree` is 9", "legal: a whole number from 1 to 5"],
         ),
         ("degree: 2", "degre: 2", ["x.yaml:8:36: unknown key `degre` in `detector.settings`", "did you mean: degree"]),
-        ("radius_mm: 15.0", "radius_mm: 30.0", ["x.yaml:10:23: a matching radius of 30 mm", "at most 25.4 mm"]),
+        ("radius_mm: 15.0", "radius_mm: 30.0", ["x.yaml:10:23: within a matching radius of 30 mm", "at most 25.4 mm"]),
         ("radius_mm: 15.0", "radius_mm: 0.015", ["x.yaml:10:23: `matching.radius_mm` is 0.015", "from 0.5 to 1000"]),
         ("kind: simulated", "kind: simulate", ['x.yaml:4:9: `source.kind` is "simulate"', "did you mean: simulated"]),
         ("name: thesis,", "name: thesi,", ['x.yaml:5:18: `source.target.name` is "thesi"', "one of thesis, custom"]),
@@ -292,7 +292,7 @@ def test_mistakes_of_the_experiment_have_their_place(folder: Path, old: str, new
             "source.target.hole_spacing_mm: [50.8, 90.0]",
             ["13:41: with source.target.hole_spacing_mm=90.0: the target cannot be built"],
         ),
-        ("matching.radius_mm: [10.0, 26.0]", ["13:30: a matching radius of 26 mm"]),
+        ("matching.radius_mm: [10.0, 26.0]", ["13:30: within a matching radius of 26 mm"]),
         (
             "capture.frames: [1, 2]\n  capture: [{frames: 1}]",
             ["13:3: the axes `capture` and `capture.frames` set the same key"],
@@ -330,7 +330,7 @@ def test_a_combination_that_cannot_be_is_named(folder: Path) -> None:
         (
             "frames: [1, 5]\n  vary",
             "frames: [1, 7]\n  vary",
-            ["16:15: 7 frames are not run in the main experiment", "of 1, 5"],
+            ["16:15: the main experiment has no set-up with 7 frames", "of 1, 5"],
         ),
         ("frames: [1, 5]\n  vary", "frames: [1, 1]\n  vary", ["are the same experiment"]),
         ("[0.5, 0.9]", "[0.5, 90]", ["19:21: `source.target.distance_m` is 90"]),

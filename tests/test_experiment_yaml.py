@@ -115,7 +115,7 @@ def test_all_duplicate_keys_with_both_places() -> None:
     ("text", "expected"),
     [
         ("a: [1,\nb: 2", "x.yaml:2:5: not valid YAML"),
-        ("a: [1,\nb: 2", "begun at x.yaml:1:4"),
+        ("a: [1,\nb: 2", "which began at x.yaml:1:4"),
         ("a: 1\n  b: 2", "x.yaml:2:4: not valid YAML: mapping values are not allowed here"),
         ("a:\n\tb: 1", "x.yaml:2:1: not valid YAML"),
         ("a: 1\n---\nb: 2", "x.yaml:2:1: not valid YAML: expected a single document"),
@@ -130,10 +130,10 @@ def test_all_duplicate_keys_with_both_places() -> None:
         ("ok: 1\n1: 2", "x.yaml:2:1: a key must be text"),
         ("? [a]\n: 1", "x.yaml:1:3: a key must be text"),
         ("a: &a {q: 1}\nb:\n  <<: *a", "x.yaml:3:3: merge keys (`<<`) are not part of YAML 1.2"),
-        ("a: &x [*x]", "x.yaml:1:4: an alias within its own anchor"),
+        ("a: &x [*x]", "x.yaml:1:4: an alias refers to a value that contains it"),
         ("%YAML 1.1\n---\na: yes", "x.yaml:1:1: only YAML 1.2 is supported"),
-        ("a: " + "[" * 60 + "]" * 60, f"x.yaml:1:{3 + MAX_DEPTH}: nested too deep"),
-        ("a: " + "[" * 300_000, f"x.yaml:1:{3 + MAX_DEPTH}: nested too deep"),
+        ("a: " + "[" * 60 + "]" * 60, f"x.yaml:1:{3 + MAX_DEPTH}: nested too deeply"),
+        ("a: " + "[" * 300_000, f"x.yaml:1:{3 + MAX_DEPTH}: nested too deeply"),
     ],
 )
 def test_bad_text_is_one_message_with_its_place(text: str, expected: str) -> None:

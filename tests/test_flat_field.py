@@ -227,7 +227,7 @@ def test_a_file_holds_what_was_saved_and_others_are_refused(tmp_path):
     arrays = dict(np.load(path))
     for changes, message in (
         ({"version": np.array(2)}, "was written by a newer tofpod"),
-        ({"version": np.array(1.5)}, "states the version"),
+        ({"version": np.array(1.5)}, "states the invalid version"),
         ({"error_m": np.zeros((3, 3))}, "do not belong together"),
         ({"variance_m2": -np.ones((128, 160))}, "do not belong together"),
         ({"lens": np.array([160.0, 128.0])}, "not a flat field"),

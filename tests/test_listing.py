@@ -323,7 +323,7 @@ def test_a_folder_that_only_looks_like_results_is_left_alone(tmp_path, capsys):
     stranger.mkdir(parents=True)
     (stranger / "report.html").write_text("mine")
     assert clean.main(["results", "photos", "--yes", "--out", str(tmp_path)]) == 2
-    assert "not a folder of results" in capsys.readouterr().err
+    assert "not a results folder" in capsys.readouterr().err
     assert (stranger / "report.html").read_text() == "mine"
 
 

@@ -90,7 +90,7 @@ def test_the_program_corrects_a_study(tmp_path: Path, capsys: pytest.CaptureFixt
     prior = ["--prior", str(tmp_path), "--board", "board", "--out", str(tmp_path / "out")]
     assert pod.main([*given, *prior]) == 0
     said, printed = json.loads((tmp_path / "out" / "mapod.json").read_text()), capsys.readouterr().out
-    assert printed.startswith("warning:") and "real.csv does not tell" in printed.splitlines()[0]
+    assert printed.startswith("warning:") and "real.csv does not state" in printed.splitlines()[0]
     assert "simulated" in printed and "measured" in printed and "combined" in printed
     assert [step["board"] for step in said["after_each_board"]] == ["none", "A", "B"]
     assert [step["targets"] for step in said["after_each_board"]] == [0, 12, 24]

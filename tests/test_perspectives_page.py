@@ -62,8 +62,8 @@ def test_every_section_is_there_and_nothing_comes_from_outside(page):
         "Holes found",
         "Registration error",
         "Merged clouds",
-        "What each map gives",
-        "If facts were otherwise",
+        "Results of each map",
+        "If the facts were different",
         "Failures",
         "Provenance",
     ]
@@ -147,7 +147,7 @@ def test_the_terminal_shows_counts_of_both_numbers_of_frames(found):
     assert len(lines) == 1 + 6
     assert re.match(r"registration, merge +1 view +2 views +9 views$", lines[0])
     assert re.match(r"marks, fusion +7 / 8 +7 / 8 +8 / 9$", lines[-1])
-    assert "of 11 with N=1 / N=50 frames a view" in ways_grid(compared).title
+    assert "of 11 with N=1 / N=50 frames per view" in ways_grid(compared).title
     half = found.holes["hole"].eq("4") & found.holes["repeat"].lt(6)
     unsure = replace(found, holes=found.holes.assign(detected=found.holes["detected"] & ~half))
     again = compare_maps(unsure, summarise_holes(unsure.holes, list(found.axes["path"])))

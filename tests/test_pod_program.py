@@ -385,7 +385,7 @@ HIT = ["--size", "a", "--hit", "hit"]
     [
         (GOOD, ["--size", "b", "--hit", "hit"], ["no column 'b'", "'a', 'hit', 't'"]),
         (GOOD, ["--size", "a", "--hit", "Hits"], ["no column 'Hits'", "did you mean 'hit'?"]),
-        (GOOD, ["--size", "a"], ["no column states what was found", "none is guessed"]),
+        (GOOD, ["--size", "a"], ["no column states what was found", "the program does not guess"]),
         (GOOD, [*HIT, "--ahat", "a"], ["one of them, not both"]),
         (GOOD, ["--size", "a", "--ahat", "hit"], ["--ahat needs --decision"]),
         (GOOD, [*HIT, "--decision", "3"], ["--decision belongs to --ahat"]),

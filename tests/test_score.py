@@ -108,7 +108,7 @@ def test_wrong_sets_of_maps_are_refused_at_once(folder, maps, tmp_path, capsys):
     said = capsys.readouterr().err
     assert "1 maps are missing: tiny/test/good/0000" in said
     assert "1 maps are not for a board of validation or test: tiny/test/good/0009" in said
-    assert "0000 (3 x 4 instead of" in said and "0001 (no finite number on" in said
+    assert "0000 (3 x 4 instead of" in said and "0001 (no finite number at" in said
     assert "0002 (cannot be read as an array of numbers)" in said and not (tmp_path / "out").exists()
 
 

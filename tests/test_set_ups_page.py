@@ -64,9 +64,9 @@ def test_every_section_is_there_and_nothing_comes_from_outside(page):
     assert headings(page) == [
         "Holes found",
         "Sizes and positions",
-        "What each camera gives",
+        "Errors of each camera",
         "The thesis' claim",
-        "If facts were otherwise",
+        "If the facts were different",
         "Thresholds and false calls",
         "Failures",
         "Provenance",
@@ -143,13 +143,13 @@ def test_effects_have_a_figure_and_a_table():
     found = switched({(): 3, ("noise",): 5, ("fixed_pattern",): 4, names: 6}, names)
     cloud = [replace(example(50), variant="noise+fixed_pattern")]
     page = set_ups_html(found, cloud, About(provenance(), YAML, "Anatomy"))
-    assert "What each effect costs" in headings(page)
+    assert "Loss due to each effect" in headings(page)
     assert '<figure id="effects">' in page
     # noise alone, with 1 and 50 frames, in the answer and in the table: 2/16 in, which is 3.175 mm
     assert re.sub(r"</?small>", "", page).count("+3.18 mm (+3.18 to +3.18)") == 4
     # alone and last, where the last bit decides how 3.175 is rounded
     assert len(re.findall(r"\+3\.1[78] mm <small>\(\+3\.1[78] to \+3\.1[78]\)", page)) == 4
-    assert "all effects together move the 50 % size by +4.76 mm" in page
+    assert "all effects together change the 50 % size by +4.76 mm" in page
 
 
 @pytest.mark.usefixtures("unsaved")

@@ -131,7 +131,7 @@ def test_what_all_set_ups_have_in_common_is_said_once(two: list[SetUpLimit]) -> 
     failed = [replace(one, record=replace(one.record, failed=3)) for one in two]
     failed[1] = replace(failed[1], a90_95=replace(failed[1].a90_95, value=np.inf, why="not demonstrated: of a ceiling"))
     notes = limit_notes(failed)
-    assert notes[0] == "every set-up: 3 trials failed and are missing"
+    assert notes[0] == "every set-up: 3 trials failed and are not included"
     assert notes[1] == "50 frames: of a ceiling"
     assert limit_notes(two[:1]) == []
     assert limit_notes([]) == []
@@ -267,9 +267,11 @@ def test_an_axis_ends_at_a_little_more_than_the_largest_size(two: list[SetUpLimi
     figure = axis_figure(group, "axis-1")
     texts = re.findall(r"<!-- (.*?) -->", figure)
     assert max(float(text) for text in texts if re.fullmatch(r"[\d.]+", text) and text not in ("1", "50")) <= 1.3 * 14
-    assert {"no limit", "goes on beyond", "largest size inspected"} <= set(texts)
+    assert {"no limit", "continues beyond the axis", "largest size inspected"} <= set(texts)
     (group,) = axis_groups(axis_lines(two))
-    assert not {"no limit", "goes on beyond"} & set(re.findall(r"<!-- (.*?) -->", axis_figure(group, "axis-1")))
+    assert not {"no limit", "continues beyond the axis"} & set(
+        re.findall(r"<!-- (.*?) -->", axis_figure(group, "axis-1"))
+    )
 
 
 def test_sizes_that_are_all_equal_have_an_axis(recwarn: pytest.WarningsRecorder) -> None:

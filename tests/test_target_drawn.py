@@ -321,6 +321,6 @@ def test_the_target_program_shows_any_board(tmp_path: Path, capsys: pytest.Captu
     ):
         assert f"{size:.3f}" in shown
     assert main([str(file), "--board", "-1"]) == 2
-    assert "numbered from 0" in capsys.readouterr().err
+    assert "from 0 upwards" in capsys.readouterr().err
     assert main(["thesis", "--board", "1"]) == 2
-    assert "declares one board, not a family" in capsys.readouterr().err
+    assert "is a single board, not a family" in capsys.readouterr().err

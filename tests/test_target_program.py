@@ -148,7 +148,7 @@ def test_a_bad_declaration_is_one_message(
 
 def test_no_such_file(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["tesis"]) == 2
-    assert "tesis: no such file, and no target of that name" in capsys.readouterr().err
+    assert "tesis: there is no such file or named target" in capsys.readouterr().err
 
 
 def test_binary_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

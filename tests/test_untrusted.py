@@ -125,7 +125,7 @@ def test_arrays_of_objects_are_not_unpickled(tmp_path, suffix):
         ("a: !!python/object/apply:os.system ['touch touched']\n", "tag"),
         ("a: !!python/object:pathlib.Path {}\n", "tag"),
         (BOMB, "too many values"),
-        ("a: " + "[" * 100_000, "nested too deep"),
+        ("a: " + "[" * 100_000, "nested too deeply"),
         ("b: {" + "a," * 6_000 + "}", "too many values"),
         ("b: 1\na: [" + "1," * 11_000 + "]", "too many values"),
         ("k: v\n" * 5_000, "duplicate key"),
@@ -201,7 +201,7 @@ def sparse(path: Path) -> Path:
     [
         (lambda path: read_inspections(path, "size", ["hit"]), "more than 256 MiB"),
         (lambda path: read_poses(path, 1), "more than 16 MiB"),
-        (read_mask, "no image that can be read (has more than 512 MiB)"),
+        (read_mask, "is not a readable image (has more than 512 MiB)"),
     ],
     ids=["inspections", "poses", "mask"],
 )
@@ -215,7 +215,7 @@ def test_a_mask_that_states_more_pixels_than_a_picture_has(tmp_path):
     content = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
     content += struct.pack(">I4sI", 0, b"IDAT", zlib.crc32(b"IDAT"))
     path.write_bytes(content)
-    assert "no image that can be read (30000 x 30000 pixels)" in refusal(lambda: read_mask(path))
+    assert "is not a readable image (30000 x 30000 pixels)" in refusal(lambda: read_mask(path))
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "9" * 10_000, "[1, 2"])

@@ -103,8 +103,8 @@ def test_defaults_fill_what_an_entry_leaves_out(tmp_path):
         ("albedo: 0.8", "step_mm: 5", ["unknown key `step_mm`", "distance_m, albedo, angle_deg"]),
         (", tolerance: 0.06", "", ["a value needs a tolerance"]),
         ("{above: 0.5}", "{above: 0.7, below: 0.5}", ["the bound `above` must be less"]),
-        ("{above: 0.5}", "{}", ["either a value says what was published, or"]),
-        ("{above: 0.5}", "{value: 0.5, tolerance: 0.1, below: 0.7}", ["either a value says what was published, or"]),
+        ("{above: 0.5}", "{}", ["give either `value`, or one or both"]),
+        ("{above: 0.5}", "{value: 0.5, tolerance: 0.1, below: 0.7}", ["give either `value`, or one or both"]),
         ("{above: 0.5}", "{above: .nan}", ["figures.yaml:15:", "a number"]),
         ("tag: M", "tag: X", ["figures.yaml:9:", "one of R, D, S, W, M"]),
         ("    calibration: true\n", "", ["lacks the key `calibration`"]),
@@ -183,8 +183,8 @@ def test_a_check_of_the_code_passes_within_its_tolerance_only_and_is_counted_apa
     assert score.verdict == "pass (tolerance)"
     assert "1 of 1 values within 25 % (1 by a wider tolerance" in program._answer([score])
     answer = program._answer([Score(check, Reading(0.9)), Score(reality, Reading(0.4))])
-    assert answer.startswith("0 of 1 blind figures hold: ")
-    assert "checks of the code 1 of 1. Fail without a stated reason: neighbours." in answer
+    assert answer.startswith("0 of 1 blind figures pass: ")
+    assert "1 of 1 checks of the code pass. Failures without a stated reason: neighbours." in answer
 
 
 def test_the_table_tells_value_interval_published_and_source(tmp_path):
@@ -267,7 +267,7 @@ def test_the_program_from_beginning_to_end(tmp_path, capsys, monkeypatch):
 
     figures.write_text(GOOD.replace("source: a filter", "source: a filter\n    fails: it did once"))
     assert main(options) == 0
-    assert "neighbours passes: remove `fails` from its entry" in capsys.readouterr().err
+    assert "neighbours passes now: remove `fails` from its entry" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -278,7 +278,7 @@ def test_the_program_from_beginning_to_end(tmp_path, capsys, monkeypatch):
         (["--mask", "m.png"], "--mask belongs to a capture"),
         (["--capture", "x", "--figures", "own.yaml"], "--figures belongs to the scorecard"),
         (["--capture", "absent"], "absent: no such file or folder"),
-        (["--capture", "x", "--camera", "a", "--camera", "b"], "a capture comes from one camera"),
+        (["--capture", "x", "--camera", "a", "--camera", "b"], "a capture comes from a single camera"),
         (["--capture", "x", "--albedo", "0"], "--albedo 0"),
     ],
 )

@@ -111,7 +111,7 @@ def refused(options: list[str], capsys) -> str:
 def test_one_frame_is_refused(tmp_path, capsys):
     capture = recorded(tmp_path / "frames", plane_view(AZURE, REGION, 1.0, 0.8), frames=1)
     options = ["--capture", str(capture), "--intrinsics", "azure_kinect_nfov"]
-    assert "1 frame; temporal noise needs repeats" in refused(options, capsys)
+    assert "1 frame: too few to measure temporal noise" in refused(options, capsys)
 
 
 def test_another_size_a_wrong_camera_and_a_missing_lens_are_refused(tmp_path, capsys):
@@ -128,7 +128,7 @@ def test_another_size_a_wrong_camera_and_a_missing_lens_are_refused(tmp_path, ca
     told = refused(["--capture", str(small), "--intrinsics", str(lens), "--camera", "azure_kinect_nfov"], capsys)
     assert "the capture has 200 x 160 pixels, but azure_kinect_nfov has 640 x 576" in told
     told = refused(["--capture", str(capture), "--intrinsics", "azure_kinect_nfov", "--mask", str(lens)], capsys)
-    assert "no image that can be read" in told and "neither PNG nor JPEG" in told
+    assert "is not a readable image" in told and "neither PNG nor JPEG" in told
 
 
 def test_nothing_flat_is_refused(tmp_path, capsys):
@@ -142,7 +142,7 @@ def test_nothing_flat_is_refused(tmp_path, capsys):
     options = ["--capture", str(folder), "--intrinsics", "azure_kinect_nfov", "--mask"]
     mask = tmp_path / "mask.png"
     cv2.imwrite(str(mask), (255 * (np.hypot(u - 320, v - 288) < 24)).astype(np.uint8))
-    assert "no flat surface in it" in refused([*options, str(mask)], capsys)
+    assert "shows no flat surface" in refused([*options, str(mask)], capsys)
 
 
 # ---- real captures ---------------------------------------------------------------------------------------------------

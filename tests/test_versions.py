@@ -43,13 +43,13 @@ def test_what_is_known_is_read(found, oldest):
             "x.json: was written by a newer tofpod: it is a record of version 4\n  legal: versions 2 to 3\n  to do: up",
         ),
         (1, "x.json: is a record of version 1\n  legal: versions 2 to 3\n  to do: run it again"),
-        (None, "x.json: states no version of a record"),
-        (True, "states the version 'True', which is none"),
-        (2.0, "states the version '2.0', which is none"),
-        ("3", "states the version '3', which is none"),
-        (-1, "states the version '-1', which is none"),
-        ([3], "states the version '[3]', which is none"),
-        ("9" * 9999, "states the version '" + "9" * 40 + "', which is none"),
+        (None, "x.json: is a record that states no version"),
+        (True, "states the invalid version 'True'"),
+        (2.0, "states the invalid version '2.0'"),
+        ("3", "states the invalid version '3'"),
+        (-1, "states the invalid version '-1'"),
+        ([3], "states the invalid version '[3]'"),
+        ("9" * 9999, "states the invalid version '" + "9" * 40 + "'"),
     ],
 )
 def test_what_is_not_is_refused(found, told):
@@ -82,7 +82,7 @@ def test_the_stamp_of_a_text(text, found):
         (RECORD_VERSION + 1, f"newer tofpod: it is a record of version {RECORD_VERSION + 1}"),
         (OLDEST_VERSION - 1, f"is a record of version {OLDEST_VERSION - 1}"),
         (None, "states no version"),
-        ("one", "states the version 'one'"),
+        ("one", "states the invalid version 'one'"),
     ],
 )
 def test_a_studys_record(tmp_path, version, told):
@@ -111,7 +111,7 @@ def test_an_experiment_of_a_result_folder(tmp_path):
     for line, told in (
         (stamped("experiment", EXPERIMENT_VERSION + 1), "newer tofpod: it is an experiment of version"),
         (stamped("experiment", 0), "is an experiment of version 0"),
-        ("# tofpod experiment x1\n", "states the version 'x1'"),
+        ("# tofpod experiment x1\n", "states the invalid version 'x1'"),
     ):
         path.write_text(line + body)
         with pytest.raises(UserError, match=told):
@@ -143,7 +143,7 @@ def test_findings_carry_it_in_a_column():
     [
         (RESULTS_VERSION + 1, f"newer tofpod: it is a file of poses of version {RESULTS_VERSION + 1}"),
         (0, "is a file of poses of version 0"),
-        ("1", "states the version '1', which is none"),
+        ("1", "states the invalid version '1'"),
         (None, "states no version"),
     ],
 )

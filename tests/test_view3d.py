@@ -84,7 +84,7 @@ def test_the_page_needs_nothing_from_outside_and_escapes_what_it_is_given(tmp_pa
     assert text.count("</script>") == 1
     assert not re.findall(r"(?:src|href)=|https?:|import\(|fetch\(|XMLHttpRequest", text)
     assert "damage, missed" in text
-    assert "finding that is no damage" not in text
+    assert "finding that matches no damage" not in text
     assert "needs WebGL" in text
     assert write_view3d(tmp_path / "b.html", scene, "A & B").read_text() == text
 

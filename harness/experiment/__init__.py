@@ -1,1 +1,1 @@
-"""The YAML of an experiment: read with places, validated all at once, unfolded into points. Runs nothing."""
+"""Reads an experiment's YAML, validates it as a whole, and unfolds it into points. This room runs nothing."""

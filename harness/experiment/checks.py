@@ -1,4 +1,4 @@
-"""Mistakes that concern several keys of an experiment together, or things outside the file: names, files, views."""
+"""Finds mistakes that involve several keys of an experiment, or things outside the file: names, files, views."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ VIEWS = ("source", "views")
 
 
 def resolved(source: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
-    """Validate an experiment's data; returns its declaration (None where it is not valid) and all problems."""
+    """Validate an experiment's data; return its declaration (None if it is not valid) and all problems."""
     config, problems = validated(ExperimentConfig, source, splices_of(source.data))
     for path, legal in ((CAMERA_NAME, camera_names()), (DETECTOR_NAME, detector_names())):
         name = shape.get(source.data, path)
@@ -46,7 +46,7 @@ def resolved(source: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
     if config is None or problems:
         return config, problems
     if config.capture.average.frames is not None:
-        place, message = source.key_place_of(("capture", "average", "frames")), "an experiment counts its frames by"
+        place, message = source.key_place_of(("capture", "average", "frames")), "the number of frames is set by"
         problems.append(Problem(f"{message} `capture.frames`", place, fix="remove this key"))
     if isinstance(config.source, SimulatedSource):
         for check in (_target_problems, _mapping_problems, _flat_field_problems):
@@ -57,7 +57,7 @@ def resolved(source: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
 
 
 def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Problem]:
-    """Find what does not fit between a study, a family of boards and a threshold set on boards."""
+    """Find contradictions between a study, a family of boards and a threshold that is calibrated on boards."""
     target = config.source.target if isinstance(config.source, SimulatedSource) else None
     drawn, calibrate = isinstance(target, DrawnTargetConfig), config.threshold.calibrate
     boards_at = source.place_of(("threshold", "calibrate", "boards"))
@@ -65,7 +65,7 @@ def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Proble
         fix = "add for instance study: {boards: 60, hole_free_boards: 60}, or choose target: {name: thesis}"
         yield Problem("a family of boards needs a study", source.place_of(TARGET), fix=fix)
     elif config.study is None and calibrate is not None and calibrate.boards is not None:
-        yield Problem("only a study draws boards", boards_at, fix="write `repeats` in its place")
+        yield Problem("only a study draws boards", boards_at, fix="write `repeats` instead")
     elif config.study is not None and not isinstance(target, DrawnTargetConfig):
         fix = "write source.target: {name: drawn}"
         yield Problem("a study needs a family of boards", source.place_of(TARGET), fix=fix)
@@ -74,7 +74,7 @@ def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Proble
     if config.sensitivity is not None:
         fix = "sweep the key, or run the study once for each value with --set"
         yield Problem("a study cannot have a sensitivity", source.key_place_of(("sensitivity",)), fix=fix)
-    # what counts as a hit and which rate of false calls is wanted are rules of the study, the same for all set-ups
+    # the criterion of a hit and the wanted rate of false calls are rules of the study, equal for all set-ups
     for path in config.sweep:
         if path.split(".")[0] == "matching" or path == "threshold" or path.startswith("threshold.calibrate"):
             message = f"`{path}` is a rule of the study and cannot be an axis of it"
@@ -82,10 +82,10 @@ def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Proble
             yield Problem(message, source.key_place_of(("sweep", path)), fix=fix)
     if calibrate is not None and calibrate.boards is None:
         place = source.place_of(("threshold", "calibrate"))
-        yield Problem("a study's threshold is set on boards of their own", place, fix="write `boards: 60`")
+        yield Problem("a study calibrates its threshold on separate boards", place, fix="write `boards: 60`")
     elif calibrate is not None and calibrate.boards is not None:
-        # so few boards can show no lower rate, were all of their face judged: a new run exceeds the highest of n with
-        # probability 1 / (n + 1), and calls at all with 1 - exp(-rate * area)
+        # the number of boards bounds the rate that they can show, even if their whole face is judged: a new run exceeds
+        # the highest of n with probability 1 / (n + 1), and has a false call with 1 - exp(-rate * area)
         rate_per_m2 = calibrate.false_calls_per_m2 or 0.0
         area_m2 = target.board.width_mm * target.board.height_mm * MM**2
         needed = ceil(-1 / expm1(-rate_per_m2 * area_m2) * (1 - 1e-12)) - 1
@@ -109,14 +109,14 @@ def _target_problems(config: ExperimentConfig, simulated: SimulatedSource, sourc
     apart_mm = [dist(a.centre_mm, b.centre_mm) for a, b in combinations(target.damages, 2)]
     pitch_mm = drawn.apart_mm if drawn is not None else min(apart_mm, default=None)
     if pitch_mm is not None and config.matching.radius_mm > pitch_mm / 2:
-        what = f"a matching radius of {config.matching.radius_mm:g} mm lets a detection count for either of two damages"
+        what = f"within a matching radius of {config.matching.radius_mm:g} mm, a detection can match two damages"
         legal = f"at most {pitch_mm / 2:g} mm for damages whose centres are {pitch_mm:g} mm apart"
         yield Problem(what, source.place_of(("matching", "radius_mm")), legal=legal)
 
 
 @lru_cache(maxsize=10_000)
 def _declared(config: AnyTargetConfig) -> TargetConfig:
-    """Return the target, or a family's first board. Raises UserError where it cannot be."""
+    """Return the target, or the first board of a family. Raises UserError if it cannot exist."""
     target = config.declare()
     check_target(target)
     return target
@@ -126,8 +126,8 @@ def _declared(config: AnyTargetConfig) -> TargetConfig:
 def _unseen(
     camera: CameraConfig, views: AnyViews | None, declared: AnyTargetConfig
 ) -> tuple[KeyPath, UserError] | None:
-    """Return why the camera does not see the target, and the key that this concerns: no such camera, no albedo at its
-    wavelength, or `_unseen_pose`; of a family in the extreme poses that can be drawn, first in a single view."""
+    """Return why the camera does not see the target, and the key that causes it: an unknown camera, no albedo at its
+    wavelength, or `_unseen_pose`. A family is checked in its extreme poses, first in a single view."""
     target = _declared(declared)
     path: KeyPath = CAMERA_NUMBERS if camera.numbers else CAMERA_NAME
     try:
@@ -151,7 +151,7 @@ def _unseen(
 
 
 def _unseen_pose(optics: Optics, views: AnyViews | None, target: TargetConfig) -> tuple[KeyPath, UserError] | None:
-    """Return the mistake of the first pose that sees nothing of the face within range, and the key that it concerns."""
+    """Return the mistake of the first pose that sees nothing of the face within range, and the key that causes it."""
     try:
         poses = (target.pose,) if views is None else poses_of(views, target.pose)
     except ValidationError as error:
@@ -173,7 +173,7 @@ def _unseen_pose(optics: Optics, views: AnyViews | None, target: TargetConfig) -
 
 
 def _mapping_problems(config: ExperimentConfig, simulated: SimulatedSource, source: Source) -> Iterator[Problem]:
-    """Find what does not fit between several views and their mapping into one cloud."""
+    """Find contradictions between several views and their mapping into one cloud."""
     views, mapping = simulated.views, config.mapping
     if views is None and mapping is not None:
         fix = "declare source.views, for instance {kind: arc, count: 3, spread_deg: 40.0}"
@@ -187,11 +187,11 @@ def _mapping_problems(config: ExperimentConfig, simulated: SimulatedSource, sour
 
 
 def _flat_field_problems(config: ExperimentConfig, simulated: SimulatedSource, source: Source) -> Iterator[Problem]:
-    """Find a flat field's plane that lies outside of the camera's range."""
+    """Report a flat field whose plane lies outside the camera's range."""
     try:
         flat_field, optics = config.capture.flat_field, camera_of(simulated.camera).optics
     except UserError:
-        return  # reported with the target's pose
+        return  # reported together with the target's pose
     if flat_field is not None and not optics.nearest_m < flat_field.distance_m < optics.farthest_m:
         place = source.place_of(("capture", "flat_field"))
         legal = f"{optics.nearest_m:g} to {optics.farthest_m:g} m"
@@ -199,7 +199,7 @@ def _flat_field_problems(config: ExperimentConfig, simulated: SimulatedSource, s
 
 
 def _capture_problems(config: ExperimentConfig, capture: CaptureSource, source: Source) -> Iterator[Problem]:
-    """Find files that are not there or cannot be read, and what only a simulated source can have."""
+    """Find files that are missing or cannot be read, and keys that only a simulated source can have."""
     missing = [number for number, name in enumerate(capture.paths) if not Path(name).exists()]
     for number, path in ((number, Path(capture.paths[number])) for number in missing):
         near = nearest(path.name, [file.name for file in path.parent.glob("*")])
@@ -208,7 +208,7 @@ def _capture_problems(config: ExperimentConfig, capture: CaptureSource, source: 
     lens = capture.intrinsics
     if unknown := bool(lens) and lens not in camera_names() and not Path(str(lens)).is_file():
         legal, place = f"a file, or one of {', '.join(camera_names())}", source.place_of(("source", "intrinsics"))
-        yield Problem(f"{lens}: neither a file nor a camera", place, legal)
+        yield Problem(f"{lens}: is neither a file nor a camera", place, legal)
     try:
         if not missing and not unknown:
             recording_of(capture)

@@ -1,4 +1,4 @@
-"""Loading an experiment from a YAML file and ``--set`` overrides, with all of its mistakes reported at once."""
+"""Loads an experiment from a YAML file and ``--set`` overrides, and reports all of its mistakes at once."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ STAMP_KIND = "experiment"
 def load_experiment(
     path: Path, overrides: Sequence[str] = (), calibration: Path | None = None, *, quick: bool = False
 ) -> Experiment:
-    """Read, override (``path=value`` each), validate and unfold. Raises DeclarationError with all problems at once.
-    ``calibration``: a recording whose lens takes the place of the camera file's nominal one (`lens_numbers`).
-    ``quick``: fewer repeats and boards, and no sensitivity; ``overrides`` take precedence."""
+    """Read an experiment, apply ``path=value`` overrides, validate and unfold it. Raises DeclarationError with all
+    problems. The lens of a recording ``calibration`` replaces the camera file's nominal lens (`lens_numbers`).
+    ``quick`` reduces repeats and boards and drops the sensitivity study; ``overrides`` take precedence."""
     recording_of.cache_clear()
     path = _experiment_file(Path(path))
     written = read_yaml(path)
-    # a file that a result folder holds states its version; a file that is written by hand states none
+    # a file in a result folder states its version; a file that is written by hand states none
     found = stamp_of(written.text, STAMP_KIND)
     if found is not None:
-        again = "use the experiment that it was made from, or remove the first line and correct what is then refused"
+        again = "use the original experiment, or remove the first line and correct the problems that are then reported"
         check_version(found, EXPERIMENT_VERSION, path, "an experiment", again=again)
     overrides = [*_quick(written.data), *overrides] if quick else overrides
     source, problems = overridden(written, overrides, declared_of)
@@ -51,7 +51,7 @@ def load_experiment(
     for variation in config.sensitivity.vary if config.sensitivity else ():
         varied += [variation.path] if isinstance(variation, ValuesVariation) else [*variation.set]
     if any(each.startswith("detector") for each in varied):
-        # a detector may fill some settings from others (a preset): written out they would count beside a varied preset
+        # a detector may fill some settings from others (a preset); written out, they would override a varied preset
         data["detector"]["settings"] = shape.get(source.data, DETECTOR_SETTINGS) or {}
     return Experiment(config, points, data, source)
 
@@ -71,7 +71,7 @@ def _quick(data: Any) -> list[str]:
 
 
 def _experiment_file(path: Path) -> Path:
-    """Return the file that a path means, or a name such as ``averaging`` that comes with tofpod. Raises UserError."""
+    """Return the file for a path, or for the name of tofpod's own experiment (``averaging``). Raises UserError."""
     if path.exists() or path.name != str(path):
         return path
     own = shipped("experiments") / f"{path.name.removesuffix('.yaml')}.yaml"
@@ -82,12 +82,12 @@ def _experiment_file(path: Path) -> Path:
 
 
 def resolved_yaml(experiment: Experiment) -> str:
-    """Return the experiment with every default written out, under its version; loading it gives the same points."""
+    """Return the experiment as YAML with its version and every default; loading it gives the same points."""
     return stamped(STAMP_KIND, EXPERIMENT_VERSION) + to_yaml(dict(experiment.data))
 
 
 def _with_absolute_paths(source: Source, folder: Path) -> Source:
-    """Make paths of files absolute: they count from the YAML's folder, in ``--set`` from the current one."""
+    """Make file paths absolute: they are relative to the YAML's folder, or in ``--set`` to the current folder."""
     data = source.data
     swept: KeyPath = ("sweep", dotted(checks.CAMERA_NAME))
     listed = shape.get(data, swept)
@@ -106,9 +106,9 @@ def _with_absolute_paths(source: Source, folder: Path) -> Source:
 
 
 def _with_calibration(source: Source, recording: Path) -> Source:
-    """Put the recording's lens among the camera's replaced numbers; it counts before what the file says of the lens."""
+    """Add the recording's lens to the camera's replaced numbers; it takes precedence over the lens in the file."""
     if shape.get(source.data, ("source", "kind")) != "simulated":
-        raise UserError("a real capture brings its own lens", fix="leave out --calibration, or use source.intrinsics")
+        raise UserError("a real capture has its own lens", fix="leave out --calibration, or use source.intrinsics")
     swept = shape.get(source.data, ("sweep", ".".join(checks.CAMERA_NAME)))
     single = shape.get(source.data, checks.CAMERA_NAME)
     names = swept if isinstance(swept, list) else [single] if isinstance(single, str) else [CameraConfig().name]
@@ -118,9 +118,9 @@ def _with_calibration(source: Source, recording: Path) -> Source:
 
 
 def lens_numbers(recording: Path, cameras: Iterable[str]) -> dict[str, Any]:
-    """Return the ``source.camera.numbers`` with which the cameras look through a recording's own lens. Raises UserError
-    where the recording cannot be read, names no lens, or is of another size than a camera's sensor."""
-    from detectors.recordings import open_capture  # brings the readers of every format
+    """Return the ``source.camera.numbers`` that give the cameras the lens of a recording. Raises UserError if the
+    recording cannot be read, states no lens, or has another size than a camera's sensor."""
+    from detectors.recordings import open_capture  # imports the readers of all formats
 
     lens = None
     if recording.is_dir() or recording.suffix.lower() == ".mkv":
@@ -129,12 +129,12 @@ def lens_numbers(recording: Path, cameras: Iterable[str]) -> dict[str, Any]:
         raise UserError(f"--calibration {recording}: no such file or folder")
     if lens is None:
         legal = "an Azure Kinect .mkv, or a folder of depth images with its intrinsics beside them"
-        raise UserError(f"--calibration {recording}: holds no calibration of a lens", legal=legal)
+        raise UserError(f"--calibration {recording}: holds no calibrated lens", legal=legal)
     for name in cameras:
         nominal = load_camera(name).nominal_lens if name in camera_names() or is_camera_path(name) else lens
         if (nominal.width, nominal.height) != (lens.width, lens.height):
             legal = f"{nominal.width} x {nominal.height}, as {name} has"
             fix = "name a recording of the same camera in the same mode, or choose another source.camera.name"
-            what = f"{recording}: the calibration is for {lens.width} x {lens.height} pixels"
+            what = f"{recording}: its calibration is for {lens.width} x {lens.height} pixels"
             raise UserError(what, legal=legal, fix=fix)
     return numbers_of_lens(lens)

@@ -1,8 +1,8 @@
-"""The keys of an experiment's YAML, and its points: the values that determine their results, and their digests.
+"""Declares the keys of an experiment's YAML, and its points with their digests.
 
-Ranges of single fields are here; conditions on several fields are in `checks`. A digest covers only content that can
-change a number: not the name, the number of repeats or the other points. So a new value on an axis leaves all other
-points, their seeds and their finished trials unchanged."""
+This module holds the ranges of single fields; `checks` holds conditions on several fields. A digest covers only content
+that can change a result: not the name, the number of repeats or the other points. So a new value on an axis leaves all
+other points, their seeds and their finished trials unchanged."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ Repeats = Annotated[int, Field(ge=1, le=MAX_REPEATS)]
 Frames = Annotated[int, Field(ge=1, le=MAX_FRAMES)]
 Boards = Annotated[int, Field(ge=1, le=MAX_BOARDS)]
 ListAsTuple = BeforeValidator(lambda values: tuple(values) if isinstance(values, list) else values)
-"""Strict mode rejects a list where a tuple is declared; `Config` converts lists, but not those within a mapping."""
+"""Strict mode rejects a list in place of a tuple; `Config` converts lists, but not those within a mapping."""
 AxisValues = Annotated[tuple[Any, ...], Field(min_length=1, max_length=1000), ListAsTuple]
 DottedPath = Annotated[str, Field(min_length=1, max_length=200)]
 Label = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]{1,80}$", description="one line of at most 80 characters")]
@@ -52,7 +52,7 @@ StudyFrames = Annotated[tuple[Frames, ...], Field(min_length=1, max_length=100),
 
 
 class SimulatedSource(Config):
-    """Frames of a simulated camera that looks at a declared target, from one pose or from several ``views``."""
+    """Frames of a simulated camera that views a declared target from one pose or from several ``views``."""
 
     kind: Literal["simulated"]
     target: AnyTargetConfig
@@ -68,12 +68,12 @@ class CaptureSource(Config):
     paths: tuple[FileName, ...] = Field(
         min_length=1, max_length=100_000, description="files of depth frames, or a folder"
     )
-    unit: str | None = Field(None, description="unit of the stored depth, where the files do not state it")
+    unit: str | None = Field(None, description="unit of the stored depth, if the files do not state it")
     intrinsics: FileName | None = Field(None, description="a file of lens intrinsics, or a camera's name")
 
 
 class CaptureConfig(Config):
-    """The number of frames that are averaged, and how."""
+    """The number of averaged frames, and the method of averaging."""
 
     frames: Frames
     average: AverageConfig = AverageConfig()
@@ -81,12 +81,12 @@ class CaptureConfig(Config):
         None, description="a plane captured first, whose fixed pattern is subtracted from every frame"
     )
     exact: bool = Field(
-        False, description="true simulates each frame; false draws the mean where its distribution is the same"
+        False, description="true simulates each frame; false draws the mean if its distribution is the same"
     )
 
 
 class DetectorConfig(Config):
-    """The detector, by name, and its settings; each detector declares its own (below)."""
+    """The detector by name, and its settings, which each detector declares."""
 
     name: str = "thesis"
     settings: dict[str, Any] = Field(default_factory=dict)
@@ -97,9 +97,9 @@ class CalibrateConfig(Config):
     same set-up or, in a study, the lowest k that meets the rate of false calls on ``boards`` extra boards."""
 
     repeats: Repeats | None = None
-    boards: Boards | None = Field(None, description="of a study: extra boards for calibration only")
+    boards: Boards | None = Field(None, description="in a study: extra boards for calibration only")
     false_calls_per_m2: Annotated[float, Field(gt=0, le=1e6)] | None = Field(
-        None, description=f"of a study: the rate of false calls to meet; null: {DEFAULT_RATE_PER_M2:g}"
+        None, description=f"in a study: the rate of false calls to meet; null: {DEFAULT_RATE_PER_M2:g}"
     )
 
     @model_validator(mode="before")
@@ -113,12 +113,12 @@ class CalibrateConfig(Config):
         if (self.repeats is None) == (self.boards is None):
             raise ValueError("give either `repeats` or, in a study, `boards`, and not both")
         if self.boards is None and self.false_calls_per_m2 is not None:
-            raise ValueError("`false_calls_per_m2` needs `boards`, as repeats of one board say little about a rate")
+            raise ValueError("`false_calls_per_m2` needs `boards`, since repeats of one board cannot show a rate")
         return self
 
 
 class ThresholdConfig(Config):
-    """The detector's threshold k, given or calibrated: one of the two."""
+    """The detector's threshold k, which is either given or calibrated."""
 
     k: Annotated[float, Field(gt=0, le=1000)] | None = Field(None, description="in units of the detector's score")
     calibrate: CalibrateConfig | None = None
@@ -132,18 +132,18 @@ class ThresholdConfig(Config):
 
 class MatchingConfig(Config):
     """The rule by which a detection counts as a hit: it is matched one to one with the nearest damage within a radius
-    on the face. The distance to long damage (slot, gouge, chip) is that to its centre line."""
+    on the face. The distance to long damage (slot, gouge, chip) is the distance to its centre line."""
 
     radius_mm: Annotated[float, Field(ge=0.5, le=1000)] = 15.0
     overlap: Annotated[float, Field(gt=0.0, le=1.0)] | None = Field(
         None,
-        description="a detection is also a hit, wherever its centre lies, if at least this share of its pixels lies on "
-        "the damage (outline grown by two pixels); further such detections are parts of it and no false calls",
+        description="a detection also counts as a hit, wherever its centre is, if at least this share of its pixels is "
+        "on the damage (outline grown by two pixels); further such detections are parts of it, not false calls",
     )
 
 
 class ValuesVariation(Config):
-    """A variation: one key is set to each of the values in turn."""
+    """A variation that sets one key to each of the values in turn."""
 
     path: DottedPath
     values: AxisValues
@@ -152,7 +152,7 @@ class ValuesVariation(Config):
 
 
 class LabelledVariation(Config):
-    """A variation: several keys change together, under one label."""
+    """A variation that changes several keys together, under one label."""
 
     label: Label
     set: Annotated[dict[DottedPath, Any], Field(min_length=1, max_length=50)]
@@ -161,7 +161,7 @@ class LabelledVariation(Config):
 
 
 class SensitivityConfig(Config):
-    """Variations of the experiment, one at a time, each run at a few numbers of frames with fewer repeats."""
+    """Variations of the experiment, one at a time, each with a few numbers of frames and fewer repeats."""
 
     repeats: Repeats
     calibration_repeats: Repeats | None = Field(None, description="hole-free runs; null: as in threshold")
@@ -171,22 +171,22 @@ class SensitivityConfig(Config):
 
 class StudyConfig(Config):
     """A study of the probability of detection on random boards: ``boards`` have damage, and false calls are counted on
-    ``hole_free_boards``. All set-ups inspect the same boards; ``repeats`` draw the noise anew on each. ``units`` are
-    cameras with different fixed patterns: all inspect each damaged board, and a different one each hole-free board."""
+    ``hole_free_boards``. All set-ups inspect the same boards, each with ``repeats`` draws of noise. ``units`` are
+    cameras with different fixed patterns: all of them inspect each damaged board, another one each hole-free board."""
 
     boards: Boards
     hole_free_boards: Boards
     units: Annotated[int, Field(ge=2, le=1000)] | None = Field(
-        None, description="number of units; null: only source.camera.unit_seed, and limits hold for that unit alone"
+        None, description="number of units; null: only source.camera.unit_seed, so that limits hold for that unit alone"
     )
 
 
 class ExperimentConfig(Config):
-    """One experiment, and the axes over which it is swept."""
+    """An experiment and the axes over which it is swept."""
 
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$", description="the folder of its results, too")
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$", description="also the name of its results folder")
     title: Annotated[str, Field(max_length=300)] = ""
-    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = Field(1, description="draws the noise")
+    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = Field(1, description="seed of the noise")
     source: Annotated[SimulatedSource | CaptureSource, Field(discriminator="kind")]
     capture: CaptureConfig
     mapping: MappingConfig | None = Field(None, description="how several views become one cloud")
@@ -194,21 +194,21 @@ class ExperimentConfig(Config):
     threshold: ThresholdConfig
     matching: MatchingConfig = MatchingConfig()
     study: StudyConfig | None = Field(None, description="needs a family of boards (target: {name: drawn})")
-    repeats: Repeats = Field(1, description="draws of the noise in each set-up")
+    repeats: Repeats = Field(1, description="number of draws of the noise in each set-up")
     sweep: Annotated[dict[DottedPath, AxisValues], Field(max_length=20)] = Field(default_factory=dict)
     draws: Annotated[int, Field(ge=2, le=1000)] | None = Field(
-        None, description="runs so many set-ups of the sweep, drawn at random, alike ones once; null: runs all"
+        None, description="number of set-ups of the sweep to run, drawn at random without duplicates; null: all"
     )
     switches: DottedPath | None = Field(
-        None, description="path of a mapping of switches: runs none, each alone, all but each, and all of them on"
+        None, description="path of a mapping of switches, which are on: none, each alone, all but each, and all"
     )
     sensitivity: SensitivityConfig | None = None
 
     @property
     def simulated(self) -> SimulatedSource:
-        """The source of an experiment with a simulated camera. Raises UserError for a real capture."""
+        """The source, which must be a simulated camera. Raises UserError for a real capture."""
         if isinstance(self.source, CaptureSource):
-            raise UserError(f"{self.name}: its source is a real capture, and this needs a simulated camera")
+            raise UserError(f"{self.name}: its source is a real capture, but a simulated camera is needed")
         return self.source
 
 
@@ -216,7 +216,7 @@ DETECTOR_SETTINGS = ("detector", "settings")
 
 
 def splices_of(data: Any) -> shape.Splices:
-    """Return the path of the detector's settings and their model; nothing for a detector that does not exist."""
+    """Return the path of the detector's settings and their model; empty for an unknown detector."""
     detector = shape.child(data, "detector")
     name = detector.get("name", "thesis") if isinstance(detector, dict) else "thesis"
     known = isinstance(name, str) and name in detector_names()
@@ -228,9 +228,9 @@ def declared_of(data: Any) -> shape.Declared:
     return shape.Declared(ExperimentConfig, data, splices_of(data))
 
 
-MAIN = "main"  # The only set-up of an experiment whose only axis, if any, is the number of frames
+MAIN = "main"  # The set-up of an experiment without axes other than the number of frames
 NO_NUMBERS = ("name", "title", "repeats", "study", "sweep", "draws", "switches", "sensitivity")
-"""Keys that determine which trials are run, but not the result of any trial."""
+"""Keys that determine which trials run, but not the result of any trial."""
 
 
 @dataclass(frozen=True)
@@ -253,7 +253,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Experiment:
-    """A valid experiment, unfolded. ``data`` is the resolved declaration as plain data, ``source`` what was read."""
+    """A valid experiment with its points. ``data`` is the resolved declaration as plain data, ``source`` the input."""
 
     config: ExperimentConfig
     points: tuple[Point, ...]
@@ -262,17 +262,17 @@ class Experiment:
 
     @property
     def digest(self) -> str:
-        """The digest that names the experiment's results, over all points with their repeats, in order."""
+        """The digest over all points with their repeats, in order, which names the experiment's results."""
         points = [[point.variant, point.label, point.digest, point.config.repeats] for point in self.points]
         return digest(points if self.config.study is None else [self.config.study.to_data(), *points])
 
     def folder(self, results: Path) -> Path:
-        """Return ``results/<name>/<digest>``, the folder of the results; UserError where a link leads out of it."""
+        """Return the results folder, ``results/<name>/<digest>``. Raises UserError if a link leads out of it."""
         return inside(Path(results), self.config.name, self.digest)
 
 
 def point_of(label: str, variant: str, values: Mapping[str, Any], config: ExperimentConfig) -> Point:
-    """Return the point of a resolved declaration, with its digests."""
+    """Return the point for a resolved declaration, with its digests."""
     source = config.source
     if isinstance(source, CaptureSource):
         files = [[file.name, file_digest(file)] for file in recording_of(source).files]
@@ -302,7 +302,7 @@ def detector_version(config: ExperimentConfig) -> int:
 
 @lru_cache(maxsize=1000)
 def recording_of(source: CaptureSource) -> Recording:
-    """Open the recording behind a source, its first frame read and checked. Raises UserError for its files."""
+    """Open the recording of a source, and read and check its first frame. Raises UserError for faulty files."""
     from detectors.recordings import open_capture  # imports the readers of all formats
 
     name = source.intrinsics

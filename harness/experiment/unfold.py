@@ -1,4 +1,4 @@
-"""Dotted paths and ``--set path=value``; axes, switches and variations unfolded into points, each validated, with
+"""Applies ``--set path=value``, unfolds axes, switches and variations into points, and validates each of them, with
 problems at the value that causes them. Set-ups differ in the axes other than the number of frames."""
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ NOT_VARIED = ("sweep", "sensitivity")  # Keys that hold dotted paths themselves
 
 
 class PathError(UserError):
-    """A dotted path that leads nowhere in the data."""
+    """A dotted path that does not exist in the data."""
 
 
 def key_path(text: str) -> KeyPath:
-    """Return ``a.b.2.c`` as keys and indices. After ``sweep.`` the rest is one key, as it is in the file."""
+    """Return ``a.b.2.c`` as keys and indices. The rest after ``sweep.`` is a single key, as in the file."""
     head, _, rest = text.partition(".")
     if head == "sweep" and rest:
         return (head, rest)
@@ -36,9 +36,9 @@ def key_path(text: str) -> KeyPath:
 
 
 def set_path(data: Any, path: KeyPath, value: Any, declared: shape.Declared | None = None, above: KeyPath = ()) -> Any:
-    """Return a copy of ``data`` with the value at ``path`` replaced or added. With ``declared``, a mapping missing on
-    the way is filled with its defaults, and a new kind of a mapping (``merge.kind``) leaves out what only the former
-    has. ``above``: where ``data`` stands. Raises PathError where the path cannot be followed."""
+    """Return a copy of ``data`` with the value at ``path`` replaced or added. With ``declared``, missing mappings on
+    the way get their defaults, and a new kind of a mapping (``merge.kind``) drops the keys of the former kind.
+    ``above`` is the path of ``data`` itself. Raises PathError if the path cannot be followed."""
     if not path:
         return value
     key, rest = _index(data, path[0], above), path[1:]
@@ -71,7 +71,7 @@ def _index(data: Any, key: str | int, above: KeyPath) -> Any:
 
 
 def path_problem(path: KeyPath, declared: shape.Declared, place: Place | None) -> Problem | None:
-    """Return the problem of a path that the declaration does not have, with the nearest legal path; else None."""
+    """Return the problem for a path that the declaration lacks, with the nearest legal path; None for a legal path."""
     for depth in range(1, len(path) + 1):
         if declared.at(path[:depth]) is None:
             known = [dotted(legal) for legal in declared.paths() if path[0] in NOT_VARIED or legal[0] not in NOT_VARIED]
@@ -82,12 +82,12 @@ def path_problem(path: KeyPath, declared: shape.Declared, place: Place | None) -
 
 
 def overridden(source: Source, overrides: Sequence[str], declared_of: shape.DeclaredOf) -> tuple[Source, list[Problem]]:
-    """Return the source with every legal ``path=value`` applied in order, and the problems of the others."""
+    """Return the source with every legal ``path=value`` applied in order, and the problems of the illegal ones."""
     problems: list[Problem] = []
     parts = [(text, *text.partition("=")[::2], Place(OPTION, 0, 1, text, max(1, text.find("=")))) for text in overrides]
     for text, name, written, place in parts:
         if not name.strip() or not written.strip():
-            fix = "write null for no value" if "=" in text and name.strip() else None
+            fix = "write null to state no value" if "=" in text and name.strip() else None
             problems.append(Problem("not of the form path=value", place, "capture.frames=10", fix=fix))
             continue
         path, declared = key_path(name.strip()), declared_of(source.data)
@@ -104,21 +104,21 @@ def overridden(source: Source, overrides: Sequence[str], declared_of: shape.Decl
     swept = shape.child(source.data, "sweep")
     for _, name, written, place in parts:
         if isinstance(swept, dict) and (path_text := name.strip()) in swept:
-            message = f"`{path_text}` is swept, so this value would never be used"
+            message = f"`{path_text}` is an axis of the sweep, so this value would never be used"
             problems.append(Problem(message, place, fix=f"{OPTION} 'sweep.{path_text}=[{written.strip()}]'"))
     return source, problems
 
 
-MAX_POINTS = 10_000  # More than a machine works through in a week; beyond it an axis was mistyped
-MAX_SHOWN = 20  # Problems of combinations are found one point at a time and look alike
+MAX_POINTS = 10_000  # More than a machine can run in a week; larger numbers come from mistyped axes
+MAX_SHOWN = 20  # Most problems of combinations, which are found one point at a time and are similar
 FRAMES = "capture.frames"
-SWITCHES = "switches"  # Key of the file that names a mapping of switches
+SWITCHES = "switches"  # Key of the file that states the path of a mapping of switches
 FIXED = ("name", "title", "repeats", "study", "sweep", "draws", SWITCHES, "sensitivity")  # the same for all points
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One path set to one value, where in the source that value is written, and its name (empty: ``path=value``)."""
+    """A path with its value, the place of that value in the source, and its name (``path=value`` if empty)."""
 
     path: str
     value: Any
@@ -128,7 +128,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Draft:
-    """An unresolved point. ``named_at``: its label in the file, else its last value; ``frames``: a variation's."""
+    """An unresolved point. ``named_at`` is the place of its label or last value; ``frames`` are a variation's."""
 
     label: str
     variant: str
@@ -139,7 +139,7 @@ class Draft:
 
 
 def unfolded(source: Source, config: ExperimentConfig | None) -> tuple[tuple[Point, ...], list[Problem]]:
-    """Return all points in order, or all problems of axes and variations. ``config`` None: the rest is wrong."""
+    """Return all points in order, or all problems of axes and variations. ``config``: None if other keys are wrong."""
     sweep = shape.child(source.data, "sweep")
     axes = [
         [Setting(path, value, ("sweep", path, index)) for index, value in enumerate(values)]
@@ -161,7 +161,7 @@ def unfolded(source: Source, config: ExperimentConfig | None) -> tuple[tuple[Poi
 
 
 def _written_variations(data: Any) -> Iterator[Draft]:
-    """Yield the variations as they are written, without the study's numbers of frames."""
+    """Yield the variations as the file states them, without the numbers of frames of the sensitivity study."""
     vary = shape.get(data, ("sensitivity", "vary"))
     for index, each in enumerate(vary if isinstance(vary, list) else ()):
         at: KeyPath = ("sensitivity", "vary", index)
@@ -182,7 +182,7 @@ def _frame_settings(frames: Any, at: KeyPath) -> tuple[Setting, ...]:
 
 def _label(settings: Iterable[Setting]) -> str:
     parts = (setting.name or f"{setting.path}={on_one_line(setting.value)}" for setting in settings)
-    return ", ".join(parts) or "the experiment as it stands"
+    return ", ".join(parts) or "the unchanged experiment"
 
 
 def _axis_problems(axes: list[list[Setting]], source: Source) -> Iterator[Problem]:
@@ -193,14 +193,14 @@ def _axis_problems(axes: list[list[Setting]], source: Source) -> Iterator[Proble
         outer = next((other for other in paths if path.startswith(other + ".")), None)
         if outer:
             message = f"the axes `{outer}` and `{path}` set the same key"
-            yield Problem(message, at, fix=f"sweep `{outer}` alone, or only keys within it")
+            yield Problem(message, at, fix=f"sweep only `{outer}`, or only keys within it")
     count = prod(len(axis) for axis in axes)
     if count > MAX_POINTS:
         yield Problem(f"the axes make {count} points", source.key_place_of(("sweep",)), legal=f"at most {MAX_POINTS}")
 
 
 def _switch_axis(config: ExperimentConfig, source: Source) -> tuple[list[Setting], list[Problem]]:
-    """Return an axis over the mapping of switches that the file names: none on, each alone, all but each, all."""
+    """Return an axis over the mapping of switches that the file names: none on, each alone, all but each, and all."""
     path, place, problems = config.switches or "", source.place_of((SWITCHES,)), []
     found = shape.get(config.to_data(), key_path(path))
     names = [*found] if isinstance(found, dict) and all(isinstance(value, bool) for value in found.values()) else []
@@ -227,13 +227,13 @@ def _variation_problems(variations: list[Draft], axes: list[list[Setting]], sour
             listed = source.place_of((*setting.written_at[:3], "path"))
             at = listed if "values" in setting.written_at else source.key_place_of(setting.written_at)
             yield from _path_problems(setting.path, at, source, (*FIXED, FRAMES))
-    # variations at a number of frames that the main experiment does not have could be compared with nothing
+    # a variation needs a set-up of the main experiment with the same number of frames for comparison
     main = [setting.value for axis in axes for setting in axis if setting.path == FRAMES]
     main = main or [shape.get(source.data, ("capture", "frames"))]
     listed_at: KeyPath = ("sensitivity", "frames")
     for setting in _frame_settings(shape.get(source.data, listed_at), listed_at):
         if setting.value not in main:
-            message = f"{setting.value} frames are not run in the main experiment: there is nothing to compare with"
+            message = f"the main experiment has no set-up with {setting.value} frames to compare with"
             yield Problem(message, source.place_of(setting.written_at), "of " + ", ".join(map(str, main)))
 
 
@@ -246,7 +246,7 @@ def _path_problems(path: str, place: Place | None, source: Source, fixed: Iterab
 
 
 def _resolved(draft: Draft, source: Source, keep_all: bool) -> tuple[ExperimentConfig | None, list[Problem]]:
-    """Return a point's declaration, or what is wrong with it: at the wrong value, else (``keep_all``) at its name."""
+    """Return a point's declaration, or its problems: at the wrong value, or else (if ``keep_all``) at its name."""
     place = source.place_of(draft.named_at)
     located = replace(source, data={k: v for k, v in source.data.items() if k not in ("sweep", "sensitivity")})
     try:
@@ -271,7 +271,7 @@ def _resolved(draft: Draft, source: Source, keep_all: bool) -> tuple[ExperimentC
 def _drafts(
     axes: list[list[Setting]], telling: list[str], variations: list[Draft], config: ExperimentConfig
 ) -> Iterator[Draft]:
-    """Yield the product of the axes, the last one fastest; then every variation at every number of frames."""
+    """Yield the product of the axes (the last varies fastest), then all variations with all numbers of frames."""
     names, texts = names_of(telling), dict[int, str]()
     for axis in axes:
         for one in axis if axis[0].path in telling else ():
@@ -285,8 +285,8 @@ def _drafts(
         order = random_stream(config.seed, "draws").permutation(len(groups))[: config.draws]
         chosen = [each for number in sorted(order) for each in [*groups.values()][number]]
     for settings in chosen:
-        # a set-up is called like ``camera=kinect_v2, distance=0.75 m``
-        parts = [texts[id(one)] for one in settings if one.path in telling]
+        # a set-up has a name such as ``camera=kinect_v2, distance=0.75 m``
+        parts = [texts[id(setting)] for setting in settings if setting.path in telling]
         yield Draft(_label(settings), ", ".join(parts) or MAIN, settings, settings[-1].written_at if settings else ())
     common = _frame_settings(config.sensitivity and config.sensitivity.frames, ("sensitivity", "frames"))
     for variation in variations:
@@ -304,11 +304,11 @@ def _points(
     known: dict[tuple[str, str], Draft] = {}
     set_ups: dict[str, str] = {}
     for draft in drafts:
-        # a set-up and a variation, or two set-ups whose long values are shortened alike, could not be told apart
+        # a set-up and a variation, or two set-ups with long values that are shortened, may get the same name
         values = [setting.value for setting in draft.settings if setting.path != FRAMES]
         if called.setdefault(draft.variant, values) != values:
             message = f"two different set-ups are called `{draft.variant}`"
-            return (), [Problem(message, source.place_of(draft.named_at), fix="give one another label")]
+            return (), [Problem(message, source.place_of(draft.named_at), fix="give one of them another label")]
     for draft in drafts:
         config, found = _resolved(draft, source, True)
         problems += found
@@ -322,7 +322,7 @@ def _points(
                 calibrate = calibrate.model_copy(update={"repeats": study.calibration_repeats})
             threshold = config.threshold.model_copy(update={"calibrate": calibrate})
             config = config.model_copy(update={"repeats": study.repeats, "threshold": threshold})
-        # the resolved values of the axes tell set-ups apart, and which of them a variation is to be compared with
+        # the resolved values of the axes identify set-ups, and the set-up that a variation is compared with
         data = json.loads(json.dumps(config.to_data())) if axes else {}
         placed = {path: shape.get(data, key_path(path)) for path in axes}
         point = point_of(draft.label, draft.variant, {s.path: s.value for s in draft.settings}, config)

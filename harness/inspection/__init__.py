@@ -1,3 +1,3 @@
-"""The work of `harness.detect`: from captures and arguments to findings, printed and written."""
+"""The work of `harness.detect`: it turns captures and arguments into findings, which it prints and writes."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A gauge board: its declaration, its place in a capture by its coded marks, and which of its holes were found."""
+"""A gauge board: its declaration, its pose in a capture by its coded marks, and the hits and misses of its holes."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from harness.vocabulary.provenance import check_version
 
 GAUGE_VERSION = 1
 FEWEST_MARKS = 3
-SIDES = 8  # directions around a hole in which judged points must lie; otherwise a miss means nothing
-WORST_FIT_MM = 2.0  # Root mean square distance of marks from their places, beyond which the fit is doubtful
+SIDES = 8  # directions around a hole in which judged points must lie; otherwise a miss is not evidence
+WORST_FIT_MM = 2.0  # Root mean square distance of marks from their places above which the fit is doubtful
 Length = Annotated[float, Field(gt=0, le=5e3)]
 CoordinateMm = Annotated[float, Field(ge=-5e3, le=5e3)]
 
 
 class GaugeMark(Config):
-    """A printed code: its number, its centre on the board, and the side of its black square."""
+    """A printed code: its number, its centre on the board, and the side length of its black square."""
 
     code: Annotated[int, Field(ge=0, le=999)]
     x_mm: CoordinateMm
@@ -41,7 +41,7 @@ class GaugeMark(Config):
 
 
 class GaugeHole(Config):
-    """A hole to drill: its centre on the board, and its depth (None for a through-hole)."""
+    """A hole to drill: its centre on the board, its diameter, and its depth (None for a through-hole)."""
 
     id: Annotated[int, Field(ge=1)]
     diameter_mm: Length
@@ -51,7 +51,7 @@ class GaugeHole(Config):
 
 
 class GaugeBoard(Config):
-    """One board: x to the right and y up from its centre, as seen from the printed side."""
+    """A board, with x to the right and y up from its centre, seen from the printed side."""
 
     name: Annotated[str, Field(min_length=1)]
     width_mm: Length
@@ -61,7 +61,7 @@ class GaugeBoard(Config):
 
 
 class Gauge(Config):
-    """All boards, the dictionary of their codes (OpenCV's name), and the hit radius."""
+    """All boards, the dictionary of their codes (OpenCV's name), and the radius within which a finding is a hit."""
 
     dictionary: str
     hit_radius_mm: Length
@@ -69,7 +69,7 @@ class Gauge(Config):
 
 
 def read_gauge(path: Path) -> Gauge:
-    """Read the truth file of `harness.gauge`. Raises UserError if it cannot be read or is not such a file."""
+    """Read the truth file of `harness.gauge`. Raises UserError if it cannot be read or is another kind of file."""
     legal = "the gauge.json that python -m harness.gauge wrote"
     try:
         data = strict_json(bounded_bytes(path, RECORD_BYTES))
@@ -83,8 +83,8 @@ def read_gauge(path: Path) -> Gauge:
 
 @dataclass(frozen=True)
 class GaugeRow:
-    """A hole in a capture. ``counted``: detector with its version, threshold in units of score, and hit radius in mm.
-    ``found``: "NA" if the hole was not judged on all sides. ``offset_mm``, ``score``: of the hit."""
+    """A hole in a capture. ``found`` is hit, miss, or NA if it was not judged on all sides; a hit has ``offset_mm`` and
+    ``score``. ``counted`` holds the detector with its version, its threshold in units of score, and the hit radius."""
 
     board: str
     hole: GaugeHole
@@ -104,14 +104,14 @@ HITS_AND_MISSES = Table(
     (
         Column("board", "board", "board", "name of the board"),
         Column("target", "hole", lambda row: f"{row.board}:{row.hole.id}", "board and number of the hole"),
-        Column("diameter_mm", "diameter (mm)", "hole.diameter_mm", "of the drill"),
-        Column("depth_mm", "depth (mm)", "hole.depth_mm", "none for a through-hole", text=_number),
-        Column("found", "found", "found", "hit, miss, or NA if it was not judged on all sides", text=str),
-        Column("offset_mm", "offset (mm)", "offset_mm", "of the finding's centre from the hole's", text=_number),
-        Column("score", "score", "score", "of the hit", text=_number),
-        Column("detector", "", lambda row: row.counted[0], "that searched for it, with its version"),
-        Column("threshold", "", lambda row: row.counted[1], "above which it detects, units of score"),
-        Column("hit_radius_mm", "", lambda row: row.counted[2], "within which a finding is a hit"),
+        Column("diameter_mm", "diameter (mm)", "hole.diameter_mm", "diameter of the drill"),
+        Column("depth_mm", "depth (mm)", "hole.depth_mm", "depth; empty for a through-hole", text=_number),
+        Column("found", "found", "found", "hit, miss, or NA if not all sides of it were judged", text=str),
+        Column("offset_mm", "offset (mm)", "offset_mm", "distance of the finding's centre from it", text=_number),
+        Column("score", "score", "score", "score of that finding", text=_number),
+        Column("detector", "", lambda row: row.counted[0], "name and version of the detector"),
+        Column("threshold", "", lambda row: row.counted[1], "threshold in units of score"),
+        Column("hit_radius_mm", "", lambda row: row.counted[2], "distance within which a finding is a hit"),
     ),
     formats=("csv",),
 )
@@ -119,7 +119,7 @@ HITS_AND_MISSES = Table(
 
 @dataclass(frozen=True)
 class GaugeSeen:
-    """The boards in a capture. ``false_calls``: findings on them that hit no hole and lie on no mark."""
+    """The boards in a capture. ``false_calls`` counts findings on them that hit no hole and lie on no mark."""
 
     rows: tuple[GaugeRow, ...]
     false_calls: int
@@ -128,17 +128,17 @@ class GaugeSeen:
 
     @property
     def answer(self) -> str:
-        """The counts in a sentence."""
+        """The counts as a sentence."""
         count = {state: sum(row.found == state for row in self.rows) for state in ("hit", "miss", "NA")}
         hits = f"{count['hit']} hits, {count['miss']} misses, {count['NA']} holes not judged"
         return f"gauge: {hits}, {self.false_calls} false calls"
 
 
 def seen_on(gauge: Gauge, judged: Judged, detector: str, threshold: float) -> GaugeSeen:
-    """Find the boards in a judged capture by their marks, match findings to holes. Raises UserError without one."""
+    """Find the boards in a capture by their marks, and match findings to holes. Raises UserError without a board."""
     counted = (detector, threshold, gauge.hit_radius_mm)
     cloud = judged.cloud
-    if cloud.rgb is None and cloud.amplitude is not None:  # an infrared picture shows printed codes too
+    if cloud.rgb is None and cloud.amplitude is not None:  # infrared images show printed codes too
         known = cloud.amplitude[np.isfinite(cloud.amplitude)]
         scaled = 255 * np.nan_to_num(cloud.amplitude) / max(float(np.quantile(known, 0.99)) if known.size else 0, 1e-9)
         cloud = replace(cloud, rgb=np.repeat(np.clip(scaled, 0, 255).astype(np.uint8)[..., None], 3, axis=2))
@@ -157,17 +157,17 @@ def seen_on(gauge: Gauge, judged: Judged, detector: str, threshold: float) -> Ga
         fit_mm = float(np.sqrt((apart_m**2).mean())) / MM
         notes.append(f"{board.name}: {len(marks)} marks, {fit_mm:.2f} mm (rms) from their places on the board")
         if fit_mm > WORST_FIT_MM:
-            doubt = f"its marks are {fit_mm:.1f} mm off: was it printed at 100 %, and is it flat?"
+            doubt = f"its marks are {fit_mm:.1f} mm off: check that it is flat and was printed at 100 %"
             warnings.append(f"{board.name}: {doubt}")
         own, beside = _matched(board, counted, judged, invert(T_camera_board))
         if unjudged := [str(row.hole.id) for row in own if row.found == "NA"]:
-            outside = "is too near the edge of the judged area: it counts neither as a hit nor as a miss"
+            outside = "is too close to the edge of the judged area, so it counts neither as a hit nor as a miss"
             warnings.append(f"{board.name}: hole {', '.join(unjudged)} {outside}")
         rows += own
         calls += beside
     if not rows:
         why = found.problem or f"{len(by_code)} codes were read, but no board has three of them"
-        fix = "show the whole board, nearer to the camera, in the picture that is recorded beside the depth"
+        fix = "show the whole board, closer to the camera, in the image that is recorded with the depth"
         raise UserError(f"--gauge: no board is recognised: {why}", fix=fix)
     return GaugeSeen(tuple(rows), calls, tuple(warnings), tuple(notes))
 
@@ -175,11 +175,11 @@ def seen_on(gauge: Gauge, judged: Judged, detector: str, threshold: float) -> Ga
 def _matched(
     board: GaugeBoard, counted: tuple[str, float, float], judged: Judged, T_board_camera: np.ndarray
 ) -> tuple[list[GaugeRow], int]:
-    """Return the rows of a board's holes, and the number of false calls among the findings on the board."""
+    """Return the rows of a board's holes, and the number of false calls on the board."""
     radius_m = counted[2] * MM
 
     def on_face(points_m: np.ndarray) -> np.ndarray:
-        """Return the points (n, 2) where lines of sight through points (n, 3) of the camera's frame meet the face."""
+        """Return (n, 2): where the lines of sight through points (n, 3) in the camera's frame meet the face."""
         points, lens = transform_points(T_board_camera, points_m.reshape(-1, 3)), T_board_camera[:3, 3]
         return np.asarray((lens + (points - lens) * (lens[2] / (lens[2] - points[:, 2]))[:, None])[:, :2])
 

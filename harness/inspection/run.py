@@ -27,7 +27,7 @@ from detectors.missing import measure_missing, missing_returns, one_damage_once
 from detectors.noise import REACH_FRAMES, noise_reach_px
 from detectors.null import each_object_once, own_threshold
 from detectors.views import PreparedView, View
-from harness.inspection import arguments as asked
+from harness.inspection import arguments as cli
 from harness.inspection import output
 from harness.inspection.gauge import HITS_AND_MISSES, GaugeSeen, read_gauge, seen_on
 from harness.report.findings import Judged, write_findings
@@ -105,7 +105,7 @@ def threshold_of(
     if default is not None and arguments.false_calls is None:
         return float(default), "the detector's own", evidence
 
-    own = own_threshold(detector, cloud, evidence, arguments.false_calls or asked.DEFAULT_FALSE_CALLS)
+    own = own_threshold(detector, cloud, evidence, arguments.false_calls or cli.DEFAULT_FALSE_CALLS)
     names = ("threshold", "expected", "low", "high", "peaks", "floor", "objects", "rim_pixels")
     notes = {**evidence.notes, "own_null": {name: getattr(own, name) for name in names}}
     peaks = f"{own.peaks} peaks towards the camera"
@@ -196,15 +196,15 @@ class Inspection:
 
 def inspect(arguments: argparse.Namespace) -> int:
     """Open, average, register and merge views, judge, print, and write with --out. Returns 0. Raises UserError."""
-    config = asked.mapping_of(arguments) if arguments.register is not None else None
+    config = cli.mapping_of(arguments) if arguments.register is not None else None
     paths = arguments.paths[: config.views] if config else arguments.paths
-    asked.refuse_misfits(arguments, paths)
+    cli.refuse_misfits(arguments, paths)
     refuse_thresholds(arguments)
-    own_settings = [each for each in arguments.set if config is None or not each.startswith(asked.PREFIX)]
-    detector, settings = asked.detector_of(arguments, "none" if config else arguments.crop, own_settings)
+    own_settings = [each for each in arguments.set if config is None or not each.startswith(cli.PREFIX)]
+    detector, settings = cli.detector_of(arguments, "none" if config else arguments.crop, own_settings)
     gauge = read_gauge(arguments.gauge) if arguments.gauge else None
     field = load_flat_field(arguments.flat_field) if arguments.flat_field else None
-    guesses = asked.read_poses(arguments.poses, len(paths)) if arguments.poses else (None,) * len(paths)
+    guesses = cli.read_poses(arguments.poses, len(paths)) if arguments.poses else (None,) * len(paths)
     recordings = [_opened(arguments, group) for group in ([[path] for path in paths] if config else [paths])]
     quiet = [] if arguments.quiet_capture is None else [_opened(arguments, [arguments.quiet_capture])]
 
@@ -248,7 +248,7 @@ def inspect(arguments: argparse.Namespace) -> int:
 
 def _opened(arguments: argparse.Namespace, paths: Sequence[Path]) -> Recording:
     frames = slice(arguments.max_frames) if arguments.max_frames else None
-    return asked.opened(paths, arguments.intrinsics, frames=frames, **asked.reading_of(arguments))
+    return cli.opened(paths, arguments.intrinsics, frames=frames, **cli.reading_of(arguments))
 
 
 def _averaged(arguments: argparse.Namespace, recording: Recording, field: FlatField | None) -> Cloud:

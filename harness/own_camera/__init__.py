@@ -1,1 +1,1 @@
-"""The user's own camera: measurement from static captures, a camera file that reproduces it, page and certificate."""
+"""The user's own camera: measured from static captures, reproduced by a camera file, with a page and a certificate."""

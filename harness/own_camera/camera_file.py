@@ -1,7 +1,7 @@
-"""The camera file that reproduces the captures: a known camera's model refitted, or an empirical camera.
+"""The camera file that reproduces the captures: the refitted model of a known camera, or an empirical camera.
 
-A refitted model takes the unit's lens, gain, fixed pattern, displaced frames and, where the captures show it, the gate
-of faint pixels; all other numbers are those of the known camera. The surfaces' albedo is stated and not measured."""
+A refitted model has the unit's own lens, gain, fixed pattern, displaced frames and, if the captures show it, gate for
+faint pixels; all other numbers are those of the known camera. The surfaces' albedo is stated and not measured."""
 
 from __future__ import annotations
 
@@ -45,38 +45,38 @@ from scenes.sensor.unit import taps_of
 
 SEED = 1
 UNIT = CameraConfig(effects=EffectsConfig().model_copy(update={"unit_offset": False, "warm_up_drift": False}))
-"""Effects of a simulated unit that captures of a real unit show too."""
+"""Effects of a simulated unit that captures of a real unit also show."""
 STEPS, CLOSE, FARTHEST, FEW_FRAMES = 5, 0.01, 100.0, 12
-"""Most steps of the gain's fit, the relative error at which it ends, its largest change, and frames per step."""
+"""Most steps of the fit of the gain, the relative error at which it ends, its largest change, and frames per step."""
 EDGE_SHARE = 2.56
-"""Width of a blurred edge between a tenth and nine tenths of its step, in standard deviations of the Gaussian."""
+"""Width of a blurred edge from 10 % to 90 % of its step, in standard deviations of the Gaussian."""
 UNKNOWN = "not determined by the captures"
 
 
 def opened_as(camera: str | None, paths: Sequence[Path], intrinsics: str | None, **reading: Any) -> Recording:
-    """Open a capture; without a lens anywhere, the nominal lens of ``camera`` is used."""
+    """Open a capture; if it states no lens and none is given, the nominal lens of ``camera`` is used."""
     try:
         return opened(paths, intrinsics, **reading)
     except UserError:
         if camera is None or intrinsics is not None:
             raise
         recording = opened(paths, None, lens=load_camera(camera).nominal_lens, **reading)
-        note = f"the capture names no lens; the nominal lens of {camera} is used"
+        note = f"the capture states no lens; the nominal lens of {camera} is used"
         return replace(recording, notes=(*recording.notes, note))
 
 
 def camera_of_size(lens: Lens) -> str:
-    """Return the one simulated camera with as many pixels, guessed ones last. Raises UserError for none, or several."""
+    """Return the only simulated camera with the lens's size, if possible not a guessed one; else raise UserError."""
     sizes = {name: load_camera(name).nominal_lens for name in camera_names()}
     fitting = [name for name, own in sizes.items() if (own.width, own.height) == (lens.width, lens.height)]
     known = [name for name in fitting if not guessed_precision(load_camera(name))]
     if len(known or fitting) == 1:
         return (known or fitting)[0]
-    wrong, size = f"{lens.width} x {lens.height} pixels", "record the camera's own depth images, not aligned to a"
+    wrong, size = f"{lens.width} x {lens.height} pixels", "record the camera's own depth images, not those of a"
     raise UserError(
         f"several cameras have {wrong}: {', '.join(fitting)}" if fitting else f"no simulated camera has {wrong}",
         legal=", ".join(f"{name} {own.width} x {own.height}" for name, own in sizes.items()),
-        fix="name the camera that took it with --camera" if fitting else f"{size} colour camera or of another mode",
+        fix="name the capture's camera with --camera" if fitting else f"{size} colour camera or of another mode",
     )
 
 
@@ -87,13 +87,13 @@ def with_lens(name: str, lens: Lens) -> AnyCamera:
         raise UserError(
             f"the capture has {lens.width} x {lens.height} pixels, but {name} has {own.width} x {own.height}",
             legal="a capture in the simulated mode of the camera, not aligned to another camera's pixels",
-            fix="name the camera that took it, or record the depth images themselves",
+            fix="name the capture's camera, or record the camera's own depth images",
         )
     return camera_of(CameraConfig(name=name, numbers=numbers_of_lens(lens)))
 
 
 class Stated(NamedTuple):
-    """One number of a camera's file; tag O is "measured on the owner's captures"."""
+    """A number of a camera file; the tag O means "measured on the owner's captures"."""
 
     section: str
     key: str
@@ -105,14 +105,14 @@ class Stated(NamedTuple):
 def write_camera(
     path: Path, title: str, like: str | None, found: Characteristics, albedo: float, rate: Stated
 ) -> AnyCamera:
-    """Write the camera's file, of a known camera ``like`` or empirical, and return the camera. Raises UserError where
-    the known camera has another image size, and where the file cannot be written."""
+    """Write the camera file, refitted from a known camera ``like`` or empirical, and return the camera. Raises
+    UserError if the known camera has another image size, or if the file cannot be written."""
     names = ", ".join(capture.name for capture in found.captures)
     source = f"measured by harness.characterise on {names}, {date.today().isoformat()}"
     own = _refitted(like, found, albedo, source) if like else _empirical(found, albedo, source)
     facts = [*_of_unit(found, source), *own]
     if like and is_camera_path(like):
-        like = os.path.relpath(like, path.parent)  # a path counts from the file that names it
+        like = os.path.relpath(like, path.parent)  # a path is relative to the file that names it
     lines = ["# Tags: O measured on the owner's captures, M assumed.", *(f"# {doubt}" for doubt in found.doubts)]
     kind = f"like: {json.dumps(like)}" if like else "kind: empirical"
     lines += [f"name: {path.stem}", f"title: {json.dumps(title)}", kind]
@@ -132,7 +132,7 @@ def _text(value: Any) -> str:
 
 
 def _of_unit(found: Characteristics, source: str) -> Iterator[Stated]:
-    """Yield what a file of either kind takes from the captures."""
+    """Yield the numbers that files of both kinds take from the captures."""
     lens, jumps_m = found.captures[0].lens, found.jumps_m
     for key in ("width", "height", "fx", "fy", "cx", "cy"):
         yield Stated("lens", f"{key}_px", getattr(lens, key), f"lens of the recording; {source}")
@@ -145,13 +145,13 @@ def _of_unit(found: Characteristics, source: str) -> Iterator[Stated]:
 
 
 def _step_mm(found: Characteristics) -> float:
-    """Return the step that the captures were stored in; a micrometre for numbers that are not rounded."""
+    """Return the rounding step of the stored captures; a micrometre for numbers that are not rounded."""
     return found.captures[0].step_m / MM or 1e-3
 
 
 def _empirical(found: Characteristics, albedo: float, source: str) -> Iterator[Stated]:
     law, pattern, drops, edge = found.law, found.pattern, found.dropouts, found.edge
-    yield Stated("", "wavelength_nm", 850.0, f"names the albedo of simulated surfaces; {UNKNOWN}", "M")
+    yield Stated("", "wavelength_nm", 850.0, f"selects the albedo of simulated surfaces; {UNKNOWN}", "M")
     for key, value in (("offset_mm", 0.0), ("drift_mm", 0.0), ("drift_min", 20.0), ("drift_ramp", 0.0)):
         yield Stated("unit", key, value, f"constant error and drift after power-on are {UNKNOWN}", "M")
     recorded = (law.light_at_1m, source) if found.has_amplitude else (1.0, "amplitudes are not recorded", "M")
@@ -174,7 +174,7 @@ def _empirical(found: Characteristics, albedo: float, source: str) -> Iterator[S
     blurred = edge is not None and edge.flying_px > 0.05
     yield Stated("edge", "gap_px", edge.gap_px if edge else 0.0, *origin)
     yield Stated("edge", "blur_px", (edge.gap_px + edge.flying_px) / EDGE_SHARE if edge and blurred else 0.0, *origin)
-    yield Stated("edge", "least_step_mm", 20.0, "smaller steps are taken to cost no return; not measured", "M")
+    yield Stated("edge", "least_step_mm", 20.0, "smaller steps are assumed to lose no return; not measured", "M")
     yield Stated("engine", "min_range_mm", 0.0, f"limits of range are {UNKNOWN}", "M")
     yield Stated("engine", "max_range_mm", 20_000.0, f"limits of range are {UNKNOWN}", "M")
 
@@ -185,13 +185,13 @@ def _empirical(found: Characteristics, albedo: float, source: str) -> Iterator[S
 def _refitted(like: str, found: Characteristics, albedo: float, source: str) -> Iterator[Stated]:
     camera = with_lens(like, found.captures[0].lens)
     if isinstance(camera, EmpiricalCamera) or not found.surfaces:
-        what = "is an empirical camera" if found.surfaces else "is refitted on flat surfaces, and none was found"
-        raise UserError(f"--like {like}: {what}", fix="leave out --like: the file is then an empirical camera")
+        what = "is an empirical camera" if found.surfaces else "needs flat surfaces for the fit, but none was found"
+        raise UserError(f"--like {like}: {what}", fix="leave out --like to write an empirical camera")
     for key, value in _field(camera, found) if isinstance(camera, AmcwCamera) else ():
         camera = with_number(camera, "emitter", key, value)
-        yield Stated("emitter", key, value, f"contains every pixel with a return; {source}")
+        yield Stated("emitter", key, value, f"covers every pixel with a return; {source}")
     camera, gain = _gain(with_number(camera, "engine", "output_step_mm", _step_mm(found)), found, albedo)
-    yield Stated("photons", "signal_electrons", gain, f"gives the temporal noise, albedo {albedo:g}; {source}")
+    yield Stated("photons", "signal_electrons", gain, f"gives the temporal noise at albedo {albedo:g}; {source}")
     again = simulated(camera, found, albedo, FEW_FRAMES)
     own = measure.characteristics(again).pattern
     if found.pattern is not None and own is not None:
@@ -206,13 +206,13 @@ def _refitted(like: str, found: Characteristics, albedo: float, source: str) -> 
         faint = float(np.exp(np.interp(-0.5, -share[falling], np.log(level[falling]))))
         pairs = zip(found.captures, again, strict=True)
         ratios = [(a.amplitude / b.amplitude)[a.steady & b.steady] for a, b in pairs]  # type: ignore[operator]
-        origin = f"half of the pixels of amplitude {faint:.4g} return nothing; {source}"
+        origin = f"half of the pixels with amplitude {faint:.4g} have no return; {source}"
         yield Stated("engine", "min_amplitude_units", faint / float(np.nanmedian(np.concatenate(ratios))), origin)
 
 
 def _field(camera: AmcwCamera, found: Characteristics) -> Iterator[tuple[str, Any]]:
-    """Yield the emitter's numbers that leave out pixels which return, widened: the lit polygon, and where the cone's
-    light ends, which fades over as many degrees as before."""
+    """Yield the emitter's numbers that exclude pixels with a return, widened: the lit polygon, and the angle at which
+    the cone's light ends; the light fades over as many degrees as before."""
     often = [np.isfinite(capture.z_m).mean(axis=0) >= 0.5 for capture in found.captures]
     seen = np.concatenate([capture.slopes[mask] for capture, mask in zip(found.captures, often, strict=True)])
     if camera.emitter.mask_slopes is not None:
@@ -225,14 +225,14 @@ def _field(camera: AmcwCamera, found: Characteristics) -> Iterator[tuple[str, An
 
 
 def _gain(camera: Any, found: Characteristics, albedo: float) -> tuple[Any, float]:
-    """Return the camera that repeats the captures' temporal noise, and its gain, by secants on the logarithms."""
-    wanted, tried = {(one.capture, one.number): one.temporal.value for one in found.surfaces}, []
+    """Return the camera that reproduces the captures' temporal noise, and its gain, by secants on the logarithms."""
+    wanted, tried = {(surface.capture, surface.number): surface.temporal.value for surface in found.surfaces}, []
     gain = start = camera.photons.signal_electrons.value
     for _ in range(STEPS):
         camera = with_number(camera, "photons", "signal_electrons", gain)
         own = [one for stack in simulated(camera, found, albedo, FEW_FRAMES) for one in measure.surfaces_of(stack)]
         ratios = [np.log(one.temporal.value / wanted[one.capture, one.number]) for one in own]
-        tried.append((np.log(gain), float(np.mean(ratios)) if ratios else 1.0))  # too dim to be seen is too noisy
+        tried.append((np.log(gain), float(np.mean(ratios)) if ratios else 1.0))  # too dim counts as too noisy
         if abs(tried[-1][1]) < CLOSE:
             break
         slope = -0.6 if len(tried) < 2 else (tried[-1][1] - tried[-2][1]) / (tried[-1][0] - tried[-2][0] or 1.0)
@@ -244,9 +244,9 @@ def _gain(camera: Any, found: Characteristics, albedo: float) -> tuple[Any, floa
 def simulated(
     camera: AnyCamera, found: Characteristics, albedo: float, frames: int | None = None
 ) -> list[StillCapture]:
-    """Return the captures as a unit of the camera would have taken them: the same surfaces, by smooth fits, as bright
-    as recorded; with as many frames, or ``frames``. Not simulated: relief finer than the fits, light between surfaces,
-    the emitter's shadow behind an edge, and what lies beside the surfaces."""
+    """Return the captures as a unit of the camera would have recorded them: the same surfaces (by smooth fits) with the
+    recorded brightness and the same number of frames, or ``frames``. Not simulated: relief finer than the fits, light
+    between surfaces, the emitter's shadow behind an edge, and the scene beside the surfaces."""
     return [_again(camera, one, albedo, frames or len(one.z_m), number) for number, one in enumerate(found.captures)]
 
 
@@ -259,8 +259,8 @@ def _again(camera: AnyCamera, capture: StillCapture, albedo: float, frames: int,
         distance, nearest = ndimage.distance_transform_edt(labels == 0, return_indices=True)
         labels = np.where(distance <= measure.WIDEST_PX / 2, labels[tuple(nearest)], 0)
         halves = labels[None]
-        if not isinstance(camera, EmpiricalCamera):  # whose edges are steps between pixels
-            # half of each pixel along an edge lies on the other surface: the mean over all places of an edge on pixels
+        if not isinstance(camera, EmpiricalCamera):  # its edges are steps between pixels
+            # half of each pixel along an edge lies on the other surface, which is the mean over all positions of edges
             halves = np.stack([labels, np.where(labels > 0, ndimage.maximum_filter(labels, 3), 0)])
         z_m = np.full(halves.shape, np.nan)
         for place, shape_m in enumerate(capture.shapes_m, start=1):

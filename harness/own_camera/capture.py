@@ -1,6 +1,6 @@
-"""``harness.validate --capture``: a static capture beside the simulation of a known camera, as its file stands.
+"""``harness.validate --capture``: compares a static capture with the simulation of a known camera, unchanged.
 
-What is measured, and how it is simulated again, is as in `harness.characterise`; nothing is fitted to make both agree.
+Measurement and simulation are those of `harness.characterise`; nothing is fitted to make both agree.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from harness.vocabulary.errors import UserError
 
 
 def run_capture(options: argparse.Namespace, command: str) -> int:
-    """Compare, print, write capture.html, the tables and provenance.json. Returns 0. Raises UserError for what cannot
-    be read or simulated: too few frames, another size, no plane, no lens."""
+    """Compare, print, and write capture.html, the tables and provenance.json. Returns 0. Raises UserError for a capture
+    that cannot be read or simulated: too few frames, another size, no plane, no lens."""
     if len(options.camera) > 1:
-        raise UserError("--capture: a capture comes from one camera", fix="give --camera once, or not at all")
+        raise UserError("--capture: a capture comes from a single camera", fix="give --camera once, or not at all")
     if not 0 < options.albedo <= 1:
-        raise UserError(f"--albedo {options.albedo:g}", legal="above 0 and up to 1")
+        raise UserError(f"--albedo {options.albedo:g}", legal="a number above 0, up to 1")
     first = slice(options.frames) if options.frames else None
     known = options.camera[0] if options.camera else None
     recording = opened_as(known, options.capture, options.intrinsics, frames=first, **reading_of(options))
@@ -35,16 +35,16 @@ def run_capture(options: argparse.Namespace, command: str) -> int:
     camera, found = with_lens(name, capture.lens), characteristics([capture])
     if not found.surfaces:
         legal = "walls, boards, tables: flat surfaces that the simulation can repeat"
-        fix = "check the lens (--intrinsics), or leave disturbing things out with --mask"
-        raise UserError(f"{capture.name}: no flat surface in it", legal=legal, fix=fix)
+        fix = "check the lens (--intrinsics), or exclude other objects with --mask"
+        raise UserError(f"{capture.name}: shows no flat surface", legal=legal, fix=fix)
     warnings = (*recording.warnings, *found.doubts)
     print_warnings(warnings)
     print_notes(recording.notes)
     twin = characteristics(simulated(camera, found, options.albedo))
     rows = beside(found, twin, None)
     ratios = ", ".join(f"{row.ratio:.2f} ({row.where})" for row in rows if row.figure == "temporal noise")
-    answer = f"Ratio of simulated to measured noise of a pixel: {ratios}. Albedo {options.albedo:g} is assumed."
-    title = f"{capture.name} beside the simulated {camera.title}"
+    answer = f"Ratio of simulated to measured pixel noise: {ratios}. Albedo {options.albedo:g} is assumed."
+    title = f"{capture.name} compared with the simulated {camera.title}"
     facts = {"camera": name, "files": [str(path) for path in recording.files], "notes": recording.notes}
     sources = {MEASURED: found, SIMULATED: twin}
     write_page(options.out / "capture.html", sources, rows, title, answer, "", command, facts, warnings)
@@ -52,9 +52,9 @@ def run_capture(options: argparse.Namespace, command: str) -> int:
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """Return (h, w) bool: the pixels of an image that are not black. Raises UserError where it cannot be read."""
+    """Return the pixels of an image that are not black, (h, w) bool. Raises UserError if it cannot be read."""
     try:
         return np.asarray(read_picture(path, cv2.IMREAD_GRAYSCALE) > 0)
     except UserError as error:
-        legal, why = "a PNG of the frames' size, black = left out", error.message.removeprefix(f"{path}: ")
-        raise UserError(f"--mask {path}: no image that can be read ({why})", legal=legal) from error
+        legal, why = "a PNG with the size of the frames; black excludes", error.message.removeprefix(f"{path}: ")
+        raise UserError(f"--mask {path}: is not a readable image ({why})", legal=legal) from error

@@ -1,8 +1,8 @@
-"""Characteristics of a depth camera, measured on static captures: noise, correlation, dropouts, whole frames, edges.
+"""Measures a depth camera on static captures: noise, correlation, dropouts, displacement of whole frames, and edges.
 
-Flat surfaces are found in each capture; where there is none, every pixel with a steady range counts, and neither angle
-nor fixed pattern nor edges are measured. Temporal noise is that of single pixels about their own mean, each frame's
-displacement subtracted. Not measured: errors that all frames and pixels share, and noise slower than the capture."""
+Flat surfaces are found in each capture. Without them, every pixel with a steady range counts, and angle, fixed pattern
+and edges are not measured. Temporal noise is that of single pixels about their own mean, without each frame's
+displacement. Not measured: errors that all frames and pixels share, and noise slower than the capture."""
 
 from __future__ import annotations
 
@@ -26,35 +26,35 @@ from harness.vocabulary.geometry import MM, Cloud, Lens
 from scenes.closed_form import Plane
 
 TOLERANCE_M, LEAST_PLANE_PX = 8 * MM, 2000
-"""Distance within which a point is on a plane (a nominal lens bows real walls by 3 mm rms); pixels of the least one."""
+"""Distance within which a point is on a plane (a nominal lens bends real walls by 3 mm rms); least pixels of one."""
 EDGE_PX, WIDEST_PX, LEAST_STEP_M = 3, 24, 20 * MM
-"""Pixels nearer to a plane's rim are left out, because the camera's filter mixes in what lies beyond. Then: farthest
-pixels that two surfaces at an edge lie apart, and the least step of depth there."""
+"""Width of a plane's rim in pixels, which is left out because the camera's filter mixes other surfaces into it; largest
+distance in pixels between the two surfaces at an edge; and the least step of depth there."""
 LEAST_BIN_PX = 300
-"""Some 12 windows of 5 x 5: the deviation of 20 frames is then known to 5 %."""
+"""About 12 windows of 5 x 5 pixels, so that the standard deviation of 20 frames is known to 5 %."""
 MOST_FRAMES = 300
-"""Most frames of a capture that are held in memory: 440 MB of 640 x 576 pixels."""
+"""Most frames of a capture that are held in memory: 440 MB for 640 x 576 pixels."""
 RANGE_CELLS, LIGHT_CELLS, ANGLE_CELL_DEG = 1.08, 1.25, 10.0
-"""Ratios of the ends of a cell of range and of a cell of brightness, and width of a cell of angle."""
+"""Ratios of the upper to the lower end of cells of range and of brightness, and the width of cells of angle."""
 TELLING_RATIO = 1.25
-"""Ratio of the largest to the smallest range, or brightness, from which they determine an exponent."""
+"""Least ratio of the largest to the smallest range (or brightness) that determines an exponent."""
 LAGS, PATTERN_LAGS, CORRELATED_FRAMES = 12, 40, 16
-"""Pixels over which correlations of noise and pattern are followed, and frames that determine the former."""
+"""Largest lags in pixels of the correlations of noise and of pattern, and frames for the correlation of noise."""
 JUMP_M, JUMP_SIGMAS = 3 * MM, 6.0
-"""A frame jumps if its displacement exceeds both: ten times the wander of a static Azure Kinect."""
+"""A frame jumps if its displacement exceeds both values, which are ten times the wander of a static Azure Kinect."""
 ASSUMED = np.array([0.0, 2.0, -0.5])
-"""Exponents assumed if captures do not determine them: of range (read noise, disparity) and brightness (shot noise)."""
+"""Exponents of range (read noise, disparity) and brightness (shot noise) if the captures do not determine them."""
 UNSURE = 0.5
 """Largest standard error of an exponent that is reported."""
 SLOW, WIDE_PX, COARSE = 0.15, 6.5, 0.35
-"""Correlation of successive frames, reach of neighbours' correlation, and ratio of noise to rounding step that show
-that the recording was averaged, smoothed or rounded before it was stored."""
+"""Limits for the correlation of successive frames, the reach of neighbours' correlation, and the ratio of noise to
+rounding step, which show that a recording was averaged, smoothed or rounded before it was stored."""
 
 
 @dataclass(frozen=True)
 class StillCapture:
-    """Frames of a static scene: ``z_m`` (n, h, w) float32, NaN where invalid; ``slopes`` (h, w, 2); mean ``amplitude``
-    (h, w), NaN where never above 0, or None; ``step_m`` of stored z; ``planes`` with pixels, ``used`` pixels (h, w)."""
+    """Frames of a static scene. ``z_m`` (n, h, w) float32 is NaN where invalid; ``slopes`` (h, w, 2); ``amplitude`` (h,
+    w) is a mean, NaN if never above 0, or None; ``step_m`` is that of stored z; ``planes`` have their pixels (h, w)."""
 
     name: str
     lens: Lens
@@ -67,19 +67,19 @@ class StillCapture:
 
     @cached_property
     def steady(self) -> np.ndarray:
-        """Pixels (h, w) bool of the surfaces, without their rims, that have a range in most frames."""
+        """The pixels of the surfaces, without their rims, that have a range in most frames, (h, w) bool."""
         often = np.isfinite(self.z_m).mean(axis=0) > 0.5
         return often & np.any([inner(mask) for _, mask in self.planes], axis=0) if self.planes else often
 
     @cached_property
     def offsets_m(self) -> np.ndarray:
-        """Displacement (n,) of each frame as a whole against the mean of all, in metres of z."""
+        """Displacement (n,) of each whole frame relative to the mean of all frames, in metres of z."""
         middle = np.nanmean(self.z_m[:, self.steady], axis=0, dtype=np.float64)
         return np.array([np.nanmean(z[self.steady] - middle) for z in self.z_m])
 
     @cached_property
     def drift_m(self) -> float:
-        """Change of the frames' displacement over the capture, by its robust slope (Theil and Sen)."""
+        """Change of the frames' displacement over the capture, from its robust slope (Theil and Sen)."""
         return float(stats.theilslopes(self.offsets_m)[0]) * (len(self.z_m) - 1)
 
     @cached_property
@@ -90,7 +90,7 @@ class StillCapture:
 
     @cached_property
     def kept(self) -> np.ndarray:
-        """Frames (n,) bool that do not jump."""
+        """The frames that do not jump, (n,) bool."""
         return np.abs(self.apart_m) <= max(JUMP_M, JUMP_SIGMAS * 1.4826 * float(np.median(np.abs(self.apart_m))))
 
     @cached_property
@@ -99,7 +99,7 @@ class StillCapture:
 
     @cached_property
     def mean_m(self) -> np.ndarray:
-        """Mean z (h, w) of the frames that do not jump; NaN where there is none."""
+        """Mean z (h, w) of the frames that do not jump; NaN if there is none."""
         known = np.isfinite(self._moved_m).any(axis=0)
         mean_m = np.full(known.shape, np.nan)
         mean_m[known] = np.nanmean(self._moved_m[:, known], axis=0)
@@ -112,14 +112,14 @@ class StillCapture:
 
     @cached_property
     def variance_m2(self) -> np.ndarray:
-        """Temporal variance (h, w) of z; NaN where unknown."""
+        """Temporal variance (h, w) of z; NaN if unknown."""
         count = np.isfinite(self.noise_m).sum(axis=0)
         square = np.nansum(self.noise_m**2, axis=0, dtype=np.float64)
         return np.where(count > 1, square / np.maximum(count - 1, 1), np.nan)
 
     @cached_property
     def stretch(self) -> np.ndarray:
-        """Distance (h, w) along the ray over that along the axis."""
+        """Distance (h, w) along the ray divided by the distance along the axis."""
         return np.asarray(np.sqrt(1 + (self.slopes**2).sum(axis=-1)))
 
     @cached_property
@@ -133,7 +133,7 @@ class StillCapture:
 
     @cached_property
     def shapes_m(self) -> tuple[np.ndarray, ...]:
-        """Smooth fit z (h, w) of each flat surface, with its relief and the lens' error, also beyond its pixels."""
+        """Smooth fit of z (h, w) to each flat surface, with its relief and the lens's error, also beyond its pixels."""
         shapes_m = []
         for plane, mask in self.planes:
             use, flat_m = mask & np.isfinite(self.mean_m), plane.z_along_m(self.slopes)
@@ -143,7 +143,7 @@ class StillCapture:
         return tuple(shapes_m)
 
     def whole(self, mask: np.ndarray) -> np.ndarray:
-        """Return a surface's pixels (h, w) bool, those without a return among them, without its rim."""
+        """Return a surface's pixels without its rim, (h, w) bool, including pixels without a return."""
         near = ndimage.binary_closing(np.pad(mask, 8), np.ones((3, 3)), iterations=3)
         return np.asarray(inner(np.asarray(ndimage.binary_fill_holes(near))[8:-8, 8:-8]) & self.used)
 
@@ -156,20 +156,20 @@ class StillCapture:
 
 
 def inner(mask: np.ndarray) -> np.ndarray:
-    """Return a mask (h, w) without a rim of `EDGE_PX`: the camera's filter mixes in what is beyond."""
+    """Return a mask (h, w) without a rim of `EDGE_PX`, into which the camera's filter mixes other surfaces."""
     return np.asarray(ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1] > EDGE_PX)
 
 
 def read_still(recording: Recording, used: np.ndarray | None = None) -> StillCapture:
-    """Read a recording into memory, `MOST_FRAMES` at most, and of ``used`` (h, w) pixels. Raises UserError where it
-    has too few frames, no grid of pixels, no lens, another size than ``used``, or where nothing in it varies."""
+    """Read at most `MOST_FRAMES` of a recording into memory; only ``used`` (h, w) pixels count. Raises UserError if it
+    has too few frames, no pixel grid, no lens, another size than ``used``, or no variation."""
     name, lens, slopes = recording.name, recording.lens, recording.slopes
     if not recording.organised or lens is None or slopes is None:
-        what = f"{name}: points without a pixel grid and a lens do not show a camera's noise"
-        raise UserError(what, legal="depth images with a lens", fix="name a lens with --intrinsics")
+        what = f"{name}: without a pixel grid and a lens, the camera's noise cannot be measured"
+        raise UserError(what, legal="depth images with a lens", fix="state a lens with --intrinsics")
     frames = [frame for frame in islice(recording.frames(), MOST_FRAMES) if np.isfinite(frame.z_m).any()]
     if len(frames) < LEAST_FRAMES:
-        what = f"{name}: {len(frames)} frame{'s' * (len(frames) > 1)}; temporal noise needs repeats"
+        what = f"{name}: {len(frames)} frame{'s' * (len(frames) > 1)}: too few to measure temporal noise"
         raise UserError(what, legal=f"{LEAST_FRAMES} frames or more of a static scene", fix="record 50 or more")
     z_m = np.stack([frame.z_m for frame in frames]).astype(np.float32)
     used = np.ones(z_m.shape[1:], bool) if used is None else used
@@ -178,8 +178,8 @@ def read_still(recording: Recording, used: np.ndarray | None = None) -> StillCap
         raise UserError("--mask: {} pixels, but the frames have {}".format(*sizes))
     z_m[:, ~used] = np.nan
     if all(np.array_equal(z_m[0], z_m[k], equal_nan=True) for k in (len(z_m) // 2, -1)):
-        what = f"{name}: all frames are equal, so that they show no noise"
-        raise UserError(what, legal="frames as the camera gives them", fix="record single frames, not their average")
+        what = f"{name}: all frames are equal, so they show no noise"
+        raise UserError(what, legal="single frames of the camera", fix="record single frames, not their average")
     often = np.isfinite(z_m).mean(axis=0) >= 0.5
     median_m = np.full(often.shape, np.nan)
     median_m[often] = np.nanmedian(z_m[:, often], axis=0)
@@ -189,18 +189,18 @@ def read_still(recording: Recording, used: np.ndarray | None = None) -> StillCap
 
 
 def mean_amplitude(stack: Sequence[np.ndarray | None]) -> np.ndarray | None:
-    """Return the mean (h, w) over frames, NaN where never above 0; None where a frame has none."""
+    """Return the mean (h, w) over frames, NaN if never above 0; None if a frame has no amplitude."""
     known = [np.nan_to_num(each) for each in stack if each is not None]
     mean = np.mean(known, axis=0) if len(known) == len(stack) else None
     return None if mean is None else np.where(mean > 0, mean, np.nan)
 
 
-# ---------------------------------------------------------------- one figure after the other
+# ---------------------------------------------------------------- single figures
 
 
 class NoiseCell(NamedTuple):
-    """Pixels at like conditions: means of range, angle, ``amplitude`` (NaN where not recorded) and ``light``, which is
-    amplitude times range squared, or the cosine of the angle; temporal noise along the ray before rounding."""
+    """Pixels under similar conditions: means of range, angle, ``amplitude`` (NaN if not recorded) and ``light``
+    (amplitude times range squared, or the cosine of the angle), and temporal noise along the ray before rounding."""
 
     capture: str
     pixels: int
@@ -232,8 +232,8 @@ def cells_of(capture: StillCapture) -> Iterator[NoiseCell]:
 
 
 def before_rounding_m2(variance_m2: float, step_m: float) -> float:
-    """Return the variance s^2 of z before it was rounded to a step q, from that of frames after it, averaged over all
-    phases of the rounding: s^2 + q^2 / 12 less what rounding fixes (`rounding_left_m2`)."""
+    """Return the variance s^2 of z before rounding to a step q, given the variance after rounding. Averaged over all
+    phases of the rounding, the latter is s^2 + q^2 / 12 minus the part that rounding fixes (`rounding_left_m2`)."""
 
     def after(s2: float) -> float:
         return s2 + step_m**2 / 12 - rounding_left_m2(step_m, s2) - variance_m2
@@ -244,8 +244,8 @@ def before_rounding_m2(variance_m2: float, step_m: float) -> float:
 
 
 class RangeLaw(NamedTuple):
-    """Noise of the recorded surface, facing, before rounding: ``sigma_m`` at ``range_m`` (k,); ``exponents`` of range
-    and of brightness with standard ``errors``, NaN for one that is assumed; the brightness that counts as 1."""
+    """Noise of the recorded surface at normal incidence before rounding: ``sigma_m`` at ``range_m`` (k,); ``exponents``
+    of range and brightness with standard ``errors``, NaN for an assumed exponent; the brightness that counts as 1."""
 
     range_m: np.ndarray
     sigma_m: np.ndarray
@@ -255,7 +255,7 @@ class RangeLaw(NamedTuple):
 
 
 def noise_law(cells: Sequence[NoiseCell]) -> RangeLaw:
-    """Return the law that fits the cells of all captures by weighted least squares of the logarithms."""
+    """Fit the law to the cells of all captures by weighted least squares on the logarithms."""
     _, pixels, r, angle_deg, _, light, sigma_m = zip(*cells, strict=True)
     weight, y, log_r = np.array(pixels, float), np.log(sigma_m), np.log(r)
     light_at_1m = float(np.average(np.log(light) - np.log(np.cos(np.radians(angle_deg))), weights=weight))
@@ -272,7 +272,7 @@ def noise_law(cells: Sequence[NoiseCell]) -> RangeLaw:
         doubtful[0] = False
         if not doubtful.any():
             break
-        # on one slanted surface range and brightness change together: the exponent that is known less is not varied
+        # on a single slanted surface, range and brightness vary together: the less certain exponent is fixed
         worst = int(np.argmax(np.where(doubtful, errors, -1.0)))
         varied[worst], law[worst] = False, ASSUMED[worst] if errors[worst] > UNSURE else 0.0
     facing, number = y - law[2] * columns[:, 2], np.floor(log_r / np.log(RANGE_CELLS) + 1e-9)
@@ -282,7 +282,7 @@ def noise_law(cells: Sequence[NoiseCell]) -> RangeLaw:
 
 
 def correlations(capture: StillCapture) -> np.ndarray:
-    """Return the correlation (2, `LAGS` + 1) of the noise before rounding of pixels so far apart, along x and y."""
+    """Return the correlation (2, `LAGS` + 1) of the noise before rounding by lag in pixels, along x and y."""
     noise = capture.noise_m[:CORRELATED_FRAMES]
     use = capture.steady & np.isfinite(noise).all(axis=0)
     variance = float((noise[:, use] ** 2).mean()) if use.any() else 1.0
@@ -292,7 +292,7 @@ def correlations(capture: StillCapture) -> np.ndarray:
 
 
 class Dropouts(NamedTuple):
-    """Share of frames without return of ``pixels`` by ``amplitude``, rising, NaN where not recorded; (k,) each."""
+    """Share of frames without a return, by ascending ``amplitude`` (NaN if not recorded), of ``pixels``; (k,) each."""
 
     amplitude: np.ndarray
     share: np.ndarray
@@ -300,7 +300,7 @@ class Dropouts(NamedTuple):
 
 
 def dropouts_of(captures: Sequence[StillCapture]) -> Dropouts:
-    """Return the dropouts of all captures together, on their surfaces."""
+    """Return the dropouts on the surfaces of all captures together."""
     parts = [np.zeros((2, 0))]
     for capture in captures:
         share = 1 - np.isfinite(capture.z_m).mean(axis=0)
@@ -317,9 +317,9 @@ def dropouts_of(captures: Sequence[StillCapture]) -> Dropouts:
 
 @dataclass(frozen=True)
 class SurfaceFigures:
-    """Figures of one flat surface, as makers name them, in mm. ``temporal``: noise, with its interval.
-    ``frame_rms_mm``: distance of a single frame's points from their own plane; ``average_rms_mm`` of the average's.
-    ``form95_mm``, ``form997_mm``: width that so many of a frame's points need. ``fill_rate``: share that returns."""
+    """Figures of a flat surface in mm, with manufacturers' names. ``temporal`` is the noise with its interval.
+    ``frame_rms_mm`` is the rms distance of a frame's points from their own plane, ``average_rms_mm`` the average's.
+    Layers of ``form95_mm`` and ``form997_mm`` hold 95 and 99.7 % of points. ``fill_rate`` is the share of returns."""
 
     capture: str
     number: int
@@ -344,7 +344,7 @@ def surfaces_of(capture: StillCapture) -> Iterator[SurfaceFigures]:
         pixels = np.flatnonzero((inner(mask) & capture.steady).ravel())
         if len(pixels) < LEAST_BIN_PX:
             continue
-        few = pixels[:: max(1, len(pixels) // 20_000)]  # these tell the same to a per cent
+        few = pixels[:: max(1, len(pixels) // 20_000)]  # a sample gives the same to within 1 %
         z_m, noise = (stack.reshape(-1, mask.size)[:, few] for stack in (capture.z_m[capture.kept], capture.noise_m))
         mean_m, slopes = capture.mean_m.ravel()[few], capture.slopes.reshape(-1, 2)[few]
         temporal = bench.jackknifed(noise[:, None], lambda part: bench.temporal_sigma_m(part) / MM)
@@ -356,7 +356,7 @@ def surfaces_of(capture: StillCapture) -> Iterator[SurfaceFigures]:
 
 
 def _form(z_m: np.ndarray, slopes: np.ndarray) -> tuple[float, float, float]:
-    """Return the rms in mm of points about their own plane, and the widths that 95 and 99.7 % of them need."""
+    """Return the rms in mm of points about their own plane, and the widths of the layers with 95 and 99.7 % of them."""
     z_m, slopes = z_m[np.isfinite(z_m)].astype(float), slopes[np.isfinite(z_m)]
     plane = bench.fit_plane(z_m, slopes)
     points = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1) * z_m[:, None]
@@ -366,8 +366,8 @@ def _form(z_m: np.ndarray, slopes: np.ndarray) -> tuple[float, float, float]:
 
 
 class EdgeFigures(NamedTuple):
-    """Pixels across an edge between two surfaces, means over ``lines`` of pixels and all frames: ``gap_px`` that return
-    nothing, ``flying_px`` with a range on neither; the median step."""
+    """Pixels across an edge between two surfaces, as means over ``lines`` of pixels and all frames: ``gap_px`` without
+    a return, ``flying_px`` with a range on neither surface; and the median step."""
 
     lines: int
     gap_px: float
@@ -376,13 +376,13 @@ class EdgeFigures(NamedTuple):
 
 
 def edge_of(captures: Sequence[StillCapture]) -> EdgeFigures | None:
-    """Return the edges between surfaces of all captures together; None without any."""
+    """Return the figures of all edges between surfaces in all captures; None if there are no edges."""
     lines = defaultdict[tuple[str, frozenset[int]], tuple[list[Any], list[Any]]](lambda: ([], []))
     for capture in captures:
         labels = np.zeros(capture.stretch.shape, int)
         share = np.isfinite(capture.z_m).mean(axis=0)
         for number, (plane, mask) in enumerate(capture.planes, start=1):
-            # in a simulated capture other pixels than the mask's may be lost or off the surface
+            # in a simulated capture, pixels outside the mask may also be lost or off the surface
             off_m = np.abs(capture.mean_m - plane.z_along_m(capture.slopes))
             labels[mask & (share >= 0.5) & (off_m <= bench.GROWN * TOLERANCE_M)] = number
         images = labels, share, capture.mean_m
@@ -395,20 +395,20 @@ def edge_of(captures: Sequence[StillCapture]) -> EdgeFigures | None:
                     counts = (1 - between).sum(), between.sum(), abs(z_m[row, first] - z_m[row, last])
                     if counts[2] > LEAST_STEP_M:
                         lines[capture.name, frozenset(line[[last, first]])][axis].append(counts)
-    # take the axis that cuts across more of the edge: the other one meets it aslant
+    # use the axis that crosses more of the edge; the other axis crosses it at a small angle
     rows = np.array([row for both in lines.values() for row in max(both, key=len)])
     if len(rows) < LEAST_BIN_PX // 10:
         return None
     return EdgeFigures(len(rows), float(rows[:, 0].mean()), float(rows[:, 1].mean()), float(np.median(rows[:, 2])))
 
 
-# ---------------------------------------------------------------- all of it
+# ---------------------------------------------------------------- all figures
 
 
 @dataclass(frozen=True)
 class Characteristics:
-    """The results of all captures of one camera. ``correlation`` (2, lags): of the noise along x and y;
-    ``pattern_correlation`` likewise of the fixed pattern, None where that is not told."""
+    """The results of all captures of a camera. ``correlation`` (2, lags) is that of the noise along x and y;
+    ``pattern_correlation`` is that of the fixed pattern, None if it is unknown."""
 
     captures: tuple[StillCapture, ...]
     cells: tuple[NoiseCell, ...]
@@ -422,12 +422,12 @@ class Characteristics:
 
     @property
     def has_amplitude(self) -> bool:
-        """True where every capture records amplitudes."""
+        """True if every capture records amplitudes."""
         return all(capture.amplitude is not None for capture in self.captures)
 
     @property
     def frames(self) -> int:
-        """The frames of all captures."""
+        """The number of frames in all captures."""
         return sum(len(capture.z_m) for capture in self.captures)
 
     @property
@@ -442,7 +442,7 @@ class Characteristics:
 
     @cached_property
     def doubts(self) -> tuple[str, ...]:
-        """Full sentences on what these captures cannot show, or show wrongly."""
+        """Sentences on what these captures cannot show, or show incorrectly."""
         notes, law, first = [], self.law, self.captures[0]
         if not self.surfaces:
             notes.append("no flat surface was found: angle, plane fit, fill rate, fixed pattern and edges are unknown")
@@ -453,39 +453,39 @@ class Characteristics:
         if not self.has_amplitude:
             notes.append("no amplitude is recorded: noise and dropouts of darker surfaces are unknown")
         if np.isnan(law.errors[1]):
-            notes.append("brightness hardly varies, or only together with range: how noise depends on it is unknown,"
+            notes.append("brightness hardly varies, or only together with range: its effect on noise is unknown,"
                         f" and the power -{law.exponents[1]:g} is assumed")  # fmt: skip
         noise, sigma_m = first.noise_m[:, first.steady], float(np.sqrt(np.nanmedian(first.variance_m2[first.steady])))
         alike = float(np.nanmean(noise[1:] * noise[:-1]) / np.nanmean(noise**2)) + 1 / len(noise)
         if alike > SLOW:
-            notes.append(f"successive frames share their noise (correlation {alike:.2f}): they were averaged over time"
+            notes.append(f"the noise of successive frames is correlated ({alike:.2f}): they were averaged over time"
                          " or repeated, and single frames are noisier than stated")  # fmt: skip
         reach = int(np.argmax([*(self.correlation.max(axis=0) < 0.1), True]))
         if reach > WIDE_PX:
-            notes.append(f"neighbours share their noise over {reach} pixels: the depth was upsampled, aligned to"
+            notes.append(f"the noise of pixels is correlated over {reach} pixels: the depth was upsampled, aligned to"
                          " another camera, compressed or smoothed")  # fmt: skip
         if sigma_m < COARSE * first.step_m:
             notes.append(f"the noise ({sigma_m / MM:.2g} mm) is hidden by the rounding to {first.step_m / MM:.3g} mm,"
                         " and its size before rounding is uncertain")  # fmt: skip
-        if drifted := [one.name for one in self.captures if abs(one.drift_m) > JUMP_M]:
+        if drifted := [capture.name for capture in self.captures if abs(capture.drift_m) > JUMP_M]:
             notes.append(f"the distance drifts by more than {JUMP_M / MM:g} mm during {', '.join(drifted)}: the camera"
-                        " warmed up, or moved")  # fmt: skip
+                        " warmed up or moved")  # fmt: skip
         if jumped := len(self.jumps_m):
-            notes.append(f"{jumped} of {self.frames} frames are displaced as a whole and are left out of the noise")
+            notes.append(f"{jumped} of {self.frames} frames are displaced as a whole and are excluded from the noise")
         return (*notes, *(self.pattern.field.warnings if self.pattern is not None else ()))
 
 
 def characteristics(
     captures: Sequence[StillCapture], poses: Sequence[np.ndarray | None] | None = None
 ) -> Characteristics:
-    """Measure captures of one camera in order of time; ``poses``: 4 x 4, each camera's in the first one's frame, which
-    part shape from fixed pattern. Raises UserError for different cameras, and where too few pixels hold still."""
+    """Measure captures of a camera in order of time. ``poses`` (4 x 4, each camera in the first camera's frame)
+    separate shape from fixed pattern. Raises UserError for different cameras, and if too few pixels are steady."""
     first = captures[0]
     if other := next((one for one in captures if one.lens != first.lens), None):
-        raise UserError(f"{other.name}: has another lens than {first.name}", legal="captures of one camera")
+        raise UserError(f"{other.name}: has another lens than {first.name}", legal="captures of the same camera")
     cells = tuple(cell for capture in captures for cell in cells_of(capture))
     if not cells:
-        what = f"{first.name}: nowhere {LEAST_BIN_PX} pixels at like range, angle and brightness that hold still"
+        what = f"{first.name}: has no {LEAST_BIN_PX} steady pixels with similar range, angle and brightness"
         raise UserError(what, legal="a static scene", fix="record a matte wall that fills the view")
     correlation, flat = correlations(max(captures, key=lambda one: int(one.steady.sum()))), []
     for capture, pose in zip(captures, poses or [None] * len(captures), strict=True):
@@ -500,7 +500,7 @@ def characteristics(
 
 
 def _pattern_correlation(pattern: Separated, of_noise: np.ndarray) -> np.ndarray:
-    """Return the correlation (2, lags) of the fixed pattern along x and y, the map's noise taken off, faded to 0."""
+    """Return the correlation (2, lags) of the fixed pattern along x and y, without the map's noise, faded to 0."""
     error_m, known = pattern.field.error_m, np.isfinite(pattern.field.error_m)
     lags = range(PATTERN_LAGS + 1)
     pairs = [[bench.covariance(error_m[None], known, *lag)[0] for lag in ((k, 0), (0, k))] for k in lags]

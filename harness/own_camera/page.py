@@ -1,4 +1,4 @@
-"""The page of the user's camera: measured figures beside those simulated from its camera file, with the data files."""
+"""The page of the user's camera, which compares measured figures with those simulated from its camera file."""
 
 from __future__ import annotations
 
@@ -32,54 +32,54 @@ SHOWN = (RANGE, ANGLE, AMPLITUDE, NEIGHBOURS, PATTERN, SPECTRUM, OF_PATTERN, FRA
 FREQUENCIES = np.linspace(0, 0.5, 41)
 SHOWN_LAGS, SHOWN_PATTERN_LAGS = (1, 2, 3, 5), (1, 3, 5, 10)
 CAPTION = (
-    "The surfaces that were found; temporal noise against range, angle and amplitude, each dot for pixels where all "
-    "three are alike; correlation of noise and of fixed pattern between neighbours along x and y, and their spectra, "
-    "where white noise would be 1; displacement of whole frames; dropouts. The camera file's simulation is orange."
+    "The surfaces that were found; temporal noise against range, angle and amplitude (a dot stands for pixels with "
+    "similar values of all three); correlation of noise and of fixed pattern along x and y, and their spectra (1 for "
+    "white noise); displacement of whole frames; dropouts. Orange is the simulation from the camera file."
 )
-Told = tuple[str, str, str, float, str]
+FigureRow = tuple[str, str, str, float, str]
 """Name, place, unit, value and meaning of a figure."""
 
 
-def own_figures(found: Characteristics) -> Iterator[Told]:
-    """Yield each figure; the same of every source, in the same order."""
-    for one in found.surfaces:
-        relief = "the surface's own shape and the lens' error included"
-        yield "temporal noise", one.where, "mm", one.temporal.value, "deviation of single pixels over frames, of z"
+def own_figures(found: Characteristics) -> Iterator[FigureRow]:
+    """Yield the figures of each surface and of the camera; all sources give the same figures in the same order."""
+    for face in found.surfaces:
+        relief = "includes the surface's own shape and the lens's error"
+        yield "temporal noise", face.where, "mm", face.temporal.value, "standard deviation of a pixel's z over frames"
         forms = (
-            ("plane-fit rms, one frame", one.frame_rms_mm, "spatial noise of points about their own plane"),
-            ("plane-fit rms, average", one.average_rms_mm, "the same of the average of all frames"),
-            ("flat-form dispersion, 95 %", one.form95_mm, "width of 95 % of the points, in the manner of ISO 10360-13"),
-            ("flatness, 99.7 %", one.form997_mm, "width of 99.7 %, in the manner of VDI/VDE 2634-2"),
+            ("plane-fit rms, one frame", face.frame_rms_mm, "spatial noise of points about their own plane"),
+            ("plane-fit rms, average", face.average_rms_mm, "the same for the average of all frames"),
+            ("flat-form dispersion, 95 %", face.form95_mm, "layer with 95 % of the points, as in ISO 10360-13"),
+            ("flatness, 99.7 %", face.form997_mm, "layer with 99.7 % of the points, as in VDI/VDE 2634-2"),
         )
         for name, value, meaning in forms:
-            yield name, one.where, "mm", value, f"{meaning}; {relief}"
-        yield "fill rate", one.where, "1", one.fill_rate, "share of pixels and frames with a return"
+            yield name, face.where, "mm", value, f"{meaning}; {relief}"
+        yield "fill rate", face.where, "1", face.fill_rate, "share of pixels and frames with a return"
     yield from shared_figures(found)
 
 
-def shared_figures(found: Characteristics) -> Iterator[Told]:
+def shared_figures(found: Characteristics) -> Iterator[FigureRow]:
     """Yield the figures that do not belong to a single surface."""
     for axis, name in enumerate("xy"):
         for lag in SHOWN_LAGS:
             alike = float(found.correlation[axis, lag])
-            yield "noise correlation", f"{name}, lag {lag}", "1", alike, "of neighbours' temporal noise"
+            yield "noise correlation", f"{name}, lag {lag}", "1", alike, "correlation of neighbours' noise"
         power = np.cumsum(density_of(found.correlation[axis]))
         half = float(np.interp(0.5 * power[-1], power, FREQUENCIES))
         yield "noise spectrum", f"along {name}", "1/px", half, "frequency below which half of its power lies"
-    yield "frame jitter", "all", "mm", found.jitter_m / MM, "deviation of whole frames' displacement"
+    yield "frame jitter", "all", "mm", found.jitter_m / MM, "standard deviation of frames' displacement"
     for capture in found.captures:
         yield "drift", capture.name, "mm", capture.drift_m / MM, "change of the distance from first to last frame"
-    yield "rounding step", "all", "mm", found.captures[0].step_m / MM, "of the stored distance along the axis"
+    yield "rounding step", "all", "mm", found.captures[0].step_m / MM, "step of the stored z"
     share = len(found.jumps_m) / found.frames
     yield "displaced frames", "all", "1", share, "share of frames that are displaced as a whole"
     if found.pattern is not None:
         rms_mm = found.pattern.field.rms_m / MM
-        yield "fixed pattern", "all", "mm", rms_mm, "error of range that all frames share, less a smooth fit"
+        yield "fixed pattern", "all", "mm", rms_mm, "error of range that all frames share, minus a smooth fit"
     if found.pattern_correlation is not None:
         for axis, name in enumerate("xy"):
             for lag in SHOWN_PATTERN_LAGS:
                 alike = float(found.pattern_correlation[axis, lag])
-                yield "pattern correlation", f"{name}, lag {lag}", "1", alike, "of neighbours' fixed pattern"
+                yield "pattern correlation", f"{name}, lag {lag}", "1", alike, "correlation of the pattern"
     if found.edge is not None:
         where = "steps of depth"
         yield "gap at an edge", where, "px", found.edge.gap_px, "pixels without a return across an edge"
@@ -87,14 +87,14 @@ def shared_figures(found: Characteristics) -> Iterator[Told]:
 
 
 def beside(found: Characteristics, twin: Characteristics, known: Characteristics | None) -> list[OwnFigure]:
-    """Return each figure of the captures beside those of the simulations; surfaces go by their numbers."""
+    """Return each figure of the captures with those of the simulations; surfaces are matched by their numbers."""
     every = (found, twin, known)
     places = [{one.where: (one.capture, one.number) for one in each.surfaces} if each else {} for each in every]
     values = [
         {(row[0], place.get(row[1], row[1])): row[3] for row in own_figures(each)} if each else {}
         for each, place in zip(every, places, strict=True)
     ]
-    ends = {("temporal noise", one.where): one.temporal.interval for one in found.surfaces}
+    ends = {("temporal noise", face.where): face.temporal.interval for face in found.surfaces}
     rows = []
     for name, where, unit, value, meaning in own_figures(found):
         key = name, places[0].get(where, where)
@@ -116,8 +116,8 @@ def write_page(
     facts: Mapping[str, Any],
     warnings: Sequence[str],
 ) -> None:
-    """Print the figures; write a page, its tables and provenance.json with further ``facts``. ``sources``: measured,
-    simulated, and maybe the ``known`` camera's. Raises UserError where they cannot be written."""
+    """Print the figures; write a page, its tables and provenance.json with further ``facts``. ``sources`` are measured,
+    simulated, and perhaps those of the ``known`` camera. Raises UserError if they cannot be written."""
     found, folder = sources[MEASURED], path.parent
     heads = {"known camera": known, "its ratio": known and "its ratio"}
     show([OWN_FIGURES.grid(rows, terminal=True, heads=heads)])
@@ -127,8 +127,8 @@ def write_page(
     write_table(folder, OWN_CURVES, OWN_CURVES.frame(curves))
     drawn = svg("captures", (8.6, 15.5), title, lambda canvas: _draw(canvas, found, curves))
     notes = (
-        "Simulated are frames of the camera's file before the same surfaces, whose smooth shape is the captures'; they "
-        "are analysed as the captures are. A ratio of 1 says that the file repeats the camera."
+        "The simulated frames show the same surfaces, with the smooth shape of the captures, by the camera file; they "
+        "are analysed like the captures. A ratio of 1 means that the file reproduces the camera."
     )
     body = [figure({"captures": drawn}, "captures", CAPTION), heading("Measured and simulated"), paragraph(notes)]
     body += [OWN_FIGURES.grid(rows, heads=heads).html(), *command_of(command)]
@@ -139,7 +139,7 @@ def write_page(
 
 
 def _curves(source: str, found: Characteristics) -> Iterator[dict[str, Any]]:
-    """Yield the points of all diagrams."""
+    """Yield the points of all diagrams for a source."""
 
     def point(diagram: str, series: str, x: float, y: float) -> dict[str, Any]:
         return {"diagram": diagram, "source": source, "series": series, "x": x, "y": y}
@@ -162,8 +162,8 @@ def _curves(source: str, found: Characteristics) -> Iterator[dict[str, Any]]:
 
 
 def density_of(correlation: np.ndarray) -> np.ndarray:
-    """Return the spectral density at `FREQUENCIES` along one axis, relative to white noise of the same variance, from
-    the correlation (lags,), faded by Parzen's window (Blackman and Tukey)."""
+    """Return the spectral density at `FREQUENCIES` along an axis, relative to white noise of the same variance, from
+    the correlation (lags,) with Parzen's window (Blackman and Tukey)."""
     faded = correlation * parzen(2 * len(correlation) - 1)[len(correlation) - 1 :]
     return np.asarray(2 * np.cos(2 * np.pi * np.outer(FREQUENCIES, np.arange(len(faded)))) @ faded - faded[0])
 

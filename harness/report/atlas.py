@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 PALETTE = (*COLOURS, INK, GREY)
 DASHES = {"-": "", "--": "7 4", ":": "2 4"}
-"""Styles of lines for numbers of frames, from the least to the most: of pictures, and as SVG has them."""
+"""Line styles for numbers of frames, from least to most: Matplotlib's names, and the dashes in SVG."""
 
 
 def atlas_html(rows: Sequence[Row], warnings: Sequence[str], about: Mapping[str, Any], command: str) -> str:
-    """Return the page: damage, size, distance and frames are chosen, and the cameras that find it are named."""
+    """Return the page, on which a user chooses damage, size, distance and frames and sees which cameras find it."""
     curves: dict[tuple[Any, ...], dict[str, Any]] = {}
     for row in rows:
         place = {axis: value for axis, value in row.place.items() if axis != "distance_m"}
@@ -50,8 +50,8 @@ def atlas_html(rows: Sequence[Row], warnings: Sequence[str], about: Mapping[str,
 
 
 def save_atlas_png(path: Path, rows: Sequence[Row]) -> None:
-    """Draw a90 against distance for each camera, with the least and the most frames: one panel for each damage that has
-    a limit in half of the places or more. Of several albedos the brightest target is drawn."""
+    """Draw a90 against distance for each camera with the fewest and the most frames. Each damage that has a limit in at
+    least half of the places gets a panel. If there are several albedos, the brightest target is drawn."""
     albedos = sorted({row.place["albedo"] for row in rows if "albedo" in row.place})
     rows = [row for row in rows if row.place.get("albedo") in (None, *albedos[-1:])]
     known = pd.Series([np.isfinite(row.answer.a90_mm) for row in rows]).groupby(
@@ -71,7 +71,7 @@ def save_atlas_png(path: Path, rows: Sequence[Row]) -> None:
             for frames, style in shown.items():
                 for title, colour in zip(titles, PALETTE, strict=False):
                     of = (damage, title, detector)
-                    line = [one for one in rows if (one.damage, one.title, one.surface.detector) == of]
+                    line = [row for row in rows if (row.damage, row.title, row.surface.detector) == of]
                     line = [one for one in line if one.place["frames"] == frames]
                     x = [one.place["distance_m"] for one in line]
                     names = ("low_mm", "a90_mm", "high_mm")

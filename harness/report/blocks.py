@@ -1,4 +1,4 @@
-"""Parts of pages and figures: a skeleton with the one stylesheet, blocks, figures as SVG or PNG. Only `Markup` is HTML.
+"""Parts of pages: the skeleton with the stylesheet, blocks, figures as SVG or PNG. All text but `Markup` is escaped.
 
 page(title, answer, [heading("Limits"), LIMITS.grid(rows).html(), figure(figures, "curves", "Each stroke is ...")])"""
 
@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 
 HERE = Path(__file__).parent
 SHOWN_FIRST = (*("commit", "dirty", "seed", "started", "machine", "mitsuba_variant"), *("renders", "versions"))
-"""Keys of the provenance that a page names in any case, as not recorded where they are missing."""
+"""Keys of the provenance that every page shows, as "not recorded" if they are missing."""
 MOST_VALUES = 81
-"""Points of a line whose values a pointer can read."""
+"""Most points of a line whose values are shown under the pointer."""
 SHOWN_APART = ("command", "seconds", "failures")
-NAMED = 3  # Trials of one failure that are named, at most
+NAMED = 3  # Most trials that are named for the same failure
 
 
 def template(name: str, folder: Path | None = None) -> Template:
-    """A template of ``folder`` or of this one; a missing name is an error, text is escaped."""
+    """Load a template from ``folder`` or from this folder; undefined names are errors, and text is escaped."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     environment = Environment(
@@ -59,20 +59,20 @@ def template(name: str, folder: Path | None = None) -> Template:
 def page(
     title: str, answer: str, body: Iterable[Markup], under: Iterable[Markup] = (), warnings: Iterable[str] = ()
 ) -> str:
-    """A whole page: ``title``, ``warnings``, the ``answer`` in large letters, what follows ``under`` it, the body."""
+    """Return a whole page: ``title``, ``warnings``, the ``answer`` in large letters, parts ``under`` it, the body."""
     parts = {"body": joined(body), "under": joined(under), "warnings": list(warnings)}
     return template("page.html").render(title=title, answer=answer, **parts)
 
 
 def tag(name: str, *content: str | Markup, **attributes: str) -> Markup:
-    """An element; attributes without a value are left out, ``kind`` is its class."""
+    """Return an HTML element; attributes without a value are left out, ``kind`` is the class."""
     named = ((key.replace("_", "-") if key != "kind" else "class", value) for key, value in attributes.items() if value)
     written = Markup("").join(Markup(' {}="{}"').format(key, value) for key, value in named)
     return Markup("<{0}{1}>{2}</{0}>").format(Markup(name), written, joined(content, ""))
 
 
 def joined(parts: Iterable[str | Markup], between: str = "\n") -> Markup:
-    """All parts in their order."""
+    """Join all parts in order."""
     return Markup(between).join(escape(part) for part in parts)
 
 
@@ -81,38 +81,38 @@ note = partial(tag, "p", kind="note")
 
 
 def bullets(items: Iterable[str | Markup]) -> Markup:
-    """A list."""
+    """Return an unordered list."""
     return tag("ul", joined(tag("li", item) for item in items))
 
 
 def figure(figures: Mapping[str, str], name: str, caption: str) -> Markup:
-    """A figure of ``figures`` (SVG text by name) with its caption, or a note that its data were not stored."""
+    """Return a figure of ``figures`` (SVG text by name) with its caption, or a note that its data were not stored."""
     if name not in figures:
         return note("No data for this figure were stored.")
     return tag("figure", tag("div", Markup(figures[name]), kind="scroll"), tag("figcaption", caption), id=name)
 
 
 def fold(summary: str, *content: str | Markup, is_open: bool = False) -> Markup:
-    """Content that a click on its summary opens."""
+    """Return content that opens with a click on its summary."""
     return tag("details", tag("summary", summary), joined(content), open="open" if is_open else "")
 
 
 def folded(tables: Sequence[tuple[str, Markup]]) -> list[Markup]:
-    """Titled tables, the first open."""
+    """Return titled tables in folds, of which the first is open."""
     return [fold(title, content, is_open=not place) for place, (title, content) in enumerate(tables)]
 
 
 def command_of(command: str) -> list[Markup]:
-    """The command that made a page."""
+    """Return the section with the command that made a page."""
     return [subheading("Command"), tag("pre", command)]
 
 
 def closing(provenance: Mapping[str, Any], experiment_yaml_text: str, left_out: str = "") -> list[Markup]:
-    """The sections of every page of a sweep; ``left_out``: a sentence on frames that were left out of averages."""
+    """Return the last sections of every sweep's page. ``left_out`` is a sentence on frames excluded from averages."""
     reasons: dict[str, list[str]] = {}
     for each in provenance.get("failures", ()):
         reasons.setdefault(f"{each['state']}: {each['why']}", []).append(each["what"])
-    missing = f"{many(sum(map(len, reasons.values())), 'part')} of the experiment failed: not in any number above."
+    missing = f"{many(sum(map(len, reasons.values())), 'part')} of the experiment failed; no number above includes it."
     parts = [heading("Failures"), paragraph(missing if reasons else "No trial failed.")]
     for why, parts_of in reasons.items():
         more = f" and {len(parts_of) - NAMED} others" if len(parts_of) > NAMED else ""
@@ -135,7 +135,7 @@ def closing(provenance: Mapping[str, Any], experiment_yaml_text: str, left_out: 
 
 
 def plain(value: Any) -> str:
-    """A recorded value as text: yes and no, ``name: value`` pairs, lists; never Python's own notation."""
+    """Return a recorded value as text: yes or no, ``name: value`` pairs, or a list; never in Python's notation."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, Mapping):
@@ -147,11 +147,11 @@ def plain(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value, default=str)
 
 
-# Okabe and Ito's palette (Color Universal Design, 2008): distinguishable with all common colour blindnesses
+# Okabe and Ito's palette (Color Universal Design, 2008), which remains distinguishable with common colour blindness
 BLUE, ORANGE, GREEN, RED, SKY, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7"
 INK, GREY, PALE = "#1d2530", "#6b7480", "#e9ecef"
 DAMAGE = "#ff00ff"
-"""Magenta: the thesis' colour of damage in its clouds."""
+"""Magenta, the colour of damage in the clouds of the thesis."""
 
 STYLE: dict[str, Any] = {
     "font.family": "sans-serif",
@@ -174,9 +174,9 @@ COLOURS, MARKERS = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE), "osD^vP"
 
 
 def svg(name: str, size_in: tuple[float, float], alt: str, draw: Callable[[Figure], None]) -> str:
-    """Draw a figure of ``size_in`` (width, height) inches; the text of an inline ``<svg>`` with ``alt`` as its label,
-    and the values of its lines for a pointer over them. ``name`` seeds the ids inside, so that several
-    figures live on one page; no date, no random number gets in."""
+    """Draw a figure of ``size_in`` (width, height) inches; return it as an inline ``<svg>`` with the label ``alt`` and
+    the values of its lines, which are shown under the pointer. ``name`` seeds the ids in it, so that a page can hold
+    several figures. The text contains no dates and no random numbers."""
     buffer = io.StringIO()
     drawn = _save(buffer, size_in, draw, name, format="svg", metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
@@ -190,8 +190,8 @@ def svg(name: str, size_in: tuple[float, float], alt: str, draw: Callable[[Figur
 
 
 def _values(figure: Figure) -> list[dict[str, Any]]:
-    """Return each panel's box (left, top, right, bottom), axis and lines: name, then x and y in the drawing and on the
-    axes for each of at most `MOST_VALUES` points. Lengths are points from the upper left."""
+    """Return each panel's box (left, top, right, bottom), axis and lines. A line is its name, then x and y in the
+    drawing and on the axes for at most `MOST_VALUES` points. Lengths are in points from the upper left."""
     panels, scale, height = [], 72 / figure.dpi, figure.bbox.height
     for axes in figure.axes:
         names = {id(one[0]): one.get_label() for one in axes.containers if hasattr(one, "has_yerr")}
@@ -219,7 +219,7 @@ def plain_decades(axis: Axis) -> None:
 
 
 def save_png(path: Path, size_in: tuple[float, float], draw: Callable[[Figure], None]) -> None:
-    """Draw a figure of ``size_in`` (width, height) inches to a PNG, 160 dots an inch; same bytes for the same data."""
+    """Draw a figure of ``size_in`` (width, height) inches to a PNG with 160 dpi; the same data give the same bytes."""
     with atomic_path(path) as temporary:
         _save(temporary, size_in, draw, format="png", metadata={"Software": None})
 

@@ -1,6 +1,6 @@
-"""Damage as a detector sees it: parts of trials kept for pictures, and residuals of whole clouds and single damages.
+"""Figures of damage as a detector sees it: the residuals of whole clouds and of single damages, from stored trials.
 
-Residuals have one colour scale: linear within 1 mm, logarithmic beyond, red behind the surface, blue before it."""
+All residuals share a colour scale: linear within 1 mm, logarithmic beyond, red behind the surface, blue before it."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ Where = Literal["below", "at", "above"]
 
 @dataclass(frozen=True, eq=False)
 class StudyExample:
-    """A cut-out (h, w) of one run's pixel grid around one damage. ``where``: its size against the set-up's limit.
-    ``diameter_mm``, ``depth_mm`` are true; ``pod``: of the curve at that size; ``score``: NaN where no pixel there was
-    judged, ``threshold`` in the same units; ``residual_mm``, ``detected`` as of `ExampleCloud`; ``outline_px`` (k, 2):
-    the true rim, columns and rows from the cut-out's first pixel; ``pitch_mm``: a pixel's width at the board."""
+    """A crop (h, w) of a run's pixel grid around a damage. ``where`` compares its size with the set-up's limit.
+    ``diameter_mm`` and ``depth_mm`` are true values; ``pod`` is the curve's at that size. ``score`` is NaN if no pixel
+    there was judged; ``threshold`` has the same units. ``residual_mm`` and ``detected`` are as in `ExampleCloud`.
+    ``outline_px`` (k, 2) is the true rim as (column, row) from the first pixel, ``pitch_mm`` a pixel on the board."""
 
     variant: str
     frames: int
@@ -51,7 +51,7 @@ class StudyExample:
 
 @dataclass(frozen=True)
 class MappedExample:
-    """One merged cloud of one variant with the true holes and what was found in it, in the board's true frame."""
+    """A merged cloud of a variant with the true holes and the findings, in the board's true frame."""
 
     variant: str
     frames: int
@@ -63,18 +63,18 @@ class MappedExample:
 
 
 NOTHING = "#b9bec4"
-"""Grey: no valid point."""
+"""Grey, for pixels without a valid point."""
 LEAST_MM = 10.0
 MOST_DOWN = 3
 SMALLEST_RING_PX = 2.5
 WIDTH_IN = 10.0
 TITLES: dict[Where, str] = {"below": "Below the limit", "at": "At the limit", "above": "Above the limit"}
 SIZES: dict[Where, str] = {"below": "Smaller", "at": "Middle", "above": "Larger"}
-"""Titles where no limit lies within the sizes inspected."""
+"""Titles for set-ups without a limit within the sizes inspected."""
 
 
 class Cut(NamedTuple):
-    """A part of a pixel grid around a damage: residual, findings (h, w), rim (k, 2), a pixel's width; words beside."""
+    """A crop of a pixel grid around a damage: residual and findings (h, w), rim (k, 2), a pixel's width, and texts."""
 
     residual_mm: np.ndarray
     detected: np.ndarray
@@ -86,7 +86,7 @@ class Cut(NamedTuple):
 
 
 def residual_figure(clouds: Sequence[ExampleCloud]) -> str:
-    """Residuals of each cloud, pixels of findings, rings at the true holes (dashed: not found)."""
+    """Draw each cloud's residuals, the pixels of findings, and rings at the true holes (dashed if not found)."""
     norm = residual_norm(np.concatenate([cloud.residual_mm[cloud.inside] for cloud in clouds]))
     boxes = []
     for cloud in clouds:
@@ -121,18 +121,18 @@ def residual_figure(clouds: Sequence[ExampleCloud]) -> str:
 
 
 def examples_figure(name: str, examples: Sequence[StudyExample], title: str, *, by_limit: bool = True) -> str:
-    """One set-up's examples: below, at and above the limit (else, not ``by_limit``, by size) across, others down."""
+    """Draw a set-up's examples. The columns are below, at and above the limit, or sizes if not ``by_limit``."""
     titles = TITLES if by_limit else SIZES
     columns = []
     for where in get_args(Where):
-        some = [one for one in examples if one.where == where]
-        columns.append(sorted(some, key=lambda one: (one.diameter_mm, one.board))[:MOST_DOWN])
+        some = [example for example in examples if example.where == where]
+        columns.append(sorted(some, key=lambda item: (item.diameter_mm, item.board))[:MOST_DOWN])
     rows = [
         [None if down >= len(line) else _example_cut(line[down], titles) for line in columns]
         for down in range(max(map(len, columns)))
     ]
     every = [one for line in columns for one in line]
-    captions = "; ".join(f"{one.diameter_mm:.1f} mm, {titles[one.where].lower()}, {_outcome(one)}" for one in every)
+    captions = "; ".join(f"{each.diameter_mm:.1f} mm, {titles[each.where].lower()}, {_outcome(each)}" for each in every)
     return _cuts(name, rows, f"{title}: {captions}.")
 
 
@@ -152,7 +152,7 @@ def _example_cut(one: StudyExample, titles: Mapping[Where, str]) -> Cut:
 
 
 def _cuts(name: str, rows: Sequence[Sequence[Cut | None]], alt: str) -> str:
-    """Draw damages on one scale of colours; the axes are in mm from the middle of each cut."""
+    """Draw damages with a common colour scale; the axes are in mm from the middle of each crop."""
     cuts = [cut for line in rows for cut in line if cut is not None]
     norm = residual_norm(np.concatenate([cut.residual_mm.ravel() for cut in cuts]))
 
@@ -176,7 +176,7 @@ def _cuts(name: str, rows: Sequence[Sequence[Cut | None]], alt: str) -> str:
 
 
 def residual_norm(residual_mm: np.ndarray) -> SymLogNorm:
-    """Colours of residuals (any shape): linear within 1 mm, logarithmic beyond."""
+    """Return the colour scale for residuals (any shape): linear within 1 mm, logarithmic beyond."""
     from matplotlib.colors import SymLogNorm
 
     finite = np.abs(residual_mm[np.isfinite(residual_mm)])
@@ -195,7 +195,7 @@ def _image(axes: Axes, residual_mm: np.ndarray, detected: np.ndarray, norm: SymL
 
 
 def residual_bar(figure: Figure | SubFigure, picture: ScalarMappable, label: str, **place: Any) -> None:
-    """The colour bar with round numbers; ``place``: what `Figure.colorbar` needs."""
+    """Draw the colour bar with round numbers; ``place`` is passed to `Figure.colorbar`."""
     limit = picture.get_clim()[1] or LEAST_MM
     bar = figure.colorbar(picture, extend="both", **place)
     bar.set_label(label)

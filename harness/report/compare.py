@@ -1,4 +1,4 @@
-"""Presents a comparison of two studies: as a table for terminal and page, as a sentence, and as data for programs."""
+"""Presents a comparison of two studies as a table for terminal and page, as a sentence, and as data for programs."""
 
 from __future__ import annotations
 
@@ -67,17 +67,17 @@ COMPARED = Table(
 )
 TESTS = (
     "Lost, won: inspections with a hit in the first study only, and in the second only. The p beside them is twice the "
-    "smaller of two: that of a sign-flip test of hits with boards (not damages) as units, and that of Student's t of "
-    "the change of a90 over 500 draws of boards. If the studies have different boards, it is the share of draws of "
-    "a90. The p of false calls is that of a sign-flip test if frames and threshold are the same; otherwise it allows "
-    "for the error of each calibration. Signal: median change of the signals of damage, relative to the signal from "
-    "which damage is found; its p is that of a normal test with the scatter over boards and of both calibrations. All "
-    "p are one-sided (for being worse) and adjusted. 95 %: interval of the change of a90 over draws of boards."
+    "smaller of two p-values: that of a sign-flip test of hits with boards (not damages) as units, and that of "
+    "Student's t of the change of a90 over 500 draws of boards. If the studies have different boards, it is the share "
+    "of draws of a90. The p of false calls is that of a sign-flip test if frames and threshold are the same; otherwise "
+    "it allows for the error of each calibration. Signal: median change of the damages' signals relative to the signal "
+    "at which damage is found; its p is that of a normal test with the scatter over boards and of both calibrations. "
+    "All p are one-sided (for being worse) and adjusted. 95 %: interval of the change of a90 over draws of boards."
 )
 
 
 def compare_html(comparison: Comparison, command: str) -> str:
-    """Return the page as text: answer, table, and the origin of both studies. It needs no network."""
+    """Return the page as text: answer, table, and the origin of both studies."""
     names = " and ".join(dict.fromkeys((comparison.first.name, comparison.second.name)))
     origins = zip(("study", "commit", "seed"), _origin(comparison.first), _origin(comparison.second), strict=True)
     words = fold("Meaning of verdicts and columns", note(rule(comparison)), note(TESTS))
@@ -93,13 +93,13 @@ def compare_parts(comparison: Comparison) -> list[str | Grid]:
 
 
 def rule(comparison: Comparison) -> str:
-    """Return the meaning of the marks."""
+    """Explain the marks."""
     return (
         f"Worse (+): a90, the rate of false calls, or the threshold over the signals has grown by more than "
         f"{100 * (MARGIN - 1):.0f} %, and a test shows that this is not by chance (p < {comparison.alpha:g}, adjusted "
-        "by Holm's method over all set-ups). Better (-): the opposite for a90. ~: beyond that margin, but possibly by "
-        "chance. !: the limit is lost, or more trials failed. *: a limit for the first time. x: not comparable. < and "
-        ">: only in the first study, only in the second."
+        "by Holm's method over all set-ups). Better (-): the opposite for a90. ~: the change exceeds that margin, but "
+        "may be due to chance. !: the limit is lost, or more trials failed. *: a limit for the first time. x: not "
+        "comparable. <: only in the first study. >: only in the second study."
     )
 
 
@@ -128,7 +128,7 @@ def remarks(comparison: Comparison) -> list[str]:
 
 
 def compare_data(comparison: Comparison) -> dict[str, Any]:
-    """Return the comparison as JSON's types; numbers that are not finite become None."""
+    """Return the comparison as JSON types; numbers that are not finite become None."""
     data: dict[str, Any] = {"comparison_version": COMPARISON_VERSION}
     for name, study in (("first", comparison.first), ("second", comparison.second)):
         data[name] = {"name": study.name, "digest": study.digest, "commit": study.provenance.get("commit")}

@@ -1,4 +1,4 @@
-"""The page of coverage: a part, coloured by the smallest damage that is found at each place of it."""
+"""The coverage page: a part, coloured by the smallest damage that is found at each place."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from harness.tables.coverage import GOALS, POSES
 from harness.tables.text import many, percent
 
 COLOURS = ("#fde725", "#a0da39", "#4ac16d", "#1fa187", "#277f8e", "#365c8d", "#46327e", "#b3261e", "#8a8f96")
-"""Seven steps of viridis (van der Walt and Smith, 2015), light where small damage is found; red; grey."""
+"""Seven steps of viridis (van der Walt and Smith, 2015), light for small damage; red for none; grey for not judged."""
 METHOD = (
-    "Each patch has the detector's unit of score, an angle of incidence and a distance. How damage scores by its size "
-    "and by these three, and how much that scatters, was learnt on boards of the family in random poses, at the "
-    "experiment's own threshold. A patch is not judged where the detector judges nothing, where it is hidden or out of "
-    "view, and where it is steeper than all damage that was inspected. Of several poses the best counts, not their sum."
+    "Each patch has the detector's unit of score, an angle of incidence and a distance. The score of damage as a "
+    "function of its size and of these three, and its scatter, were estimated from boards of the family in random "
+    "poses, at the experiment's own threshold. A patch is not judged if the detector judges nothing there, if it is "
+    "hidden or out of view, or if it is steeper than all inspected damage. Of several poses, only the best counts."
 )
 
 
 def scene_of(patches: Patches, limits_mm: np.ndarray, found: Findable) -> Scene3d:
-    """Return the part in classes of its limits (n,), equal in their logarithm."""
+    """Return the part, coloured by its limits (n,) in classes of equal logarithmic width."""
     known = np.isfinite(limits_mm)
     low, high = (limits_mm[known].min(), limits_mm[known].max()) if known.any() else found.sizes_mm
     ends = np.geomspace(low, high * 1.0001, len(COLOURS) - 1)
@@ -38,7 +38,7 @@ def scene_of(patches: Patches, limits_mm: np.ndarray, found: Findable) -> Scene3
 
 
 def answer(found: Findable, patches: Patches, limits_mm: np.ndarray, size_mm: float, poses: int) -> str:
-    """State the shares of the face on which damage of a size is found, on which no size is, and that are not judged."""
+    """State the shares of the face on which damage of a size is found, on which no size is, and that is not judged."""
     some = limits_mm <= size_mm, np.isinf(limits_mm), np.isnan(limits_mm)
     share, blind, unknown = (f"{percent(patches.share(each))} %" for each in some)
     return (
@@ -49,19 +49,19 @@ def answer(found: Findable, patches: Patches, limits_mm: np.ndarray, size_mm: fl
 
 
 def warnings_of(found: Findable, seen: Mapping[Any, Seen]) -> list[str]:
-    """Return what makes the figures unreliable, in sentences."""
+    """Return warnings that the figures are unreliable."""
     warnings = [found.doubt] if found.doubt else []
     if unseen := sum(bool(np.isinf(each.deviation_m).all()) for each in seen.values()):
-        warnings.append(f"the detector judges nothing in {unseen} of the {len(seen)} poses looked at")
+        warnings.append(f"the detector judges nothing in {unseen} of the {len(seen)} simulated poses")
     return warnings
 
 
 def coverage_html(
-    name: str, summary: str, first: str, scene: Scene3d, poses: Sequence[Mapping[str, Any]],
+    name: str, sentence: str, first: str, scene: Scene3d, poses: Sequence[Mapping[str, Any]],
     goals: Sequence[Mapping[str, Any]], warnings: Sequence[str], command: str,
 ) -> str:  # fmt: skip
-    """The page as text. It needs no network."""
-    turns = tag("iframe", srcdoc=view3d_html(scene, name), kind="turns", title="the part, which turns as it is dragged")
+    """Return the page as text; it needs no network. ``sentence`` is the answer, ``first`` the note below it."""
+    turns = tag("iframe", srcdoc=view3d_html(scene, name), kind="turns", title="the part; drag it to turn it")
     ways = [heading("Ways to the goal"), GOALS.grid(goals).html()] if goals else []
     body = [turns, *ways, heading("Poses"), POSES.grid(poses).html(), note(METHOD), *command_of(command)]
-    return page(f"Coverage: {name}", summary, body, [note(first)], warnings)
+    return page(f"Coverage: {name}", sentence, body, [note(first)], warnings)

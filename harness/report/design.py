@@ -1,4 +1,4 @@
-"""The plan of a study: one set of tables for terminal and page, the figure, and JSON's types."""
+"""Presents the plan of a study: tables for terminal and page, the figure, and JSON data."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MEDIANS = (
-    'Median of the simulated studies, and their 10 % and 90 % quantiles; "none" where so many demonstrate none. '
-    "*: recommended."
+    'Median and 10 % and 90 % quantiles of the simulated studies; "none" means that so many studies demonstrate no '
+    "limit. *: recommended."
 )
 WIDE = 110
 SIZE_IN = (11.5, 4.9)
@@ -34,8 +34,8 @@ SIZE_IN = (11.5, 4.9)
 
 @dataclass(frozen=True, eq=False)
 class StudyDesign:
-    """The plans of a study that is to be made. Sizes are in ``unit``; ``origin``: of the guess; ``goal``: the bound
-    that was wanted, if any, and ``reaches``: whether nine of ten studies by the ``recommended`` plan show it."""
+    """Plans for a study. Sizes are in ``unit``; ``origin`` is that of the guessed curve. ``goal`` is the wanted bound,
+    if any, and ``reaches`` whether nine of ten studies by the ``recommended`` plan demonstrate it."""
 
     guess: PodCurve
     origin: str
@@ -49,18 +49,18 @@ class StudyDesign:
 
     @property
     def in_unit(self) -> str:
-        """The unit in brackets, where there is one."""
+        """The unit in brackets, if there is one."""
         return f" ({self.unit})" if self.unit else ""
 
     def text(self, size: float) -> str:
-        """A size with its unit."""
+        """Return a size with its unit."""
         return f"{size:.3g}" + (f" {self.unit}" if self.unit else "") if np.isfinite(size) else "no size at all"
 
 
 def design_html(design: StudyDesign, command: str) -> str:
-    """The page as text: answer, figure, plans and sizes, hole-free area; it needs no network."""
+    """Return the page as text: answer, figure, plans and sizes, hole-free area; it needs no network."""
     caption = (
-        "Left: the a90/95 that simulated studies demonstrate, with the guess's own size, below which a "
+        "Left: the a90/95 that simulated studies demonstrate, and the guess's own a90, below which a "
         "limit should not fall. Right: the guessed curve and the sizes of the recommended plan."
     )
     drawn = blocks.svg("design", SIZE_IN, answer(design), lambda canvas: _draw(canvas, design))
@@ -70,7 +70,7 @@ def design_html(design: StudyDesign, command: str) -> str:
         chosen = plan is design.recommended
         name = f"{plan.targets} targets{' (recommended)' if chosen else ''}"
         body.append(blocks.fold(name, blocks.tag("pre", _sizes(plan)), is_open=chosen))
-    body += [blocks.heading("Where nothing is"), blocks.bullets(hole_free_lines(design))]
+    body += [blocks.heading("Hole-free area"), blocks.bullets(hole_free_lines(design))]
     body += [blocks.heading("Notes"), blocks.bullets(notes(design)), *blocks.command_of(command)]
     under = [blocks.note(f"Guess: {guess_text(design)}.")]
     return blocks.page("Planning a study of detection limits", answer(design), body, under)
@@ -89,13 +89,13 @@ def _sizes(plan: planned.StudyPlan) -> str:
 
 
 def answer(design: StudyDesign) -> str:
-    """The recommendation in a sentence."""
+    """State the recommendation in a sentence."""
     plan, wish = design.recommended, ""
     if design.goal is not None:
         reached = "nine of ten studies demonstrate" if design.reaches else "no plan listed is sure to show"
         wish = f"; {reached} the {design.text(design.goal)} that is wanted"
     if not np.isfinite(plan.bound):
-        expects = "even so most studies would demonstrate no a90/95"
+        expects = "even then, most studies would demonstrate no a90/95"
     else:
         spread = f"between {design.text(plan.low)} and {design.text(plan.high)} in eight of ten studies"
         expects = f"expect a90/95 at {design.text(plan.bound)}, {spread}"
@@ -104,7 +104,7 @@ def answer(design: StudyDesign) -> str:
 
 
 def guess_text(design: StudyDesign) -> str:
-    """The guess, and where it is from."""
+    """Describe the guessed curve and its origin."""
     guess = design.guess
     sizes = ", ".join(f"{name} {design.text(guess.size_at(pod))}" for name, pod in (("a50", 0.5), ("a90", 0.9)))
     return f"{sizes} ({guess.link}, {'ln size' if guess.log_size else 'size'}); {design.origin}"
@@ -126,17 +126,17 @@ PLANS = Table(
     ),
     formats=(),
 )
-"""Its rows are pairs: a plan, and whether it is the one recommended."""
+"""Its rows are pairs of a plan and whether it is the recommended plan."""
 
 
 def plans_grid(design: StudyDesign) -> Grid:
-    """Make the table of all plans, the recommended plan with a star, and of what their studies demonstrate."""
+    """Return the table of all plans and what their studies demonstrate; a star marks the recommended plan."""
     rows = [(plan, plan is design.recommended) for plan in design.plans]
     return PLANS.grid(rows, heads={"limit": f"a90/95{design.in_unit}"})
 
 
 def hole_free_lines(design: StudyDesign) -> list[str]:
-    """The unflawed sites and areas that go with the recommended targets."""
+    """Return the unflawed sites and areas that the recommended number of targets requires."""
     sites = SITES_PER_TARGET * design.recommended.targets
     lines = [f"{sites} unflawed sites: MIL-HDBK-1823A asks for at least {SITES_PER_TARGET} per target"]
     area = design.hole_free
@@ -161,27 +161,27 @@ def notes(design: StudyDesign) -> list[str]:
         # The bound's distance from the truth is a multiple of a standard error.
         wanted = plan.targets * ((plan.high - plan.true_size) / (design.goal - plan.true_size)) ** 2
         found.append(
-            f"the limit approaches the guess's own a90 roughly as one over the root of the number of targets: "
+            "the limit approaches the guess's own a90 roughly with the inverse square root of the number of targets: "
             f"{design.text(design.goal)} needs about {float(f'{wanted:.2g}'):.0f} targets"
         )
     if high < plan.bound < np.inf:
         found.append(
-            f"the a90/95 to expect lies beyond the largest target of {design.text(high)}: it rests on the "
-            "curve's shape there; make larger targets"
+            f"the expected a90/95 lies beyond the largest target of {design.text(high)}, where it depends on the "
+            "assumed shape of the curve; make larger targets"
         )
     if plan.targets < LEAST_TARGETS:
         found.append(f"no plan listed has the {LEAST_TARGETS} targets that MIL-HDBK-1823A asks for (40 of signals)")
     return [
         *found,
-        f"medians and quantiles of {plan.studies} simulated studies, bound by {METHOD}; the share that "
-        f"demonstrates any is known to {50 / np.sqrt(plan.studies):.1f} points or better (one standard error)",
+        f"medians and quantiles are over {plan.studies} simulated studies, with bounds by {METHOD}; the standard error "
+        f"of the share that demonstrates a limit is at most {50 / np.sqrt(plan.studies):.1f} percentage points",
         "repeats of the noise are not additional targets: 50 inspections of each of 8 holes count as 8 targets",
-        "the plan is as good as the guess: a study whose sizes miss the rise of the true curve demonstrates less",
+        "the plan is only as good as the guess: a study whose sizes miss the rise of the true curve demonstrates less",
     ]
 
 
 def design_data(design: StudyDesign) -> dict[str, Any]:
-    """Return the plan as JSON's types; an infinite size becomes None."""
+    """Return the plan as JSON types; an infinite size becomes None."""
     guess = design.guess
     curve = {"link": guess.link, "log_size": guess.log_size, "mu": float(guess.mu), "sigma": float(guess.sigma)}
     data: dict[str, Any] = {
@@ -200,7 +200,7 @@ def design_data(design: StudyDesign) -> dict[str, Any]:
 
 
 def save_design_png(path: Path, design: StudyDesign) -> None:
-    """The figure as a PNG at ``path``; the same bytes for the same design."""
+    """Write the figure as a PNG to ``path``; the same design gives the same bytes."""
     blocks.save_png(path, SIZE_IN, lambda canvas: _draw(canvas, design))
 
 
@@ -208,7 +208,7 @@ def _draw(canvas: Figure, design: StudyDesign) -> None:
     """Draw the expected limit against the number of targets (median, 10-90 %), and the sizes on the guessed curve."""
     (left, right), (low, high), plan = canvas.subplots(1, 2), design.range_of_sizes, design.recommended
     places, true_size = np.arange(len(design.plans)), plan.true_size
-    # infinite where none is demonstrated
+    # a bound that is not demonstrated is infinite
     lows, bounds, ends = np.array([(one.low, one.bound, one.high) for one in design.plans]).T
     top = max([1.5 * high, *(1.1 * bounds[np.isfinite(bounds)])])
     left.vlines(places, np.minimum(lows, top), np.minimum(ends, top), color=blocks.BLUE, lw=2.2)
@@ -223,7 +223,7 @@ def _draw(canvas: Figure, design: StudyDesign) -> None:
         left.axhline(design.goal, color=blocks.GREEN, lw=1.2, ls="--", label=label)
     left.set(xlim=(-0.6, len(places) - 0.4), ylim=(0.95 * min(true_size, *lows), max(top, 1.02 * (design.goal or 0))))
     left.set_xticks(places, [str(one.targets) for one in design.plans])
-    left.set(xlabel="targets", ylabel=axis_text("a90/95 to expect", design.unit))
+    left.set(xlabel="targets", ylabel=axis_text("expected a90/95", design.unit))
     left.set_title(f"{plan.studies} simulated studies each")
     sizes = np.linspace(low, high, 241)[1:]
     right.plot(sizes, design.guess.pod(sizes), color=blocks.INK, label=f"guessed POD, {design.guess.link}")

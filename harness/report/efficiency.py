@@ -1,4 +1,4 @@
-"""The page of efficiency: detectors beside the ideal observer, in a table and against d'."""
+"""The efficiency page: detectors compared with the ideal observer in a table and a figure."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 STYLES = ("-", "--", "-.", ":")
 CLASSES = 8
-"""Number of classes of d', with equally many damages, whose shares of hits are drawn."""
+"""Number of classes of d', with equal numbers of damages, whose shares of hits are drawn."""
 LEFT = 0.5
-"""Left end of the axis of d': damage with less is found by chance alone."""
+"""Left end of the axis of d'; damage with a lower d' is found only by chance."""
 READ = (
-    "Efficiency: (d' at which the ideal observer finds the share / d' at which the detector does) squared, by depth "
-    "alone. d' is the ideal observer's signal at a damage over the deviation of its statistic. The ideal observer "
-    "knows the damage's exact signature and the noise's covariance over units, but neither the place nor the surface. "
-    "Intervals are over boards."
+    "Efficiency: the squared ratio of two d', that at which the ideal observer finds the share and that at which the "
+    "detector finds it by depth alone. d' is the ideal observer's signal at a damage divided by the standard deviation "
+    "of its statistic. The ideal observer knows the damage's exact signature and the noise's covariance over units, "
+    "but neither the place nor the surface. Intervals are over boards."
 )
 
 
@@ -47,7 +47,7 @@ def answer(rows: Sequence[Efficiency]) -> str:
 
 
 def efficiency_figure(rows: Sequence[Efficiency]) -> str:
-    """Draw each set-up's curve against d' with the shares of hits in classes of it, and the ideal observer's POD."""
+    """Draw each set-up's curve against d' with the shares of hits in classes of d', and the ideal observer's POD."""
     detectors = list(dict.fromkeys(row.limit.record.detector for row in rows))
     others = list(dict.fromkeys((row.limit.record.frames, row.limit.largest_mm) for row in rows))
     index, pod = (np.concatenate([getattr(row, name) for row in rows]) for name in ("index", "pod"))
@@ -81,16 +81,16 @@ def efficiency_figure(rows: Sequence[Efficiency]) -> str:
 
 
 def efficiency_parts(rows: Sequence[Efficiency], first: str, warnings: Sequence[str]) -> list[str | Grid]:
-    """Return what a terminal shows: the figures' conditions, warnings, the table and the answer."""
+    """Return the parts for a terminal: the conditions, warnings, the table and the answer."""
     grid = EFFICIENCY.grid(rows, terminal=True)
     return [first, *(f"warning: {text}" for text in warnings), grid, "", answer(rows)]
 
 
 def efficiency_html(rows: Sequence[Efficiency], first: str, warnings: Sequence[str], name: str, command: str) -> str:
-    """The page as text. It needs no network."""
+    """Return the page as text; it needs no network."""
     caption = (
-        "Share of damages found against d'; lines are probit curves of ln d', points classes of equally many damages. "
-        "Detectors that lose the same share everywhere have one curve for all sizes and kinds."
+        "Share of damages found against d'. Lines are probit curves of ln d'; points are classes with equal numbers of "
+        "damages. A detector that loses the same share everywhere has the same curve for all sizes and kinds."
     )
     drawn = figure({"against-d": efficiency_figure(rows)}, "against-d", caption)
     body = [heading("Set-ups"), EFFICIENCY.grid(rows).html(), note(READ), drawn, *command_of(command)]

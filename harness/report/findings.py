@@ -1,6 +1,6 @@
-"""Findings of `harness.detect` as rows, files and pictures: CSV, JSON, PNG, and a point cloud with the damage coloured.
+"""Findings of `harness.detect` as rows, files and pictures: CSV, JSON, PNG, and a point cloud with coloured damage.
 
-All files of one run are written beside their final names first and renamed together at the end."""
+All files of a run are first written under temporary names and renamed together at the end."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ if TYPE_CHECKING:
 
 DAMAGE_RGB = (255, 0, 255)
 ELONGATED = 2.0
-"""Length over width from which a finding counts as long; a width below 1 mm, which is noise, counts as 1 mm."""
+"""Least ratio of length to width of a long finding; a width below 1 mm, which is noise, counts as 1 mm."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One row: the best of both measures, camera frame. NaN where nothing could be measured. ``kind``: ``hole``,
-    ``bump`` or ``no return``. ``length_mm``, ``width_mm``, ``angle_deg``: sides of a rectangle with the second moments
-    of the residual, and the longer one's angle from x towards y, -90 to 90, across the line of sight. ``size_from``:
-    ``model`` (blurred hole, with standard errors), ``contour`` (half depth), ``extent`` (extreme points) or ``area``
-    (of pixels without return). ``depth_from``: likewise, ``extreme residual`` of the cluster's points, or ``none``."""
+    """A row: the better of both measures in the camera frame; NaN if nothing could be measured. ``kind`` is ``hole``,
+    ``bump`` or ``no return``. ``length_mm`` and ``width_mm`` are the sides of a rectangle with the residual's second
+    moments; ``angle_deg`` is the longer side's angle from x towards y, -90 to 90, across the line of sight.
+    ``size_from`` is ``model`` (blurred hole, standard errors), ``contour`` (half depth), ``extent`` (extreme points) or
+    ``area`` (no return); ``depth_from`` is the same, ``extreme residual`` of the cluster's points, or ``none``."""
 
     id: int
     kind: str
@@ -56,13 +56,13 @@ class Finding:
 
     @property
     def is_long(self) -> bool:
-        """True where it is `ELONGATED`: its diameter is then of little use."""
+        """True if it is `ELONGATED`, so that its diameter is of little use."""
         return self.length_mm > ELONGATED * max(self.width_mm, 1.0)
 
 
 @dataclass(frozen=True)
 class Judged:
-    """A cloud with a detector's results; ``missing``: its missing returns, None without a pixel grid."""
+    """A cloud with a detector's results. ``missing`` are its missing returns, None without a pixel grid."""
 
     cloud: Cloud
     evidence: Evidence
@@ -72,13 +72,13 @@ class Judged:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings numbered from 1, strongest first."""
+        """The findings, numbered from 1, strongest first."""
         pairs = zip(self.detections, self.measurements, strict=True)
         return tuple(finding_of(i, self.evidence, d, m) for i, (d, m) in enumerate(pairs, start=1))
 
 
 def finding_of(number: int, evidence: Evidence, detection: Detection, measured: Measurement) -> Finding:
-    """The row of one detection: the model's numbers where they exist, else those of the extents."""
+    """Return the row of a detection: the model's numbers if they exist, or else those of the extents."""
     modelled = math.isfinite(measured.model_diameter_m)
     placed = bool(np.isfinite(measured.model_centre_m).all())
     x_mm, y_mm, z_mm = (float(m) / MM for m in (measured.model_centre_m if placed else measured.extent_centre_m))
@@ -106,8 +106,8 @@ def write_findings(
     cloud_name: str = outputs.CLOUD.name,
     beside: Mapping[str, Callable[[Path], object]] | None = None,
 ) -> tuple[Path, ...]:
-    """Write all files of a run into ``folder``, or none. ``about``: plain data that the JSON says beside the findings;
-    ``beside``: further files by name with what writes them. Raises UserError where they cannot be written."""
+    """Write all files of a run to ``folder``, or none. The JSON holds the plain data ``about`` besides the findings;
+    ``beside`` maps names of further files to functions that write them. Raises UserError if writing fails."""
     is_new, (cloud, missing, detections) = not folder.exists(), (judged.cloud, judged.missing, judged.detections)
     writers: dict[str, Callable[[Path], object]] = {
         outputs.FINDINGS.name: lambda path: path.write_text(csv_text(judged.findings), encoding="utf-8"),
@@ -131,13 +131,13 @@ def write_findings(
 
 
 def csv_text(findings: Sequence[Finding]) -> str:
-    """The table of findings.csv; an empty cell where there is no number."""
+    """Return the content of findings.csv; unknown numbers are empty cells."""
     frame = trials.FINDINGS_OF_CAPTURE.frame(findings)
     return str(frame.to_csv(index=False, float_format=trials.FINDINGS_OF_CAPTURE.digits, lineterminator="\n"))
 
 
 def json_text(judged: Judged, about: Mapping[str, Any]) -> str:
-    """The findings with both measures and their standard errors, then ``about``; null where there is no number."""
+    """Return the findings with both measures and their standard errors, then ``about``; unknown numbers are null."""
     rows = [
         asdict(finding)
         | {
@@ -150,7 +150,7 @@ def json_text(judged: Judged, about: Mapping[str, Any]) -> str:
 
 
 def ply_bytes(cloud: Cloud, detections: Sequence[Detection]) -> bytes:
-    """The valid points (camera frame, metres, float32) as a binary PLY: damage magenta, else its colour or grey."""
+    """Return the valid points (camera frame, metres, float32) as a binary PLY: damage magenta, the rest coloured."""
     import trimesh
 
     colours = np.full((cloud.valid.size, 3), 160, np.uint8)
@@ -167,12 +167,12 @@ def ply_bytes(cloud: Cloud, detections: Sequence[Detection]) -> bytes:
 MODELLED = ("diameter", "diameter_se", "depth", "depth_se", "centre", "centre_se")
 WIDTH_IN, DPI = 11.0, 150
 TAKEN, OTHERS = "#ff00ff", ("#ff9f1c", "#2ec4b6", "#ffee32", "#4cc9f0", "#f94144", "#90be6d", "#bdb2ff")
-"""Colours that can be told from grey and from one another, also with red-green blindness."""
+"""Colours that differ from grey and from one another, also for viewers with red-green blindness."""
 Box = tuple[float, float, float, float]
 
 
 def findings_figure(cloud: Cloud, evidence: Evidence, detections: Sequence[Detection], title: str) -> Figure:
-    """Draw the colour image (where known) above the residual in mm; without a pixel grid a plan view in mm."""
+    """Draw the colour image (if known) above the residual in mm; without a pixel grid, draw a plan view in mm."""
     panels = 2 if cloud.organised and cloud.rgb is not None else 1
     box = _around(cloud, np.isfinite(evidence.residual_m))
     residual_mm = evidence.residual_m / MM
@@ -190,15 +190,15 @@ def findings_figure(cloud: Cloud, evidence: Evidence, detections: Sequence[Detec
             x, y = (cloud.points_m[..., k][judged] / MM for k in (0, 1))
             shown = axes[-1].scatter(x, y, c=residual_mm[judged], s=2, linewidths=0, **style)
         residual_bar(figure, shown, "mm behind (+) or before (−) the surface", ax=list(axes))
-        for one in axes:
-            _frame(one, cloud, box)
-            _circle(one, cloud, enumerate(detections, start=1))
+        for panel in axes:
+            _frame(panel, cloud, box)
+            _circle(panel, cloud, enumerate(detections, start=1))
 
     return _figure(title, panels * _height_in(box), draw)
 
 
 def save_blind_map(path: Path, cloud: Cloud, missing: MissingReturns, detections: Sequence[Detection]) -> None:
-    """Write the PNG: the share of frames in which each pixel returned nothing, outline and findings without return."""
+    """Write a PNG with each pixel's share of frames without a return, the outline, and findings without a return."""
     box = _around(cloud, missing.outline)
 
     def draw(figure: Figure) -> None:
@@ -217,7 +217,7 @@ def save_blind_map(path: Path, cloud: Cloud, missing: MissingReturns, detections
 
 
 def save_targets(path: Path, grid: Cloud, outlines: Sequence[np.ndarray], texts: Sequence[str], taken: int) -> None:
-    """Write the PNG: colour, amplitude or depth of a grid with outlines (h, w), texts and numbers from 1."""
+    """Write a PNG with the colour, amplitude or depth of a grid, outlines (h, w), texts, and numbers from 1."""
     import cv2
     from matplotlib.patheffects import withStroke
 
@@ -234,7 +234,7 @@ def save_targets(path: Path, grid: Cloud, outlines: Sequence[np.ndarray], texts:
             x, y = np.arange(-1, width + 1), np.arange(-1, height + 1)
             padded = np.pad(outline, 1)
             axes.contour(x, y, padded.astype(float), [0.5], colors=colour, linewidths=2.4 if chosen else 1.4)
-            # the pixel that lies deepest inside
+            # the pixel that is farthest from the outline
             depth = cv2.distanceTransform(padded.astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
             v, u = np.unravel_index(int(depth.argmax()), depth.shape)
             style: dict[str, Any] = {"fontsize": 22, "weight": "bold", "ha": "center", "va": "center", "color": colour}
@@ -268,7 +268,7 @@ def _height_in(box: Box) -> float:
 
 
 def _around(cloud: Cloud, part: np.ndarray) -> Box:
-    """Return (left, right, bottom, top) of a part (h, w) bool of the cloud's grid with a twelfth of it around."""
+    """Return (left, right, bottom, top) of a part (h, w) bool of the cloud's grid with a margin of a twelfth."""
     left, right, bottom, top = _edges(cloud)
     rows, columns = np.nonzero(part)
     if not cloud.organised or not len(rows):
@@ -296,7 +296,7 @@ def _frame(axes: Axes, cloud: Cloud, box: Box) -> None:
 
 
 def _circle(axes: Axes, cloud: Cloud, numbered: Iterator[tuple[int, Detection]]) -> None:
-    """Draw a circle round each cluster, with its number at the upper right."""
+    """Draw a circle around each cluster, with its number at the upper right."""
     from matplotlib.patches import Circle
 
     for number, detection in numbered:

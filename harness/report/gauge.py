@@ -1,4 +1,4 @@
-"""The drilling template of a gauge board: 1:1, in tiles of a paper size (PDF) and as one drawing (SVG)."""
+"""The drilling template of a gauge board at a scale of 1:1: tiles of a paper size (PDF) and a whole drawing (SVG)."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 MM_PER_INCH = 25.4
 PAPER_MM = {"A4": (210.0, 297.0), "A3": (297.0, 420.0), "letter": (215.9, 279.4)}
 MARGIN_MM, FOOT_MM, OVERLAP_MM = 10.0, 12.0, 10.0
-"""Unprinted rim of a sheet, height of the line with the scale bar, and strip that neighbouring tiles share."""
+"""Unprinted margin of a sheet, height of the line with the scale bar, and overlap of neighbouring tiles."""
 SCALE_MM = 100.0
 
 
 def tiles_of(width_mm: float, height_mm: float, paper: str) -> tuple[tuple[float, float], list[tuple[float, float]]]:
-    """Return the sheet's size (width, height) in mm, upright or not, as takes fewer sheets, and the board's point that
-    lies at the lower left of each sheet's printed area, row by row from the top; board x, y from its lower left."""
+    """Return the sheet's size (width, height) in mm, in the orientation that takes fewer sheets, and the point of the
+    board (x, y from its lower left) at the lower left of each sheet's printed area, row by row from the top."""
     best: tuple[tuple[float, float], list[tuple[float, float]]] | None = None
     for sheet in (PAPER_MM[paper], PAPER_MM[paper][::-1]):
         room = (sheet[0] - 2 * MARGIN_MM, sheet[1] - 2 * MARGIN_MM - FOOT_MM)
@@ -40,7 +40,7 @@ def tiles_of(width_mm: float, height_mm: float, paper: str) -> tuple[tuple[float
 
 
 def draw_board(axes: Axes, board: Any, dictionary: str) -> None:
-    """Draw a `GaugeBoard` in millimetres about its centre: outline, coded marks, holes with centre marks and names."""
+    """Draw a `GaugeBoard` in millimetres about its centre: outline, coded marks, holes with centre marks, and names."""
     import cv2
     from matplotlib.patches import Circle, Rectangle
 
@@ -53,7 +53,7 @@ def draw_board(axes: Axes, board: Any, dictionary: str) -> None:
         step = mark.side_mm / modules
         for row, column in np.argwhere(picture == 0).tolist():
             corner = (mark.x_mm - mark.side_mm / 2 + column * step, mark.y_mm + mark.side_mm / 2 - (row + 1) * step)
-            # without edges neighbouring modules would show hairlines
+            # without edges, hairlines would show between neighbouring modules
             axes.add_patch(Rectangle(corner, step, step, fc="black", ec="black", lw=0.1))
     for hole in board.holes:
         centre, reach = (hole.x_mm, hole.y_mm), hole.diameter_mm / 2 + 2
@@ -66,7 +66,7 @@ def draw_board(axes: Axes, board: Any, dictionary: str) -> None:
 
 
 def template_svg(board: Any, dictionary: str) -> bytes:
-    """Return one board as a drawing of its own size."""
+    """Return a board as a drawing of the same size."""
     wide, high = board.width_mm + 2, board.height_mm + 2
     figure, axes = _sheet((-wide / 2, -high / 2, wide, high), board.name)
     draw_board(axes, board, dictionary)
@@ -76,7 +76,7 @@ def template_svg(board: Any, dictionary: str) -> bytes:
 
 
 def template_pdf(boards: Any, dictionary: str, paper: str) -> bytes:
-    """Return all boards, tile by tile, a sheet a tile, each with a scale bar and the tile's place."""
+    """Return all boards with one tile per sheet; each sheet has a scale bar and the place of its tile."""
     from matplotlib.backends.backend_pdf import PdfPages
 
     buffer = io.BytesIO()
@@ -94,7 +94,7 @@ def template_pdf(boards: Any, dictionary: str, paper: str) -> bytes:
 
 
 def _frame(axes: Axes, at: tuple[float, float, float, float], title: str) -> None:
-    """Clip the parts beyond a tile, and draw its cutting corners, scale bar and name."""
+    """Clip what lies beyond a tile, and draw its crop marks, scale bar and name."""
     from matplotlib.patches import Rectangle
 
     left, low, wide, high = at
@@ -114,7 +114,7 @@ def _frame(axes: Axes, at: tuple[float, float, float, float], title: str) -> Non
 
 
 def _sheet(view_mm: tuple[float, float, float, float], name: str) -> tuple[Figure, Axes]:
-    """Return a figure of so many millimetres (left, low, wide, high) whose axes fill it: a millimetre is one on it."""
+    """Return a figure that shows a box (left, low, width, height) in mm at a scale of 1:1; its axes fill it."""
     from matplotlib import rcParams
     from matplotlib.figure import Figure
 

@@ -1,4 +1,4 @@
-"""Model-assisted probability of detection: a simulated curve beside real hits and misses, and both combined."""
+"""Presents a model-assisted probability of detection: the simulated curve, real hits and misses, and both combined."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ BOARDS = Table(
 
 
 def answer(found: Mapod) -> str:
-    """The limit to quote, and whether simulation and reality agree, in two sentences."""
+    """State in two sentences whether simulation and reality agree, and the limit to quote."""
     agrees = f"(p = {found.agrees:.2g})"
     first = f"The real hits and misses do not contradict the simulation {agrees}."
     if found.contradicted:
@@ -48,7 +48,7 @@ def answer(found: Mapod) -> str:
 
 
 def sizes_grid(found: Mapod) -> Grid:
-    """Simulated, measured and combined sizes."""
+    """Return the table of simulated, measured and combined sizes."""
     last, rows = found.steps[-1], list[tuple[str, ...]]()
     for name, sizes in (("simulated", found.simulated), ("measured", found.measured)):
         if sizes is not None:
@@ -62,40 +62,40 @@ def sizes_grid(found: Mapod) -> Grid:
 
 
 def notes(found: Mapod) -> list[str]:
-    """Sentences on prior, tests and stop rule."""
+    """Return sentences on the prior, the tests and the stopping rule."""
     lines = [
         "Transfer function: real damage of size k a is found as easily as simulated damage of size a, and the rise "
-        f"of the curve is w times as wide. Prior: ln k and ln w about 0 by Student's distribution with {FREEDOM:g} "
-        f"degrees of freedom, with scales of a factor {PRIOR_SIZE:g} in k and {PRIOR_WIDTH:g} in w, and "
-        "the simulated curve's own uncertainty; w below 1 within that uncertainty alone.",
-        "Combined: medians of the posterior, and for a90/95 its 97.5 % quantile, where the likelihood ratio of the "
-        "handbook has the bound of simulated and of measured hits; the largest over the models that fit the simulated "
-        "hits about equally well. Where the simulation is contradicted, the larger of combined and measured counts.",
-        "Were the simulated curve right, hits and misses as far from it as these would come with probability "
-        f"{found.agrees:.2g}; below 0.05 that is a contradiction.",
-        f"Stop rule: enough where a90/95 is at most {ENOUGH:g} times a90. It was fixed before any board.",
+        f"of the curve is w times as wide. Prior: ln k and ln w follow Student's distribution about 0 with {FREEDOM:g} "
+        f"degrees of freedom and scales of a factor {PRIOR_SIZE:g} in k and {PRIOR_WIDTH:g} in w, plus "
+        "the simulated curve's own uncertainty; w is below 1 only within that uncertainty.",
+        "Combined: medians of the posterior, and its 97.5 % quantile for a90/95 (for simulated and for measured hits, "
+        "a90/95 is the handbook's likelihood ratio bound); the largest over the models that fit the simulated hits "
+        "about equally well. If the simulation is contradicted, the larger of combined and measured limit counts.",
+        "If the simulated curve were right, hits and misses at least as far from it would occur with probability "
+        f"{found.agrees:.2g}; a probability below 0.05 counts as a contradiction.",
+        f"Stopping rule: stop when a90/95 is at most {ENOUGH:g} times a90. The rule was fixed before any board.",
     ]
     return [*lines, *found.read.notes, VALIDITY]
 
 
 def doubts(found: Mapod) -> list[str]:
-    """Return sentences on the reasons to doubt the combined limit."""
+    """Return the reasons to doubt the combined limit."""
     texts = [f"{found.unlike}: a difference counts as an error of the simulation"] if found.unlike else []
     return texts + ["the real hits and misses contradict the simulation"] * found.contradicted
 
 
 def mapod_parts(found: Mapod) -> list[str | Grid]:
-    """Return what a terminal shows; what makes the limit doubtful comes first."""
+    """Return the parts for a terminal; reasons to doubt the limit come first."""
     shown: list[str | Grid] = [f"warning: {one}" for one in doubts(found)]
     shown += [sizes_grid(found), "", BOARDS.grid(found.steps), "", *(f"note: {one}" for one in notes(found))]
     return [*shown, "", answer(found)]
 
 
 def mapod_html(found: Mapod, command: str) -> str:
-    """The page as text; it needs no network."""
+    """Return the page as text; it needs no network."""
     caption = (
-        "The simulated curve, the one of the real hits (above) and misses (below) alone, and the combined one with its "
-        "95 % credible band, the widest over all simulated models."
+        "The simulated curve, the curve of the real hits (above) and misses (below) alone, and the combined curve with "
+        "its 95 % credible band, the widest over all simulated models."
     )
     drawn = blocks.svg("mapod", SIZE_IN, answer(found), lambda figure: _draw(figure, found))
     body = [blocks.heading("Simulated, measured, combined"), sizes_grid(found).html()]
@@ -107,7 +107,7 @@ def mapod_html(found: Mapod, command: str) -> str:
 
 
 def save_mapod_png(path: Path, found: Mapod) -> None:
-    """The figure as a PNG at ``path``."""
+    """Write the figure as a PNG to ``path``."""
     blocks.save_png(path, SIZE_IN, lambda figure: _draw(figure, found))
 
 

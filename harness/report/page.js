@@ -1,6 +1,6 @@
 "use strict";
-// A list of contents, tables to sort and filter, which fit narrow screens, and values under the pointer on charts. Without
-// it nothing is lost.
+// Adds a table of contents, tables that can be sorted and filtered and that fit narrow screens, and values under the
+// pointer on charts. All content is also readable without this script.
 {
   const heads = [...document.querySelectorAll("main h2")];
   const nav = document.getElementById("contents");

@@ -35,12 +35,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 GUIDE = "#cfd6dd"
-MOST_ROWS = 4  # Rows of set-ups that the answer names one by one
+MOST_ROWS = 4  # Most rows of set-ups that the answer lists individually
 LIKELIEST = 10  # set-ups that the posterior's table shows
 
 
 def _posterior_section(posterior: pd.DataFrame) -> list[Any]:
-    """Heading, one small diagram for each axis, the likeliest set-ups; of `posterior_of`."""
+    """Return a heading, a small diagram for each axis, and the likeliest set-ups, from the result of `posterior_of`."""
     axes = posterior[posterior["axis"] != SET_UP]
     names = list(dict.fromkeys(axes["axis"]))
 
@@ -61,13 +61,13 @@ def _posterior_section(posterior: pd.DataFrame) -> list[Any]:
     best = posterior[posterior["axis"] == SET_UP].head(LIKELIEST)
     return [
         blocks.heading("What would make the thesis true"),
-        blocks.figure(figures, "posterior", "Share of the posterior (bars) and of the prior (line) of each fact."),
+        blocks.figure(figures, "posterior", "Posterior (bars) and prior (line) probability of each fact."),
         trials.POSTERIOR.grid(sections.records(best)).html(),
     ]
 
 
 def rates_figure(main: pd.DataFrame) -> str:
-    """The share of repeats that detected each hole against its diameter, Wilson intervals, a line by frames."""
+    """Draw each hole's share of repeats that detected it (with Wilson intervals) against its diameter, by frames."""
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
@@ -85,7 +85,7 @@ def rates_figure(main: pd.DataFrame) -> str:
 
 
 def limits_figure(compared: pd.DataFrame, layout: Layout, frames: Sequence[int]) -> str:
-    """The smallest diameter found against the last axis, a panel for each number of frames."""
+    """Draw the smallest diameter found against the last axis, with a panel for each number of frames."""
 
     def draw(figure: Figure) -> None:
         panels = figure.subplots(1, len(frames), squeeze=False)[0]
@@ -99,7 +99,7 @@ def limits_figure(compared: pd.DataFrame, layout: Layout, frames: Sequence[int])
             axes.set_xticks(layout.column_values, [f"{value:g}" for value in layout.column_values])
             axes.set(ylim=(0, top), ylabel="smallest diameter found (mm)", xlabel=layout.column_name)
             axes.set_title(many(n, "frame"))
-        columns = int(15 * width_in / (6 + max(map(len, layout.rows))))  # some 15 letters an inch
+        columns = int(15 * width_in / (6 + max(map(len, layout.rows))))  # about 15 letters per inch
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=max(columns, 1))
 
     width_in = 1 + 3.2 * len(frames)
@@ -109,7 +109,7 @@ def limits_figure(compared: pd.DataFrame, layout: Layout, frames: Sequence[int])
 
 
 def noise_figure(noise: pd.DataFrame) -> str:
-    """Temporal, systematic and total error of one variant against frames, with the 1/sqrt(N) guide and the floor."""
+    """Draw a variant's temporal, systematic and total error against frames, with the 1/sqrt(N) guide and the floor."""
     frames = noise["frames"].to_numpy(float)
     floor_mm = fit_floor(frames, noise["total_rms_mm"].to_numpy(float))
 
@@ -119,7 +119,7 @@ def noise_figure(noise: pd.DataFrame) -> str:
         for column, colour, marker, label in (
             ("temporal_rms_mm", blocks.BLUE, "o", "temporal noise, rms"),
             ("systematic_mm", blocks.ORANGE, "s", "systematic error (offset and pattern)"),
-            ("pattern_mm", blocks.GREEN, "v", "of it, pattern over pixels"),
+            ("pattern_mm", blocks.GREEN, "v", "its pattern over pixels"),
             ("total_rms_mm", blocks.INK, "D", "total error, rms"),
         ):
             values = noise[column].where(noise[column] > 0)
@@ -141,16 +141,16 @@ def noise_figure(noise: pd.DataFrame) -> str:
 
 
 def cost_text(cost: sections.Row) -> str:
-    """``+0.42 mm (0.30 to 0.55)`` of a row of the table of effects; a bound where a size lies off the ladder."""
+    """Return a loss in the table of effects as ``+0.42 mm (0.30 to 0.55)``, or as a bound if a size is out of range."""
     if not np.isfinite(cost["loss_mm"]):
-        return "off the ladder of sizes" if np.isnan(cost["loss_mm"]) else f"{'+' if cost['loss_mm'] > 0 else '−'}∞"
+        return "outside the range of sizes" if np.isnan(cost["loss_mm"]) else f"{'+' if cost['loss_mm'] > 0 else '−'}∞"
     low, high = (f"{end:+.2f}" if np.isfinite(end) else "∞" for end in (cost["loss_low_mm"], cost["loss_high_mm"]))
-    bound = "" if cost["on_ladder"] else ", a bound: a size lies off the ladder"
+    bound = "" if cost["on_ladder"] else ", a bound: a size lies outside the range"
     return f"{cost['loss_mm']:+.2f} mm ({low} to {high}{bound})".replace("-", "−")
 
 
 def costs_by_place(costs: pd.DataFrame) -> dict[tuple[str, int], dict[tuple[str, str], sections.Row]]:
-    """The rows of the table of effects by place and frames, then by effect and what it is on against."""
+    """Return the rows of the table of effects by (place, frames), then by (effect, other effects that are on)."""
     found: dict[tuple[str, int], dict[tuple[str, str], sections.Row]] = {}
     for row in sections.records(costs):
         found.setdefault((row["place"], int(row["frames"])), {})[row["effect"], row["against"]] = row
@@ -165,7 +165,7 @@ def effects_figure(costs: pd.DataFrame) -> str:
         panels = figure.subplots(1, len(places), squeeze=False, sharex=True, sharey=True)[0]
         for axes, ((_, frames), at) in zip(panels, places.items(), strict=True):
             for shift, colour, label, against in (
-                (-0.2, blocks.BLUE, "alone, against nothing on", "nothing"),
+                (-0.2, blocks.BLUE, "alone", "nothing"),
                 (0.2, blocks.ORANGE, "on top of all the others", "all others"),
             ):
                 chosen = [(names.index(effect) + shift, row) for (effect, on), row in at.items() if on == against]
@@ -176,7 +176,7 @@ def effects_figure(costs: pd.DataFrame) -> str:
                 axes.barh([place for place, _ in chosen], sizes, 0.36, xerr=errors, **style)
                 for place, row in chosen:
                     if not np.isfinite(row["loss_mm"]):
-                        axes.text(0, place, " off the ladder", va="center", fontsize=8, color=blocks.GREY)
+                        axes.text(0, place, " out of range", va="center", fontsize=8, color=blocks.GREY)
             axes.set(title=many(frames, "frame"), xlabel="loss of the 50 % size (mm)")
             axes.axvline(0, color=blocks.GREY, lw=1)
             axes.grid(axis="y", visible=False)
@@ -184,7 +184,7 @@ def effects_figure(costs: pd.DataFrame) -> str:
         panels[0].invert_yaxis()
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
 
-    alt = "Loss of the 50 per cent detectable diameter in millimetres to each effect, alone and on top of the others."
+    alt = "Loss of the 50 % diameter in millimetres due to each effect, alone and on top of the others."
     return blocks.svg("effects", (10, 0.42 * len(names) + 1.6), alt, draw)
 
 
@@ -196,8 +196,8 @@ CAMERA = (
 
 @dataclass(frozen=True)
 class Layout:
-    """The places of set-ups: the last axis across, all others down; of a single axis, all down. ``rows``: text of a row
-    -> its set-ups, one a column. ``columns``: the last axis' values, ``column_values`` numbers."""
+    """The layout of set-ups in a table: the last of several axes across, the others down. ``rows`` maps the text of a
+    row to its set-ups. ``columns`` are the last axis's values, ``column_values`` the same as numbers."""
 
     rows: Mapping[str, Sequence[str]]
     columns: tuple[str, ...] = ()
@@ -206,17 +206,17 @@ class Layout:
 
     @staticmethod
     def of(tables: ResultTables) -> Layout:
-        """The layout of an experiment's set-ups."""
+        """Return the layout of an experiment's set-ups."""
         set_ups = tables.variants[~tables.variants["is_variation"].astype(bool)]
         paths = [str(path) for path in tables.axes["path"]]
         values = list(dict.fromkeys(set_ups[paths[-1]])) if len(paths) > 1 else []
         rows: dict[str, list[str]] = {}
-        # a column that variations leave empty has no whole numbers
+        # a column that is empty for variations holds no integers
         held = [set_ups[path].convert_dtypes().tolist() for path in paths[:-1]]
         for variant, *places in zip(set_ups["variant"], *held, strict=True):
             labels = map("{}={}".format, paths, map(canonical_json, places))
             rows.setdefault(", ".join(map(in_words, labels)), []).append(str(variant))
-        if any(len(names) != len(values) for names in rows.values()):  # set-ups drawn at random fill no grid
+        if any(len(names) != len(values) for names in rows.values()):  # set-ups that are drawn at random form no grid
             return Layout({in_words(str(name)): [str(name)] for name in set_ups["variant"]})
         numbers = tuple(float(v) for v in values) if all(isinstance(v, int | float) for v in values) else ()
         last = tables.axes.iloc[-1]
@@ -227,7 +227,7 @@ class Layout:
 def set_ups_html(
     tables: ResultTables, examples: Sequence[ExampleCloud], about: sections.About, found: Summaries | None = None
 ) -> str:
-    """The page of several set-ups as text; see `write_report`."""
+    """Return the page of several set-ups as text; see `write_report`."""
     found = found or summaries(tables, examples, with_claims=about.with_claims)
     compared, costs, posterior = of_set_ups(found[SET_UPS], tables), found[trials.EFFECTS], found.get(trials.POSTERIOR)
     verdict = next(iter(verdicts_of(found)), None)
@@ -239,7 +239,7 @@ def set_ups_html(
     shown = [row for row in sections.records(compared) if row["frames"] in frames]
     calls = of_set_ups(found[FALSE_CALLS], tables)
     calls = calls[(calls["role"] == "damaged") & calls["frames"].isin(frames)]
-    rule = "Each set-up has hole-free runs and a threshold of its own."
+    rule = "Each set-up has its own hole-free runs and threshold."
     return sections.sweep_page(
         "set_ups.html",
         tables,
@@ -260,7 +260,7 @@ def set_ups_html(
 
 
 def set_ups_answer(compared: pd.DataFrame, layout: Layout, costs: pd.DataFrame, verdict: Verdict | None) -> str:
-    """State what the experiment found: each row's holes with the most frames, the costliest effect, C11."""
+    """State each row's holes found with the most frames, the effect with the largest loss, and the verdict on C11."""
     if compared.empty:
         return "No trial of any set-up finished, so there is no answer."
     frames = sections.shown_frames(compared)
@@ -278,10 +278,10 @@ def set_ups_answer(compared: pd.DataFrame, layout: Layout, costs: pd.DataFrame, 
         if together is None or count not in frames:
             continue
         place = f"{named}, " if named else ""
-        moved = f"all effects together move the 50 % size by {cost_text(together)}"
+        moved = f"all effects together change the 50 % size by {cost_text(together)}"
         each = [row for (effect, against), row in at.items() if against == "nothing" and effect != "all"]
         dearest = max(each, key=lambda row: np.nan_to_num(row["loss_mm"], nan=-np.inf), default=None)
-        alone = f"; alone, {dearest['effect']} does most: {cost_text(dearest)}" if dearest else ""
+        alone = f"; the largest single effect is {dearest['effect']}: {cost_text(dearest)}" if dearest else ""
         parts.append(f"With {place}{_averaged(count)}, {moved}{alone}.")
     if verdict:
         parts.append(f"{verdict.claim} ({verdict.text.rstrip('.')}) is {verdict.verdict}.")
@@ -299,7 +299,7 @@ def _costs_grid(costs: pd.DataFrame) -> Grid:
     rows = []
     for effect in dict.fromkeys(costs["effect"]):
         cells = [at.get((effect, against)) for at in places.values() for against in ("nothing", "all others")]
-        rows.append([effect.replace("all", "all together"), *("–" if one is None else cost_text(one) for one in cells)])
+        rows.append([effect.replace("all", "all together"), *("–" if row is None else cost_text(row) for row in cells)])
     return Grid.of(heads, rows)
 
 
@@ -313,10 +313,10 @@ def write_report(
     facts: Mapping[str, Any] | None = None,
     found: Summaries | None = None,
 ) -> Path:
-    """Write ``folder/report.html`` and return its path: the page of one set-up, of several side by side, or of maps,
-    with a page beside it for each map of ``examples``. ``provenance``: see `harness.report.blocks.closing`; ``facts``:
-    the resolved experiment as plain data; ``found``: of `summaries`. Claims are scored of the thesis' target. The
-    same input gives the same bytes. Raises UserError where the folder cannot be written."""
+    """Write ``folder/report.html`` and return its path: the page of a set-up, of several set-ups, or of maps, with a
+    page for each map of ``examples`` beside it. `harness.report.blocks.closing` describes ``provenance``; ``facts`` is
+    the resolved experiment as plain data, ``found`` the result of `summaries`. Claims need the thesis' target.
+    The same input gives the same bytes. Raises UserError if the folder cannot be written."""
     about = sections.About(provenance, experiment_yaml_text, title, is_thesis(facts or {}), facts or {})
     clouds = [example for example in examples if isinstance(example, ExampleCloud)]
     maps = [example for example in examples if isinstance(example, MappedExample)]
@@ -334,7 +334,7 @@ def write_report(
 def report_html(
     tables: ResultTables, examples: Sequence[ExampleCloud], about: sections.About, found: Summaries | None = None
 ) -> str:
-    """The page of an experiment with one set-up as text; see `write_report`."""
+    """Return the page of an experiment with one set-up as text; see `write_report`."""
     found = found or summaries(tables, examples, with_claims=about.with_claims)
     main, noise, calls = (found[of][found[of]["variant"] == MAIN] for of in (SUMMARY, NOISE_BY_FRAMES, FALSE_CALLS))
     verdicts = verdicts_of(found)
@@ -361,7 +361,7 @@ def report_html(
 
 
 def answer_sentence(main: pd.DataFrame, verdicts: Sequence[Verdict] = ()) -> str:
-    """State which holes were found with the most and the fewest frames, and the claims. ``main``: its summary rows."""
+    """State which holes were found with the most and the fewest frames (``main``: summary rows), and the verdicts."""
     if main.empty:
         return "No trial of the main experiment finished, so there is no answer."
     frames = sorted(int(n) for n in main["frames"].unique())

@@ -1,4 +1,4 @@
-"""The page of an experiment with several views: whether more views beat one, and how registering and merging matter."""
+"""The page of an experiment with several views: the gain of more views, and the effects of registering and merging."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-LEADS = {"borne out": "Yes", "not borne out": "Not in every respect", "undecided": "That stays open"}
+LEADS = {"borne out": "Yes", "not borne out": "Not in every respect", "undecided": "That is undecided"}
 MAPS_SHOWN = (
     *("registration", "merge", "views", "found", "from (mm)", "average (mm)", "offset (mm)", "pattern (mm)"),
     *("surface noise (mm)", "threshold (mm)", "false calls", "views left out", "time (s)"),
@@ -35,7 +35,7 @@ MAPS_SHOWN = (
 def perspectives_html(
     tables: ResultTables, examples: Sequence[MappedExample], about: sections.About, found: Summaries | None = None
 ) -> str:
-    """The page as text; see `harness.report.page.write_report`."""
+    """Return the page as text; see `harness.report.page.write_report`."""
     found = found or summaries(tables, with_claims=about.with_claims)
     compared, errors, verdicts = found[SET_UPS], found[REGISTRATION_ERRORS], verdicts_of(found)
     cases = maps.map_cases(tables, found[SUMMARY])
@@ -48,8 +48,8 @@ def perspectives_html(
     if len(set_ups):
         figures["found"] = found_figure(sections.records(set_ups[set_ups["frames"] == frames[0]]))
     rule = (
-        "Each set-up has hole-free runs and a threshold of its own. The same frames feed every set-up; repeats vary "
-        "the error of the nominal poses too. A single view needs no registration."
+        "Each set-up has its own hole-free runs and threshold. All set-ups use the same frames; repeats also vary "
+        "the error of the nominal poses. A single view needs no registration."
     )
 
     def by_frames(table: Table, rows: pd.DataFrame, only: Sequence[str] = ()) -> Markup:
@@ -73,7 +73,7 @@ def perspectives_html(
 
 
 def found_figure(rows: Sequence[sections.Row]) -> str:
-    """The number of holes found against the number of views, a line for each way of registering and merging."""
+    """Draw the number of holes found against the number of views, with a line per registration and merging method."""
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
@@ -82,7 +82,7 @@ def found_figure(rows: Sequence[sections.Row]) -> str:
             there = [row for row in rows if (row["registration"], row["merge"]) == way]
             own = sorted((row["views"], len(row["found"])) for row in there)
             colour, marker = (each[number % len(each)] for each in (blocks.COLOURS, blocks.MARKERS))
-            shift = 0.04 * (number - len(ways) / 2)  # so that equal counts stay apart
+            shift = 0.04 * (number - len(ways) / 2)  # separates equal counts
             views, counts = np.array(sorted(own), float).T
             label = maps.label_of(method_text(way[0]), way[1])
             axes.plot(views + shift, counts, marker=marker, ms=5, lw=1.2, color=colour, label=label)
@@ -91,11 +91,11 @@ def found_figure(rows: Sequence[sections.Row]) -> str:
         axes.set_xticks(sorted({row["views"] for row in rows}))
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
 
-    return blocks.svg("found", (5.4, 4.4), "Number of holes found against views, by way of merging.", draw)
+    return blocks.svg("found", (5.4, 4.4), "Number of holes found against views, by method of merging.", draw)
 
 
 def answer_sentence(cases: Sequence[maps.MapCase], verdicts: Sequence[Verdict] = ()) -> str:
-    """Say how many holes one view finds, and the most views by the way that finds most; the verdicts too."""
+    """State how many holes one view finds, how many the most views find by the best method, and the verdicts."""
     sentences = []
     for case in cases:
         alone = case.single()
@@ -117,13 +117,13 @@ def answer_sentence(cases: Sequence[maps.MapCase], verdicts: Sequence[Verdict] =
         return "No trial of any set-up finished, so there is no answer."
     if verdicts:
         leads = dict.fromkeys(LEADS[verdict.verdict] for verdict in verdicts if verdict.claim == "H1")
-        sentences.insert(0, f"Do more views beat one? {' / '.join(leads)}.")
+        sentences.insert(0, f"Are several views better than one? {' / '.join(leads)}.")
         sentences.append(f"{', '.join(f'{verdict.claim} is {verdict.verdict}' for verdict in verdicts)}.")
     return " ".join(sentences)
 
 
 def map_files(examples: Sequence[MappedExample]) -> dict[str, MappedExample]:
-    """The file of each browser map beside the report; the most frames first, then by views, way."""
+    """Return the file of each browser map beside the report, sorted by frames (most first), views and method."""
     files: dict[str, MappedExample] = {}
     for example in sorted(examples, key=lambda e: (-e.frames, e.views, e.registration, e.merge, e.variant)):
         words = f"{example.views} views {example.registration} {example.merge} {example.frames} frames"
@@ -153,12 +153,12 @@ PART_NAMES = {"in_plane": "In the plane of the board", "across": "Across it"}
 
 
 def method_text(method: str) -> str:
-    """Return the name of a method on axes."""
+    """Return the name of a method as axes and sentences show it."""
     return {"icp": "ICP", "cpd": "CPD"}.get(method, method)
 
 
 def tre_figure(registrations: pd.DataFrame, frames: Sequence[int]) -> str:
-    """Every registration's error by method, in the plane and across it, with the median."""
+    """Draw the error of each registration by method, in the plane and across it, with the median."""
     methods = list(dict.fromkeys(registrations["method"]))
 
     def draw(figure: Figure) -> None:
@@ -173,7 +173,7 @@ def tre_figure(registrations: pd.DataFrame, frames: Sequence[int]) -> str:
                     for chosen, marker, shade, size in ((good, "o", colour, 2.2), (bad, "x", blocks.INK, 4)):
                         values = chosen[f"tre_{part}_mm"].to_numpy(float)
                         values = values[np.isfinite(values) & (values > 0)]
-                        # spread evenly by rank, so that the picture is always the same
+                        # points are spread evenly by rank, so that the picture is reproducible
                         spread = x + 0.26 * (np.modf(np.arange(len(values)) * 0.6180339887)[0] - 0.5)
                         axes.plot(spread, values, ls="none", marker=marker, ms=size, color=shade, alpha=0.45)
                     median = good[f"tre_{part}_mm"].median()

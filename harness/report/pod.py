@@ -1,4 +1,4 @@
-"""A probability of detection curve: its tables for terminal and page, and its figure with the inspections behind it."""
+"""Presents a probability of detection curve: tables for terminal and page, and a figure with the inspections."""
 
 from __future__ import annotations
 
@@ -23,30 +23,30 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_MARKS = 2000
-"""Most inspections that a figure draws as single marks; more of them form one picture within it."""
+"""Most inspections that a figure draws as vector marks; if there are more, they are rasterised."""
 STRIPE = 0.10
 """Height of the stripes above 1 and below 0 in which hits and misses are spread, in units of POD."""
 VALIDITY = (
-    "The limit holds for inspections like these: the same kind of flaws and parts, the same procedure, the sizes that "
-    "were tried. Targets are taken as independent of each other. Sizes beyond the largest target are extrapolation."
+    "The limit holds for inspections like these: the same kind of flaws and parts, the same procedure, and the sizes "
+    "inspected. Targets are assumed to be independent. Sizes beyond the largest target are extrapolated."
 )
 
 
 def pod_html(statement: PodStatement, command: str) -> str:
-    """The page as text: limit, figure, table of models, tests, notes; it needs no network."""
+    """Return the page as text: limit, figure, table of models, tests, notes; it needs no network."""
     caption = (
-        "The curve with its pointwise band, the inspections behind it, and the sizes at POD 0.5 and 0.9. a90/95 is "
-        "where the band's lower edge reaches 0.9."
+        "The curve with its pointwise band, the inspections, and the sizes at POD 0.5 and 0.9. a90/95 is the size at "
+        "which the band's lower edge reaches 0.9."
     )
     chosen_by = (
-        "Sorted by deviance, smaller is nearer to the data. Unless one was asked for, that alone "
-        "chooses the curve, never the limit."
+        "The models are sorted by deviance; a smaller deviance means a better fit. Unless a model was requested, "
+        "the deviance selects the curve, but never the limit."
     )
     if len(statement.fits) > 1:
         chosen_by += (
             f" {len(statement.fits)} models are within {NEAR_DEVIANCE:g} of the least (for each inspection of a "
-            "target), too little to tell them apart: every a90/95 to quote is the largest of theirs, and the band "
-            "holds all their bands."
+            "target), too little to distinguish them: each a90/95 to quote is the largest of these models, and the "
+            "band covers all their bands."
         )
     size_in, draw = _plan(statement)
     drawn = blocks.svg("pod", size_in, f"{answer(statement)} {statement.counts}.", draw)
@@ -64,7 +64,7 @@ def pod_html(statement: PodStatement, command: str) -> str:
 
 
 def pod_parts(statement: PodStatement) -> list[str | Grid]:
-    """Return what a terminal shows: the page's tables and sentences."""
+    """Return the parts for a terminal: the page's tables and sentences."""
     parts: list[str | Grid] = [f"warning: {doubt}" for doubt in statement.doubts]
     parts += [f"{statement.read.path}: {statement.kind}, {statement.counts}", f"model: {statement.model}"]
     parts += ["", models_grid(statement), "", sizes_grid(statement), "", fit_grid(statement)]
@@ -75,7 +75,7 @@ def pod_parts(statement: PodStatement) -> list[str | Grid]:
 
 
 def sizes_grid(statement: PodStatement) -> Grid:
-    """a50, a90 and a90/95: size, and how it was found."""
+    """Return the table of a50, a90 and a90/95 with the method of each."""
     of = f", the largest of {len(statement.fits)} models" if len(statement.fits) > 1 else ""
     digits, unit = _digits(statement), statement.unit
     rows = [(name, sized(getattr(statement, name), unit, digits), "estimate") for name in ("a50", "a90")]
@@ -99,14 +99,14 @@ MODELS = Table(
 
 
 def models_grid(statement: PodStatement) -> Grid:
-    """The models that were tried; marked: that of the curve, and those whose bounds are compared with its own."""
+    """Return the table of models; it marks the model of the curve, and the models whose bounds are compared with it."""
     of_unit = f" ({statement.unit})" if statement.unit else ""
     heads = {name: f"{name}{of_unit}" for name in ("a50", "a90", "a90/95")}
     return MODELS.grid(statement.models, heads=heads)
 
 
 def fit_grid(statement: PodStatement) -> Grid:
-    """The numbers of the fit."""
+    """Return the table with the numbers of the fit."""
     return Grid.of(("of the fit", "value"), ((name, f"{value:.5g}") for name, value in statement.numbers.items()))
 
 
@@ -115,18 +115,18 @@ def _bound_text(bound: Bound, unit: str, digits: int = 2) -> str:
 
 
 def _digits(statement: PodStatement) -> int:
-    """Return three digits where a90 and its bound are so near that the third says something, else two."""
+    """Return 3 digits if a90 and its bound are so close that a third digit is needed, or else 2."""
     return 3 if 2 * (statement.bound.value - statement.a90) <= ROUGH * statement.a90 else 2
 
 
 def save_pod_png(path: Path, statement: PodStatement) -> None:
-    """The figure as a PNG at ``path``; the same bytes for the same statement."""
+    """Write the figure as a PNG to ``path``; the same statement gives the same bytes."""
     size_in, draw = _plan(statement)
     blocks.save_png(path, size_in, draw)
 
 
 def answer(statement: PodStatement) -> str:
-    """The limit in one sentence."""
+    """State the limit in one sentence."""
     size = f"{statement.bound.confidence:.0%} confidence".replace("%", " %")
     if statement.bound.demonstrated:
         limit = sized(statement.bound.value, statement.unit, _digits(statement))
@@ -135,7 +135,7 @@ def answer(statement: PodStatement) -> str:
 
 
 def sized(value: float, unit: str, digits: int = 2) -> str:
-    """A size with that many significant digits and its unit; a word where it is not finite."""
+    """Return a size with that many significant digits and its unit, or "not reached" if it is not finite."""
     if not np.isfinite(value):
         return "not reached"
     decimals = max(0, digits - 1 - int(f"{value:.{digits - 1}e}".partition("e")[2]))
@@ -143,17 +143,17 @@ def sized(value: float, unit: str, digits: int = 2) -> str:
 
 
 def axis_text(column: str, unit: str) -> str:
-    """``column`` with its unit in brackets, where one was told."""
+    """Return ``column`` with its unit in brackets, if it has a unit."""
     return plain(f"{column} ({unit})" if unit else column)
 
 
 def plain(text: str) -> str:
-    """Escape the user's text for a figure, whose library would typeset text between dollar signs."""
+    """Escape the user's text for Matplotlib, which would typeset text between dollar signs."""
     return text.replace("$", r"\$")
 
 
 def _plan(statement: PodStatement) -> tuple[tuple[float, float], Callable[[Figure], None]]:
-    """Write the figure as a PNG: one panel, or two where there are signals to see."""
+    """Return the figure's size and the function that draws it: a second panel shows signals, if there are any."""
 
     def draw(figure: Figure) -> None:
         panels = figure.subplots(1, 2 if statement.signal else 1, squeeze=False)[0]
@@ -174,7 +174,7 @@ def _plan(statement: PodStatement) -> tuple[tuple[float, float], Callable[[Figur
 
 
 def draw_pod(axes: Axes, statement: PodStatement) -> None:
-    """Curve, band, data and the sizes read off."""
+    """Draw the curve, the band, the data and the sizes to quote."""
     curve, sizes, (lower, upper) = statement.curve, statement.sizes, statement.band
     confidence = f"{statement.bound.confidence:.0%}".replace("%", " %")
     axes.fill_between(sizes, lower, upper, color=BLUE, alpha=0.16, lw=0)
@@ -200,8 +200,8 @@ def draw_pod(axes: Axes, statement: PodStatement) -> None:
 
 
 def draw_hits(axes: Axes, size: np.ndarray, hit: np.ndarray, strength: float) -> None:
-    """Each inspection of ``size`` (n,), ``hit`` (n,) bool, as a stroke, spread in height so that equals stay apart."""
-    # multiples of the golden ratio keep apart without chance
+    """Draw each inspection of ``size`` (n,), ``hit`` (n,) bool, as a stroke; equal sizes are spread in height."""
+    # multiples of the golden ratio spread the strokes without random numbers
     spread = STRIPE * np.asarray((np.arange(len(size)) * 0.6180339887498949) % 1.0)
     style: dict[str, Any] = {"marker": "|", "s": 26, "lw": 0.8, "color": INK, "alpha": strength, "clip_on": False}
     style["rasterized"] = len(size) > MOST_MARKS
@@ -211,13 +211,13 @@ def draw_hits(axes: Axes, size: np.ndarray, hit: np.ndarray, strength: float) ->
 
 
 def hits_in_view(axes: Axes, beside: float = STRIPE + 0.06) -> None:
-    """The axis of POD, with room above and below its 0 and 1."""
+    """Set the axis of POD, with room below 0 and above 1."""
     axes.set_ylim(-beside, 1 + beside)
     axes.set_yticks(np.linspace(0, 1, 6))
 
 
 def draw_signals(axes: Axes, statement: PodStatement) -> None:
-    """Signals against sizes with the fitted line, one deviation beside it, the decision and where signals end."""
+    """Draw signals against sizes, the fitted line with one standard deviation, the decision, and censored signals."""
     model = statement.signal
     assert model is not None
     sizes = statement.sizes
@@ -225,7 +225,7 @@ def draw_signals(axes: Axes, statement: PodStatement) -> None:
     line = model.b0 + model.b1 * x
     back = np.exp if model.log_signal else np.asarray
     axes.fill_between(sizes, back(line - model.tau), back(line + model.tau), color=BLUE, alpha=0.14, lw=0)
-    axes.plot(sizes, back(line), color=BLUE, label="fit ± one deviation")
+    axes.plot(sizes, back(line), color=BLUE, label="fit ± one standard deviation")
     axes.axhline(model.decision, color=RED, lw=1.2, label=f"decision {model.decision:.4g}")
     ends = [f"{sign} {value:.4g}" for sign, value in (("≤", model.left), ("≥", model.right)) if value is not None]
     for value in (model.left, model.right):
@@ -249,13 +249,13 @@ def draw_signals(axes: Axes, statement: PodStatement) -> None:
 
 
 def _log_sizes(axes: Axes, sizes: np.ndarray) -> None:
-    """Set a logarithmic axis whose numbers are written out."""
+    """Set a logarithmic axis with plain numbers."""
     axes.set_xscale("log")
     plain_numbers(axes.xaxis, (1, 2, 5) if sizes[-1] / sizes[0] < 1000 else (1,))
 
 
 def plain_numbers(axis: Axis, at: tuple[float, ...] = (1, 2, 5)) -> None:
-    """20, not 2 x 10^1, ``at`` these multiples of each decade."""
+    """Label an axis with 20 instead of 2 x 10^1, ``at`` these multiples of each decade."""
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
     axis.set_major_locator(LogLocator(subs=at))

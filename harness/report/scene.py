@@ -1,4 +1,4 @@
-"""The scene of an experiment as a picture: camera, target and the surface behind it, from the side, not to scale."""
+"""Draws the scene of an experiment: camera, target and the surface behind it, from the side and not to scale."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from harness.vocabulary.declaration import shape
 from harness.vocabulary.path_names import camera_title, value_text
 
 BEHIND = ("source.target.backing.distance_mm", "source.target.backing_distance_mm")
-"""Paths that say how far a surface stands behind a declared target."""
+"""Paths of settings for the distance between a target and the surface behind it."""
 
 
 def scene_svg(facts: Mapping[str, Any]) -> Markup:
-    """Return the picture with its caption; empty where ``facts``, the resolved experiment, hold no simulated target."""
+    """Return the picture with its caption; empty if ``facts``, the resolved experiment, hold no simulated target."""
     cameras, distances = _values(facts, "source.camera.name"), _values(facts, "source.target.distance_m")
     if not (cameras and distances):
         return Markup("")
@@ -25,7 +25,7 @@ def scene_svg(facts: Mapping[str, Any]) -> Markup:
     distance = value_text("distance_m", [distances[0], distances[-1]]) if len(distances) > 1 else f"{distances[0]:g} m"
     gaps = [gap for path in BEHIND for gap in _values(facts, path)]
     gap = " or ".join(f"{one:g} mm" for one in gaps) if len(gaps) < 3 else f"{min(gaps):g} to {max(gaps):g} mm"
-    behind = f", {gap} before another surface" if gaps else ""
+    behind = f", {gap} in front of another surface" if gaps else ""
     target = facts["source"]["target"].get("name", "target")
     target = {"drawn": "target with damage drawn at random", "thesis": "board with eleven holes"}.get(target, target)
     words = f"{', '.join(names)} at {distance} from a {target}{behind}. Not to scale."
@@ -34,7 +34,7 @@ def scene_svg(facts: Mapping[str, Any]) -> Markup:
 
 
 def _values(facts: Mapping[str, Any], path: str) -> list[Any]:
-    """Return the values of a setting: those of its axis, or the experiment's single value; empty where it has none."""
+    """Return a setting's values: those of its axis, or the experiment's single value; empty if it has none."""
     if path in (axes := facts.get("sweep") or {}):
         return [value for value in axes[path] if value is not None]
     value = shape.get(facts, tuple(path.split(".")))

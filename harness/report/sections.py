@@ -1,4 +1,4 @@
-"""Sections that several pages of a sweep share, and the final tables of a terminal."""
+"""Sections that several pages of a sweep share, and the final tables for a terminal."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ Row = Mapping[str, Any]
 
 
 class About(NamedTuple):
-    """Title and origin of a report: ``provenance`` as of `harness.report.blocks.closing`, and the resolved experiment.
-    ``with_claims``: whether the target is the thesis' own; ``facts``: the resolved experiment as plain data."""
+    """Title and origin of a report. ``provenance`` is as in `harness.report.blocks.closing`; ``facts`` is the resolved
+    experiment as plain data. ``with_claims`` says whether the target is that of the thesis."""
 
     provenance: Mapping[str, Any]
     experiment_yaml_text: str
@@ -39,7 +39,7 @@ class About(NamedTuple):
 def sweep_page(
     name: str, tables: ResultTables, about: About, answer: str, figures: Mapping[str, str], **parts: Any
 ) -> str:
-    """Return the page of a sweep by the template ``name``: what all have in common, and its own ``parts``."""
+    """Return a sweep's page from the template ``name``, with the sections of all pages and its own ``parts``."""
     warnings = about.provenance.get("warnings", ())
     base = {"title": about.title, "answer": answer, "warnings": warnings, "figures": figures}
     seen = int(tables.holes.groupby("variant")["hole"].nunique().min()) if len(tables.holes) else None
@@ -49,17 +49,17 @@ def sweep_page(
 
 
 RULES_NOTE = (
-    "Each criterion is written in the program and is the same for every run. Where the data leave room for both "
-    "answers, the claim is undecided."
+    "Each criterion is part of the program and is the same for every run. If the data allow both answers, the claim is "
+    "undecided."
 )
 CALLS_NOTE = (
-    "Detections that belong to no hole, with exact 95 % Poisson intervals. A calibrated threshold is the highest of "
-    "the quiet thresholds of R hole-free runs; one more such run would exceed it with probability 1/(R + 1)."
+    "Detections that match no hole, with exact 95 % Poisson intervals. A calibrated threshold is the highest of the "
+    "quiet thresholds of R hole-free runs; one more such run would exceed it with probability 1/(R + 1)."
 )
 
 
 class Varied(NamedTuple):
-    """A variation with one number of frames: its row of `SET_UPS`, and that of the set-up that it changes."""
+    """A variation with one number of frames: its row of `SET_UPS`, and the row of the set-up that it changes."""
 
     variant: Row
     row: Row | None
@@ -67,20 +67,20 @@ class Varied(NamedTuple):
 
     @property
     def differs(self) -> bool:
-        """True where other holes are found."""
+        """True if other holes are found."""
         pair = self.row, self.other
         return len({(*row["found"], "", *row["undecided"]) for row in pair if row is not None}) > 1
 
 
 def _why(varied: Varied) -> str:
-    """Return the reason for a variation, and its settings where its name does not say them."""
+    """Return the reason for a variation, and its settings if its name does not state them."""
     variant = varied.variant
     settings = variant["settings"].strip("{}").replace('"', "").replace(": ", "=")
     return "\n".join(filter(None, (variant["reason"], "" if settings == variant["variant"] else variant["settings"])))
 
 
 def _side(label: str, side: str) -> Column:
-    """Return the column of `SET_UPS` called ``label``, of one side of a variation."""
+    """Return the column ``label`` of `SET_UPS` for one side of a variation."""
     (column,) = (one for one in SET_UPS.columns if one.label == label)
 
     def cell(varied: Varied) -> Cell:
@@ -94,11 +94,11 @@ VARIED = Table(
     "variations",
     "one row per variation and number of frames, beside the set-up that it changes",
     (
-        Column("", "variation", lambda one: in_words(one.variant["variant"])),
+        Column("", "variation", lambda row: in_words(row.variant["variant"])),
         Column("", "why", _why),
-        Column("", "changes", lambda one: in_words(one.variant["reference"] or "–")),
-        Column("", "frames", lambda one: "no trial of it finished" if one.row is None else one.row["frames"]),
-        Column("", "≠", lambda one: Cell("≠" if one.differs else "", "changed" if one.differs else "")),
+        Column("", "changes", lambda row: in_words(row.variant["reference"] or "–")),
+        Column("", "frames", lambda row: "no trial of it finished" if row.row is None else row.row["frames"]),
+        Column("", "≠", lambda row: Cell("≠" if row.differs else "", "changed" if row.differs else "")),
         *(
             _side(label, side)
             for label in ("found", "threshold (mm)", "surface noise (mm)")
@@ -112,8 +112,8 @@ VARIED = Table(
 
 
 def varied_section(tables: ResultTables, compared: pd.DataFrame, frames: Sequence[int] = (), of: str = "") -> Markup:
-    """The sensitivity study: each variation beside the set-up that it changes, else beside ``of``, with as many frames
-    or else the most. ``compared``: of `compare_set_ups`; ``frames``: those to show, none for all."""
+    """Return the sensitivity study: each variation beside the set-up that it changes (or else ``of``) with as many
+    frames (or else the most). ``compared`` comes from `compare_set_ups`; empty ``frames`` show all."""
     there: dict[str, list[Row]] = {}
     for row in records(compared):
         if not frames or row["frames"] in frames:
@@ -129,25 +129,25 @@ def varied_section(tables: ResultTables, compared: pd.DataFrame, frames: Sequenc
     if not rows:
         return Markup("")
     text = (
-        "Each row changes something in the one set-up that it names, and is compared with it; ≠: other holes are found."
+        "Each row changes a setting of the set-up that it names and is compared with it; ≠ marks other holes found."
         " A variation with fewer repeats and hole-free runs has a lower threshold."
     )
     grid = VARIED.grid(rows, heads={"changes": ""} if of else None)
-    return joined([heading("If facts were otherwise"), paragraph(text), grid.html()])
+    return joined([heading("If the facts were different"), paragraph(text), grid.html()])
 
 
 def claims_section(title: str, verdicts: Sequence[Verdict]) -> Markup:
-    """A heading and the table of claims; nothing without verdicts. Pages of other targets hold none of it."""
+    """Return a heading and the table of claims; empty without verdicts, as on pages of other targets."""
     if not verdicts:
         return Markup("")
     rows, keys = [vars(verdict) for verdict in verdicts], ("claim", "says", "verdict", "evidence")
-    criteria = fold("Criteria, fixed beforehand", CLAIMS.grid(rows, only=("claim", "criterion")).html())
+    criteria = fold("Criteria, fixed in advance", CLAIMS.grid(rows, only=("claim", "criterion")).html())
     return joined([heading(title), paragraph(RULES_NOTE), CLAIMS.grid(rows, only=keys).html(), criteria])
 
 
 def counted_verdicts(verdicts: Sequence[Verdict]) -> str:
     """Return ``Of 7 claims, 5 are borne out (C1, ...), 2 are undecided (...).``; empty without verdicts."""
-    named = {answer: [one.claim for one in verdicts if one.verdict == answer] for answer in MARKS}
+    named = {answer: [verdict.claim for verdict in verdicts if verdict.verdict == answer] for answer in MARKS}
     parts = [
         f"{len(names)} {'is' if len(names) == 1 else 'are'} {answer} ({', '.join(names)})"
         for answer, names in named.items()
@@ -157,17 +157,17 @@ def counted_verdicts(verdicts: Sequence[Verdict]) -> str:
 
 
 def rule_note(repeats: int, *more: str) -> Markup:
-    """State below the answer what counts as found, and what the intervals do not cover."""
+    """Return the note below the answer: what counts as found, and what the intervals do not cover."""
     draws = "The one repeat is one draw" if repeats == 1 else f"The repeats are {repeats} draws"
     text = (
-        f"{draws} of the noise before the same board in the same place with one unit of each camera: the intervals "
+        f"{draws} of the noise for the same board in the same place with one unit of each camera: the intervals "
         "hold for these set-ups, not for other boards, places or units."
     )
     return note(" ".join((found_rule(repeats), *more, text)))
 
 
 def left_out(runs: pd.DataFrame) -> str:
-    """State how many frames averaging left out as disturbed, over all runs; empty where it left out none."""
+    """State how many frames were left out of averages as disturbed, over all runs; empty if there were none."""
     out, used = int(runs["left_out"].sum()), int(runs["frames_used"].sum())
     return f"{out} of {out + used} frames were left out of an average as disturbed." if out else ""
 
@@ -188,7 +188,7 @@ SHOWN = ("set-up", "frames", "found", "from (mm)", "50 % size (mm)")
 
 
 def final_tables(tables: ResultTables, found: Summaries) -> list[str | Grid]:
-    """Return what a terminal shows at the end, by the kind of experiment."""
+    """Return what a terminal shows at the end, which depends on the kind of experiment."""
     if not tables.registrations.empty:
         return [ways_grid(found[SET_UPS])]
     if len(set_ups_of(tables)) > 1:
@@ -197,7 +197,7 @@ def final_tables(tables: ResultTables, found: Summaries) -> list[str | Grid]:
 
 
 def holes_grid(summary: pd.DataFrame, *, terminal: bool = False) -> Grid:
-    """Show the main set-up's detections of trials by hole and frames: with intervals on a page, sizes at a terminal."""
+    """Return the main set-up's share of detections by hole and frames, with intervals (page) or sizes (terminal)."""
     summary = summary[summary["variant"] == MAIN]
     frames = sorted(int(n) for n in summary["frames"].unique())
 
@@ -225,13 +225,13 @@ def holes_grid(summary: pd.DataFrame, *, terminal: bool = False) -> Grid:
 
 
 def set_ups_grid(compared: pd.DataFrame, *, terminal: bool = False) -> Grid:
-    """Return what each set-up finds with the least and the greatest number of frames."""
+    """Return the table of what each set-up finds with the least and the greatest number of frames."""
     rows = [row for row in records(compared) if row["frames"] in shown_frames(compared)]
     return SET_UPS.grid(rows, terminal=terminal, only=SHOWN)
 
 
 def ways_grid(compared: pd.DataFrame) -> Grid:
-    """Return holes found for each way of registering and merging (down) and number of views (across)."""
+    """Return the holes found for each method of registering and merging (down) and each number of views (across)."""
     rows = [row for row in records(compared) if not row["is_variation"]]
     frames, views = shown_frames(compared), sorted({row["views"] for row in rows})
     several = len({row["place"] for row in rows}) > 1
@@ -250,4 +250,4 @@ def ways_grid(compared: pd.DataFrame) -> Grid:
     heads = ("registration, merge", *(many(n, "view") for n in views))
     of_holes = f" of {max(row['holes'] for row in rows)}" if rows else ""
     numbers = " / ".join(f"N={n}" for n in frames)
-    return Grid.of(heads, cells, title=f"holes found{of_holes} with {numbers} frames a view (+: undecided)")
+    return Grid.of(heads, cells, title=f"holes found{of_holes} with {numbers} frames per view (+: undecided)")

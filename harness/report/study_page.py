@@ -27,19 +27,19 @@ MOST_CURVES = 6
 STYLES = ("-", "--", ":", "-.")
 LONGEST_NAME = 60
 ROW = 0.035
-"""Height of a set-up's row of hits above 1 and of misses below 0, in units of POD."""
+"""Height of a set-up's rows of hits above 1 and of misses below 0, in units of POD."""
 
 
 def with_room(set_ups: Sequence[SetUpResult]) -> list[SetUpResult]:
-    """Return those shown in figures: all, or `MOST_CURVES` evenly from the smallest limit to the largest, in order."""
-    by_limit = sorted(set_ups, key=lambda one: one.limit.a90_95.value)
+    """Return the set-ups for figures: all, or `MOST_CURVES` spread evenly from the smallest limit to the largest."""
+    by_limit = sorted(set_ups, key=lambda set_up: set_up.limit.a90_95.value)
     places = np.linspace(0, len(by_limit) - 1, min(MOST_CURVES, len(by_limit))).round().astype(int)
     chosen = {id(by_limit[place]) for place in places}
-    return [one for one in set_ups if id(one) in chosen]
+    return [set_up for set_up in set_ups if id(set_up) in chosen]
 
 
 def overlay_figure(limits: Sequence[SetUpLimit]) -> str:
-    """Draw `draw_overlay` for a page."""
+    """Return the figure of `draw_overlay` for a page."""
     names = [name_of(limit) for limit in limits]
     lines = sum(-(-len(name) // LONGEST_NAME) for name in names) / _names_across(names)
     sentences = " ".join(limit_sentence(limit) for limit in limits)
@@ -51,8 +51,8 @@ def _names_across(names: Sequence[str]) -> int:
 
 
 def draw_overlay(figure: Figure, limits: Sequence[SetUpLimit]) -> None:
-    """Draw the curves of all set-ups with their bands on one axis of sizes, a mark at each a90/95 within it, and each
-    inspection as a stroke at its true size: hits above 1, misses below 0, a row for each set-up."""
+    """Draw the curves and bands of all set-ups over a common axis of sizes, a mark at each a90/95 within it, and each
+    inspection as a stroke at its true size: hits above 1, misses below 0, with a row for each set-up."""
     axes, names = figure.subplots(), [name_of(limit) for limit in limits]
     axes.axhspan(1, 2, color=PALE, lw=0)
     axes.axhspan(-1, 0, color=PALE, lw=0)
@@ -78,8 +78,8 @@ def draw_overlay(figure: Figure, limits: Sequence[SetUpLimit]) -> None:
 
 
 def depth_limits_figure(results: Sequence[SetUpResult]) -> str:
-    """Draw the depth found 90 % of the time against diameter with its interval, a line for each set-up's surface."""
-    surfaces = [(one.limit, one.surface) for one in results if one.surface is not None][: len(COLOURS)]
+    """Draw the depth found 90 % of the time with its interval against diameter, with a line for each set-up."""
+    surfaces = [(result.limit, result.surface) for result in results if result.surface is not None][: len(COLOURS)]
     deepest = max(surface.depth_range_mm[1] for _, surface in surfaces)
     shallowest = min(surface.depth_range_mm[0] for _, surface in surfaces)
 
@@ -102,7 +102,7 @@ def depth_limits_figure(results: Sequence[SetUpResult]) -> str:
 
 
 def _span(limits: Sequence[SetUpLimit]) -> tuple[float, float]:
-    """Return the range of sizes inspected with 4 % of it on either side; of a single size a tenth of it."""
+    """Return the range of sizes inspected with a margin of 4 % of it, or a tenth of the size if there is only one."""
     sizes = np.concatenate([limit.record.inspected.size_mm for limit in limits])
     if not len(sizes):
         return 0.0, 1.0
@@ -112,7 +112,7 @@ def _span(limits: Sequence[SetUpLimit]) -> tuple[float, float]:
 
 
 def operating_figure(results: Sequence[SetUpResult]) -> str:
-    """Draw ROC, free-response curve and overlap of regions of each set-up."""
+    """Draw the ROC, the free-response curve and the overlap of regions of each set-up."""
 
     def draw(figure: Figure) -> None:
         left, middle, right = figure.subplots(1, 3)
@@ -121,7 +121,7 @@ def operating_figure(results: Sequence[SetUpResult]) -> str:
                 left.plot(roc.false, roc.true, color=colour, lw=1.5, label=f"{roc.area:.3f}")
                 left.plot(*roc.at, "o", color=colour, ms=5.5, mec="white", mew=0.8, zorder=5)
             if (curve := result.free_response) is not None:
-                # thresholds without a false call have no place on a logarithmic axis: they stand at its left end
+                # thresholds without false calls have no place on a logarithmic axis; they are drawn at its left end
                 least = 0.5 / curve.area_m2
                 calls = np.maximum(curve.false_calls_per_m2, least)
                 middle.fill_between(calls, curve.found_low, curve.found_high, color=colour, alpha=0.13, lw=0)
@@ -160,7 +160,7 @@ WIDTH_CHARACTERS = 60
 
 
 def axis_figure(axis: study.AxisGroup, name: str) -> str:
-    """a90 with its interval over boards and a90/95 for each value of the axis; an arrow for what lies far beyond."""
+    """Draw a90 with its interval over boards and a90/95 for each value of the axis; arrows mark sizes far beyond."""
     shown = list(axis.lines.items())[: len(COLOURS)]
     every = [limit for _, line in shown for limit in line.limits]
     top_mm = ROOM * max((limit.largest_mm for limit in every if limit.inspections), default=np.inf)
@@ -169,7 +169,7 @@ def axis_figure(axis: study.AxisGroup, name: str) -> str:
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
-        # intervals of several lines stand beside each other, moved by 2.5 % of the axis, less where places are close
+        # intervals of several lines are drawn side by side, 2.5 % of the axis apart, or less if places are close
         scale = np.log(places) if logarithmic else places
         nearest = float(np.diff(np.sort(scale)).min()) if len(scale) > 1 else 1.0
         step = min(0.025 * (float(np.ptp(scale)) or 1.0), 0.6 * nearest / len(shown))
@@ -192,7 +192,7 @@ def axis_figure(axis: study.AxisGroup, name: str) -> str:
             beyond |= bool(far.any())
         axes.plot([], [], "_", color=GREY, ms=11, mew=2.2, label="a90/95")
         if beyond:
-            axes.plot([], [], marker="^", ls="none", color=GREY, ms=6, label="goes on beyond")
+            axes.plot([], [], marker="^", ls="none", color=GREY, ms=6, label="continues beyond the axis")
         if np.isfinite(top_mm):
             axes.axhline(top_mm / ROOM, color=GREY, lw=1.0, ls=":", label="largest size inspected")
         for value, place in zip(axis.values, places, strict=True):
@@ -222,7 +222,7 @@ def axis_figure(axis: study.AxisGroup, name: str) -> str:
 
 
 def study_parts(result: StudyResult) -> list[str | Grid]:
-    """Return what a terminal shows of a study: warnings, limits, what to know beside them, the answer."""
+    """Return the parts of a study for a terminal: warnings, limits, notes on them, and the answer."""
     warnings = [f"warning: {text}" for text in study.threshold_warnings(result.limits)]
     notes = limit_notes(result.limits)
     grid = limits_grid(result.limits, terminal=True)
@@ -240,14 +240,14 @@ def study_html(
     inspected = [one.limit for one in shown if one.limit.inspections]
     curved = [one for one in shown if one.roc or one.free_response or one.pixels]
     figures = {name: axis_figure(group, name) for name, group in groups.items()}
-    if len({one.record.inspected.limit_of for one in inspected}) == 1:  # a depth is not drawn beside a diameter
+    if len({one.record.inspected.limit_of for one in inspected}) == 1:  # depths and diameters need separate axes
         figures["overlay"] = overlay_figure(inspected)
     figures |= {"depth-limits": depth_limits_figure(shown)} if any(one.surface for one in shown) else {}
     figures |= {"operating": operating_figure(curved)} if curved else {}
     named: list[tuple[str, str]] = []
     for limit in (one.limit for one in shown):
         record = limit.record
-        some = [one for one in examples if (one.variant, one.frames) == (record.variant, record.frames)]
+        some = [example for example in examples if (example.variant, example.frames) == (record.variant, record.frames)]
         if some:
             title_of, name = name_of(limit), f"examples-{len(named) + 1}"
             named.append((title_of, name))
@@ -260,8 +260,8 @@ def study_html(
         title=title,
         answer=unbroken(study_answer(limits)),
         conditions=result.conditions,
-        rule=f"Fixed beforehand: a damage is found {result.record.hit_rule}, and no finding counts twice. Repeats of "
-        "the noise on one board are not additional targets.",
+        rule=f"Fixed in advance: a damage is found {result.record.hit_rule}, and no finding counts twice. Repeats of "
+        "the noise on a board are not additional targets.",
         limits=limits_grid(limits).html() if limits else None,
         limit_notes=[unbroken(note) for note in limit_notes(limits)],
         set_ups=len(limits),
@@ -296,21 +296,21 @@ def study_html(
 
 def _axis_caption(group: study.AxisGroup) -> str:
     caption = (
-        "The size found 90 % of the time with its 95 % interval over boards; dash: a90/95. What lies far beyond the "
-        "largest size inspected (dotted) is an arrow."
+        "The size found 90 % of the time with its 95 % interval over boards. A dash is a90/95. An arrow marks a value "
+        "far beyond the largest size inspected (dotted)."
     )
     if len(group.lines) > len(COLOURS):
-        caption += f" The first {len(COLOURS)} of {len(group.lines)} lines; the table goes on."
+        caption += f" The first {len(COLOURS)} of {len(group.lines)} lines are drawn; the table holds all."
     return caption if group.numeric else f"{caption} The values have no order."
 
 
 def _surface_notes(result: StudyResult) -> list[str]:
-    """Return reasons why there is no surface over diameter and depth, or what to know beside it, with their set-ups."""
+    """Return the reasons why there is no surface over diameter and depth, or notes on it, with their set-ups."""
     reasons: dict[str, list[str]] = {}
-    for one in result.set_ups:
-        why = f"No surface: {one.surface_why}" if one.surface is None else one.surface.note
+    for set_up in result.set_ups:
+        why = f"No surface: {set_up.surface_why}" if set_up.surface is None else set_up.surface.note
         if why:
-            reasons.setdefault(why, []).append(name_of(one.limit))
+            reasons.setdefault(why, []).append(name_of(set_up.limit))
     every = len(result.set_ups)
     notes = {why: "" if len(names) == every else f" ({', '.join(names)})" for why, names in reasons.items()}
     return [f"{why}{where}." for why, where in notes.items()]

@@ -1,4 +1,4 @@
-"""Summaries of an experiment that is not a study, computed once: files hold them, pages and the terminal show them."""
+"""Summaries of an experiment that is not a study, computed once for files, pages and the terminal."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from harness.vocabulary.provenance import RESULTS_VERSION
 
 Summaries = Mapping[Table, pd.DataFrame]
 LISTS = ("found", "undecided", "reasons")
-"""Columns whose values are lists until they are written."""
+"""Columns whose values are lists in memory and text in files."""
 
 
 def is_thesis(facts: Mapping[str, Any]) -> bool:
-    """Return whether the target is the thesis' own, whose claims are scored; ``facts``: the resolved experiment."""
+    """Return whether the resolved experiment ``facts`` has the target of the thesis, whose claims are scored."""
     return (facts.get("source", {}).get("target") or {}).get("name") == "thesis"
 
 
 def summaries(tables: trials.ResultTables, examples: Sequence[Any] = (), *, with_claims: bool = True) -> Summaries:
-    """Return all tables that a page shows. ``examples``: pictures for claims; ``with_claims``: claims, posterior."""
+    """Return all tables for a page; claims, which use the pictures ``examples``, and posterior only ``with_claims``."""
     paths, set_ups = [str(path) for path in tables.axes["path"]], set_ups_of(tables)
     summary, everything = summarise_holes(tables.holes, paths), [str(name) for name in tables.variants["variant"]]
     found = {trials.SUMMARY: summary, trials.FALSE_CALLS: false_calls(tables.runs)}
@@ -56,7 +56,7 @@ def summaries(tables: trials.ResultTables, examples: Sequence[Any] = (), *, with
 
 
 def of_set_ups(rows: pd.DataFrame, tables: trials.ResultTables) -> pd.DataFrame:
-    """Select the rows of the experiment's set-ups, variations left out."""
+    """Select the rows of the experiment's set-ups, without variations."""
     return rows[rows["variant"].isin(set_ups_of(tables))] if len(rows) else rows
 
 
@@ -66,7 +66,7 @@ def verdicts_of(found: Summaries) -> list[Verdict]:
 
 
 def as_files(found: Summaries) -> dict[Table, pd.DataFrame]:
-    """Return the tables as files hold them, with lists as text."""
+    """Return the tables as files hold them, with lists converted to text."""
     written = {
         table: frame.assign(**{name: frame[name].map("; ".join) for name in LISTS if name in frame})
         for table, frame in found.items()

@@ -1,4 +1,4 @@
-"""A cloud that can be turned in the browser: one offline file with the findings and, where known, the truth."""
+"""A cloud that can be turned in the browser: an offline file with the findings and, if known, the true damage."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from harness.vocabulary.files import write_text
 
 MOST_POINTS = 150_000
 VIEW_COLOURS = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE, "#F0E442", "#332288", "#882255", "#44AA99")
-"""Okabe and Ito's colours, then four of Tol's muted ones; further views begin anew."""
+"""Okabe and Ito's colours, then four of Tol's muted colours; further views repeat them from the start."""
 SEVERAL_CODE = 255
 RESIDUAL_STEP_MM = 0.01
 NO_RESIDUAL = -32768
@@ -24,13 +24,13 @@ KINDS: dict[Kind, tuple[str, str]] = {
     "found": ("damage, found", "#00a651"),
     "missed": ("damage, missed", ORANGE),
     "finding": ("finding", DAMAGE),
-    "false call": ("finding that is no damage", "#e0201b"),
+    "false call": ("finding that matches no damage", "#e0201b"),
 }
 
 
 @dataclass(frozen=True)
 class Circle3d:
-    """A damage or a finding (by the thesis' measure): ``centre_mm`` (3,), unit ``normal`` (3,), in its frame."""
+    """A damage or a finding (by the thesis' measure); ``centre_mm`` (3,), unit ``normal`` (3,) in the scene's frame."""
 
     centre_mm: np.ndarray
     normal: np.ndarray
@@ -41,10 +41,10 @@ class Circle3d:
 
 @dataclass(frozen=True)
 class Scene3d:
-    """The cloud that is shown. ``points_mm`` (n, 3); ``rgb`` (n, 3) uint8; ``residual_mm`` (n,), NaN where not judged;
-    ``view_of`` (n,) index into ``view_names``, -1 of several; ``detected`` (n,) bool. ``frame``: "board" (x right, y
-    up, z to the viewer) or "camera" (x right, y down, z away). ``facts``: (name, value) beside the picture. ``rgb``
-    is of what ``shown`` says, explained by ``key``: (words, colour)."""
+    """The cloud to show. ``points_mm`` (n, 3); ``rgb`` (n, 3) uint8; ``residual_mm`` (n,), NaN if not judged;
+    ``view_of`` (n,), an index into ``view_names`` or -1 for several; ``detected`` (n,) bool. ``frame`` is "board" (x
+    right, y up, z to the viewer) or "camera" (x right, y down, z away). ``facts`` are (name, value) beside the picture.
+    ``shown`` says what ``rgb`` represents; ``key`` explains its colours as (words, colour)."""
 
     points_mm: np.ndarray
     frame: Literal["board", "camera"]
@@ -60,29 +60,29 @@ class Scene3d:
 
 
 def write_view3d(path: Path, scene: Scene3d, title: str) -> Path:
-    """Write one self-contained page that shows the cloud (by WebGL 1) and return its path; see `MOST_POINTS`. Raises
-    UserError where the file cannot be written, ValueError where no point is finite."""
+    """Write a self-contained page that shows at most `MOST_POINTS` of the cloud (WebGL 1) and return its path. Raises
+    UserError if the file cannot be written, ValueError if no point is finite."""
     write_text(Path(path), view3d_html(scene, title))
     return Path(path)
 
 
 def view3d_html(scene: Scene3d, title: str) -> str:
-    """The page as text; see `write_view3d`."""
+    """Return the page as text; see `write_view3d`."""
     there = {circle.kind for circle in scene.circles}
     kinds = [(kind, *words) for kind, words in KINDS.items() if kind in there]
     return template("view3d.html").render(title=title, facts=scene.facts, data=packed(scene), kinds=kinds)
 
 
 def packed(scene: Scene3d) -> dict[str, Any]:
-    """The cloud as the page reads it: plain numbers, and arrays as base64 of little-endian numbers. Places are whole
-    numbers of 16 bits within the bounding box: steps of 0.01 mm over 0.6 m."""
+    """Return the cloud as the page reads it: plain numbers, and arrays as base64 of little-endian numbers. Places are
+    16-bit integers within the bounding box, which gives steps of 0.01 mm over 0.6 m."""
     kept = _kept(scene)
-    # The page's frame: x right, y up, z to the viewer. From a camera's that is half a turn about x.
+    # The page's frame has x right, y up, z to the viewer: half a turn about x from a camera's frame.
     turn = np.array([1.0, 1.0, 1.0] if scene.frame == "board" else [1.0, -1.0, -1.0])
     points = scene.points_mm[kept].astype(float) * turn
     low, high = points.min(axis=0), points.max(axis=0)
     step = np.maximum((high - low) / 65535, 1e-9)
-    # mean distance of points across the line of sight if they were spread evenly over their extent
+    # mean distance between points across the line of sight, if they were spread evenly over their extent
     span = high[:2] - low[:2]
     pitch = float(np.sqrt(max(span[0] * span[1], 1e-6) / len(points)))
     residual = view = None

@@ -1,1 +1,1 @@
-"""The scorecard: measurements of simulated cameras beside published measurements of the real ones."""
+"""The scorecard: measurements of simulated cameras compared with published measurements of real cameras."""

@@ -1,8 +1,8 @@
-"""The bench: a camera before a scene of known geometry, and the analysis of depth images: planes, noise, depth steps.
+"""Places a camera in front of a scene of known geometry and analyses its depth images: planes, noise, depth steps.
 
 A plane z = d + sx x + sy y is exactly linear in 1/z over the rays' slopes: 1/z = (1 - sx X - sy Y) / d. A stack is
-``z_m`` (n, h, w) of a static scene, NaN where a frame has no range; ``where`` (h, w) bool names the pixels that count:
-those of it that at least half of the frames, and at least two, give a range."""
+``z_m`` (n, h, w) of a static scene, NaN where a frame has no range. ``where`` (h, w) bool selects pixels; of these, the
+pixels count that have a range in at least half of the frames and in at least two."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from scenes.sensor.source import SimulatedUnit
 
 SEED = 1
 NOISE = NO_EFFECTS.model_copy(update={"noise": True, "ambient": True, "saturation": True})
-"""Noise of each pixel, to which the calibration point refers, without traits of a unit or of a frame."""
+"""Effects of each pixel's noise, to which the calibration point refers, without effects of a unit or of a frame."""
 STEADY = EffectsConfig().model_copy(update={"frame_jumps": False})
 PATTERNED = NOISE.model_copy(update={"fixed_pattern": True})
 GROUPS = 10
@@ -32,7 +32,7 @@ GROUPS = 10
 
 @dataclass(frozen=True)
 class Effort:
-    """Numbers of frames of each kind of measurement, and of units on which a unit's error is judged."""
+    """Numbers of frames for each kind of measurement, and of units for measurements of a unit's error."""
 
     noise_frames: int
     few_frames: int
@@ -45,18 +45,18 @@ FULL = Effort(noise_frames=80, few_frames=12, whole_frames=400, units=10)
 
 @dataclass(frozen=True)
 class Bench:
-    """One camera and the effort spent on it."""
+    """A camera and the effort of its measurements."""
 
     camera_name: str
     effort: Effort
 
     @property
     def camera(self) -> AnyCamera:
-        """The camera of the file."""
+        """The camera of the camera file."""
         return load_camera(self.camera_name)
 
     def patch(self, height: int, width: int) -> Region:
-        """Pixels about the optical axis, with the margin that the camera's own filter needs, within the sensor."""
+        """Return pixels about the optical axis with the margin for the camera's own filter, clipped to the sensor."""
         lens = self.camera.nominal_lens
         row, column = round(lens.cy) - height // 2, round(lens.cx) - width // 2
         tight = Region(row, row + height, column, column + width)
@@ -65,7 +65,7 @@ class Bench:
     def taken(
         self, view: NoiseFreeView, effects: EffectsConfig, frames: int, *labels: str | int, **settings: Any
     ) -> FrameStack:
-        """Frames of a unit of the camera with ``settings`` of `CameraConfig` before a view; ``labels`` of noise."""
+        """Return frames of a unit with ``settings`` of `CameraConfig` and a view; ``labels`` select the noise."""
         config = CameraConfig(name=self.camera_name, effects=effects, **settings)
         unit = SimulatedUnit(self.camera, config, view)
         cut = unit.cut
@@ -87,7 +87,7 @@ class FrameStack:
 
 @dataclass(frozen=True)
 class Reading:
-    """A value and its two-sided 95 % interval (unknown where nothing repeats); ``nan`` where there are no data."""
+    """A value and its two-sided 95 % interval (unknown without repeats); NaN without data."""
 
     value: float
     interval: Interval = UNKNOWN
@@ -97,8 +97,8 @@ NOTHING = Reading(float("nan"))
 
 
 def jackknifed(frames: np.ndarray, statistic: Callable[[np.ndarray], float], groups: int = GROUPS) -> Reading:
-    """Return ``statistic`` of ``frames`` (n, ...) with Student's interval from the delete-a-group jackknife over
-    frames, which must be independent; unknown below 4 frames. Source: Efron and Tibshirani 1993, chapter 11."""
+    """Return ``statistic`` of ``frames`` (n, ...), which must be independent, with Student's interval from the
+    delete-a-group jackknife over frames; unknown below 4 frames. Source: Efron and Tibshirani 1993, chapter 11."""
     value, g = float(statistic(frames)), min(groups, len(frames) // 2)
     if g < 2 or not np.isfinite(value):
         return Reading(value)
@@ -109,7 +109,7 @@ def jackknifed(frames: np.ndarray, statistic: Callable[[np.ndarray], float], gro
 
 
 def mean_of(values: ArrayLike) -> Reading:
-    """Return the mean of independent values with Student's interval; values that are NaN are left out."""
+    """Return the mean of independent values with Student's interval; NaN values are left out."""
     known = np.asarray(values, float)
     known = known[np.isfinite(known)]
     if known.size < 2:
@@ -119,29 +119,29 @@ def mean_of(values: ArrayLike) -> Reading:
 
 
 def share_of(hits: np.ndarray, pixels_each: float) -> Reading:
-    """Return the share of true ``hits`` with Wilson's interval, ``pixels_each`` neighbours counting as one."""
+    """Return the share of true ``hits`` with Wilson's interval; ``pixels_each`` neighbours count as a single pixel."""
     trials = hits.size / pixels_each
     low, high = wilson(hits.mean() * trials, trials)
     return Reading(float(hits.mean()), Interval(float(low), float(high)))
 
 
 BISQUARE = 4.685
-"""Tukey's constant: 95 % efficient on normal errors."""
+"""Tukey's constant, which gives an efficiency of 95 % for normal errors."""
 CANDIDATES, TRIPLE_PX, SCREENED = 400, 40, 4000
-"""Planes tried in each round, by triples of points so near to each other, each judged on so many pixels."""
+"""Number of planes tried in each round, distance between the three points of each, and pixels that judge it."""
 GROWN = 2.0
 MOST_PLANES = 6
 
 
 def robust_inverse_fit(basis: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return coefficients c with 1/z = basis c, and which points count, by Tukey's bisquare on residuals of z."""
+    """Return coefficients c of 1/z = basis c, and which points count, by Tukey's bisquare on residuals of z."""
     weight = np.ones_like(z)
     for _ in range(15):
         # an error of z is z^2 times an error of 1/z
         row = weight * z**4
         coefficients = np.linalg.lstsq(basis.T @ (basis * row[:, None]), basis.T @ (row / z), rcond=None)[0]
         residual = z - 1 / (basis @ coefficients)
-        # on exact data the median is 0: a micrometre counts as exact
+        # the median is 0 for exact data; a micrometre counts as exact
         u = residual / (BISQUARE * max(1.4826 * float(np.median(np.abs(residual))), 1e-6))
         weight = np.where(np.abs(u) < 1, (1 - u**2) ** 2, 0.0)
     return coefficients, weight > 0
@@ -160,9 +160,9 @@ def fit_plane(z_m: np.ndarray, slopes: np.ndarray) -> Plane:
 def find_planes(
     z_m: np.ndarray, slopes: np.ndarray, tolerance_m: float, least_px: int
 ) -> list[tuple[Plane, np.ndarray]]:
-    """Return the planes of a depth image with the connected pixels (h, w) bool on each, largest first, by RANSAC.
-    ``z_m`` (h, w), NaN where unknown. Points within ``tolerance_m`` of a plane belong to it, and connected points up to
-    `GROWN` times as far. Planes of fewer than ``least_px`` pixels are left out. Equal images give equal planes."""
+    """Return the planes of a depth image with the connected pixels (h, w) bool of each, largest first, by RANSAC.
+    ``z_m`` (h, w) is NaN where unknown. Points within ``tolerance_m`` of a plane belong to it, and connected points up
+    to `GROWN` times as far. Planes with fewer than ``least_px`` pixels are left out. Equal images give equal planes."""
     basis = _with_ones(slopes)
     left = np.isfinite(z_m) & np.isfinite(slopes).all(axis=-1)
     found: list[tuple[Plane, np.ndarray]] = []
@@ -186,7 +186,7 @@ def find_planes(
 def _best_candidate(
     z_m: np.ndarray, basis: np.ndarray, left: np.ndarray, tolerance_m: float, number: int
 ) -> np.ndarray:
-    """Return (3,) coefficients of 1/z of the plane through three near points with most of the screened pixels."""
+    """Return the coefficients (3,) of 1/z of the plane through three close points that has most screened pixels."""
     rng = random_stream(0, "planes", number)
     points = np.argwhere(left)
     shift = rng.integers(-TRIPLE_PX, TRIPLE_PX + 1, (CANDIDATES, 3, 2))
@@ -215,18 +215,18 @@ SURFACE_DEGREE = 5
 
 
 def often_valid(z_m: np.ndarray, where: np.ndarray | bool) -> np.ndarray:
-    """Return (h, w) bool: the pixels of ``where`` that count."""
+    """Return the pixels of ``where`` that count, (h, w) bool."""
     return where & (np.isfinite(z_m).sum(axis=0) >= max(2, len(z_m) / 2))
 
 
 def temporal_sigma_m(z_m: np.ndarray, where: np.ndarray | bool = True) -> float:
-    """Return the standard deviation over frames (n - 1), rms over the pixels that count; NaN where none does."""
+    """Return the standard deviation over frames (n - 1), as an rms over the pixels that count; NaN if none does."""
     use = often_valid(z_m, where)
     return float(np.sqrt(np.nanvar(z_m[:, use], axis=0, ddof=1).mean())) if use.any() else float("nan")
 
 
 def deviations(z_m: np.ndarray, where: np.ndarray | bool, keep_jitter: bool) -> np.ndarray:
-    """Return deviations (n, h, w) from pixel means (less each frame's unless kept), 0 at pixels that do not count."""
+    """Return deviations (n, h, w) from pixel means (minus each frame's mean unless kept), 0 for other pixels."""
     use = often_valid(z_m, where)
     d = np.zeros_like(z_m)
     d[:, use] = z_m[:, use] - np.nanmean(z_m[:, use], axis=0)
@@ -236,7 +236,7 @@ def deviations(z_m: np.ndarray, where: np.ndarray | bool, keep_jitter: bool) -> 
 
 
 def covariance(d: np.ndarray, where: np.ndarray, lag_x: int, lag_y: int) -> tuple[float, float]:
-    """Return (mean product, mean square) of pairs of pixels (lag_x, lag_y) apart, both in ``where``; NaN for none."""
+    """Return (mean product, mean square) over pairs of pixels (lag_x, lag_y) apart in ``where``; NaN without pairs."""
     h, w = where.shape
     first, second = (slice(h - lag_y), slice(w - lag_x)), (slice(lag_y, h), slice(lag_x, w))
     both = where[first] & where[second]
@@ -248,27 +248,27 @@ def covariance(d: np.ndarray, where: np.ndarray, lag_x: int, lag_y: int) -> tupl
 
 
 def correlation(d: np.ndarray, where: np.ndarray, lag_x: int, lag_y: int) -> float:
-    """Return the correlation of deviations of pixels (lag_x, lag_y) apart; NaN where there is none."""
+    """Return the correlation of deviations of pixels (lag_x, lag_y) apart; NaN if there is none."""
     product, square = covariance(d, where, lag_x, lag_y)
     return product / square if square > 0 else float("nan")
 
 
 def correlation_at(z_m: np.ndarray, where: np.ndarray | bool, lag_x: int, lag_y: int) -> float:
-    """Return the correlation of the temporal noise of pixels (lag_x, lag_y) apart, with what a frame shares."""
+    """Return the correlation of temporal noise of pixels (lag_x, lag_y) apart, including whole-frame displacement."""
     return correlation(deviations(z_m, where, keep_jitter=True), often_valid(z_m, where), lag_x, lag_y)
 
 
 @dataclass(frozen=True)
 class FixedPattern:
-    """The error that a wall's average shows beyond a smooth surface and noise: ``std_m``, ``covariance_m2`` (0..20)."""
+    """The error of a wall's average beyond a smooth surface and noise: ``std_m``, ``covariance_m2`` at lags 0..20."""
 
     std_m: float
     covariance_m2: np.ndarray
 
 
 def fixed_pattern(z_m: np.ndarray, where: np.ndarray, slopes: np.ndarray, lags: int = 20) -> FixedPattern:
-    """Return the fixed pattern of a wall: average, minus a robust surface of degree 5 in 1/z, minus left temporal
-    noise. ``z_m`` (n, h, w), every pixel of ``where`` valid in every frame; ``slopes`` (h, w, 2)."""
+    """Return the fixed pattern of a wall: the average minus a robust surface of degree 5 in 1/z, without the remaining
+    temporal noise. ``z_m`` (n, h, w) must be valid in every frame at every pixel of ``where``; ``slopes`` (h, w, 2)."""
     average = z_m.mean(axis=0)[where]
     # Legendre products up to total degree 5 over the slopes, scaled to -1..1
     middle, half = slopes[where].mean(axis=0), np.ptp(slopes[where], axis=0) / 2
@@ -285,7 +285,7 @@ def fixed_pattern(z_m: np.ndarray, where: np.ndarray, slopes: np.ndarray, lags: 
     noise = deviations(z_m, good, keep_jitter=False)
 
     def left_at(lag_x: int, lag_y: int) -> float:
-        # deviations from a mean of n frames have (n - 1)/n of the variance, the mean 1/n: together 1/(n - 1)
+        # deviations from a mean of n frames have (n - 1)/n of the variance and the mean has 1/n: a ratio of 1/(n - 1)
         of_noise = covariance(noise, good, lag_x, lag_y)[0] / (len(z_m) - 1)
         return covariance(residual[None], good, lag_x, lag_y)[0] - of_noise
 
@@ -295,7 +295,7 @@ def fixed_pattern(z_m: np.ndarray, where: np.ndarray, slopes: np.ndarray, lags: 
 
 TOLERANCE_SIGMAS = 4.0
 TOLERANCE_STEP = 0.1
-"""A pixel is on a surface within four deviations of its noise and a tenth of the step of it."""
+"""A pixel is on a surface if it lies within four standard deviations of noise plus a tenth of the step."""
 LEAST_TOLERANCE_M = 0.5 * MM
 MOST_OF_STEP = 0.45
 FLAT_PX = 8.0
@@ -303,8 +303,8 @@ FLAT_PX = 8.0
 
 
 def on_surface_tolerance_m(sigma_m: float, step_m: float) -> float:
-    """Return the distance from a surface within which a range counts as this surface's; NaN where noise hides the
-    step: a tolerance of more than `MOST_OF_STEP` of it would join the surfaces."""
+    """Return the distance within which a range belongs to a surface; NaN if noise hides the step, since a tolerance of
+    more than `MOST_OF_STEP` of the step would join the surfaces."""
     noise = TOLERANCE_SIGMAS * sigma_m if np.isfinite(sigma_m) else 0.0
     tolerance_m = max(noise, TOLERANCE_STEP * step_m, LEAST_TOLERANCE_M)
     return tolerance_m if tolerance_m <= MOST_OF_STEP * step_m else float("nan")
@@ -319,10 +319,10 @@ def edge_widths(
     reach_px: float,
     across: int,
 ) -> dict[str, np.ndarray]:
-    """Widths (n,) in pixels of what frames (n, h, w) show within ``reach_px`` of an edge that lines of pixels along the
-    axis ``across`` cross: a ``gap`` without a range, ``flying`` pixels with a range off both surfaces, and the share of
-    lines ``with_flying`` ones. All but the gap are NaN where noise hides the step. ``front_z_m``, ``back_z_m`` (h, w):
-    z along each pixel's ray. ``from_edge_px`` (h, w): below 0 on the front, NaN for pixels that do not count."""
+    """Return widths (n,) in pixels within ``reach_px`` of an edge that lines of pixels along the axis ``across`` cross,
+    for each of the frames (n, h, w): the ``gap`` without a range, the ``flying`` pixels with a range off both surfaces,
+    and the share of lines ``with_flying`` pixels. All but the gap are NaN if noise hides the step. ``front_z_m`` and
+    ``back_z_m`` (h, w) are z along each ray; ``from_edge_px`` (h, w) is negative in front, NaN for excluded pixels."""
     near = np.abs(from_edge_px) <= reach_px
     z = z_m[:, near]
     on_surface = np.any([np.abs(z - surface[near]) <= tolerance_m for surface in (front_z_m, back_z_m)], axis=0)

@@ -1,4 +1,4 @@
-"""Compares a declared drilled board with a real capture of it: noise, fixed pattern, depth of the holes, detections.
+"""Compares a declared drilled board with a real capture of it: noise, fixed pattern, hole depths and detections.
 
 Every set-up of an experiment is simulated and, if the capture was aligned to the colour camera, resampled to its
 pixels. The same analysis is applied to both around each declared hole: a quadratic surface is fitted to a ring around
@@ -45,30 +45,30 @@ if TYPE_CHECKING:
     from detectors.recordings import Recording
 
 PEAK_MM, RING_MM = 6.0, (6.5, 13.5)
-"""Distances from a hole's centre on the board: the largest for its peak, and those of the ring of face around it."""
+"""Distances from a hole's centre on the board: the largest for its peak, and the radii of the ring around it."""
 OFF_RING = 4.0
-"""Pixels of a ring farther off, in robust standard deviations, are something else, such as a tag."""
+"""Robust standard deviations beyond which a ring's pixel is excluded, since it belongs to an object such as a tag."""
 PATTERN_PX, ANGLES_DEG = (3, 6, 12), (0, 20, 35, 60)
 CLOSE = 0.3
 """Largest difference of a ratio from 1 that counts as agreement."""
 HOW = (
-    "The board is declared, its view is rendered with light between its surfaces, the camera is simulated with its "
-    "file unchanged, and the frames are resampled to the capture's pixels. The same analysis is applied to both: rings "
-    "of 6.5 to 13.5 mm around the holes, each minus a quadratic surface; a hole's peak is the largest deviation within "
-    "6 mm of its centre. No parameter is fitted. Objects on the real board, its relief, and the maker's treatment of "
-    "pixels between two surfaces are not simulated. Detectors see whole images, with the same threshold for both."
+    "The board is declared, its view is rendered with light between its surfaces, the camera is simulated from its "
+    "unchanged file, and the frames are resampled to the capture's pixels. The same analysis is applied to both: a "
+    "quadratic surface is fitted to a ring of 6.5 to 13.5 mm around each hole, and the hole's peak is the largest "
+    "deviation from it within 6 mm of the centre. No other parameter is fitted. Not simulated: objects on the board, "
+    "its relief, and the maker's treatment of pixels between surfaces. Detectors see whole images, at one threshold."
 )
 CAPTION = (
     "Peak of each hole behind the face around it. Means over holes have Student's 95 % intervals; temporal deviations "
     "have those of a jackknife over frames."
 )
 Readings = dict[tuple[str, str, str], tuple[Reading, int]]
-"""Readings with their number of pixels or holes, by quantity, condition and unit."""
+"""Readings with their numbers of pixels or holes, by quantity, condition and unit."""
 
 
 @dataclass(frozen=True)
 class Image:
-    """The pixels on which board and capture are compared: their lens, and the board's and depth camera's frames."""
+    """The pixels on which board and capture are compared: their lens, and the frames of board and depth camera."""
 
     lens: Lens
     T_image_board: np.ndarray
@@ -116,8 +116,8 @@ def image_of(target: TargetConfig, camera: AnyCamera, lens: Lens | None) -> Imag
 def measured(
     z_m: np.ndarray, image: Image, target: TargetConfig, config: ExperimentConfig, detectors: dict[str, dict[str, Any]]
 ) -> tuple[Readings, np.ndarray]:
-    """Measure frames (n, h, w) on the image's pixels; ``detectors``: settings by name, at the experiment's threshold.
-    Returns readings and holes' peaks in mm (n,), NaN where not all in view. Raises UserError if none is in view."""
+    """Measure frames (n, h, w) on the image's pixels; ``detectors`` maps names to settings. Returns readings and the
+    holes' peaks in mm (n,), NaN for holes that are not entirely in view. Raises UserError if no hole is in view."""
     cloud, noises = _cloud(z_m, image), []
     centres, (height, width) = np.array([hole.centre_mm for hole in target.holes]), image.lens.whole.shape
     peaks = np.full(len(centres), np.nan)
@@ -143,7 +143,7 @@ def measured(
             whole = ndimage.uniform_filter(ring.astype(float), size) > 1 - 1e-6
             found.append(ndimage.uniform_filter(np.where(ring, residual_mm, 0.0), size)[whole])
     if not noises:
-        raise UserError("no hole of the board is in view with the face around it", fix="check the declared pose")
+        raise UserError("no hole is in view together with the face around it", fix="check the declared pose")
     flat, seen, angles = np.concatenate(noises, axis=1)[:, None], np.isfinite(peaks), _angles_deg(target)
     noise = jackknifed(flat, lambda z: temporal_sigma_m(z) / MM)
     readings: Readings = {("temporal deviation", "on the face", "mm"): (noise, flat.shape[2])}
@@ -184,7 +184,7 @@ def _cloud(z_m: np.ndarray, image: Image) -> Cloud:
 
 def run_board(options: argparse.Namespace, recording: Recording | None, command: str) -> int:
     """Compare and print; write capture.csv, capture.html and provenance.json. Returns 0. Raises UserError if the
-    experiment declares no board in front of a simulated camera, or the capture cannot be compared with it."""
+    experiment declares no board in front of a simulated camera, or if the capture cannot be compared with it."""
     experiment = load_experiment(options.board)
     points = list({point.frames_key: point for point in experiment.points}.values())
     detectors = {point.config.detector.name: point.config.detector.settings for point in experiment.points}
@@ -241,7 +241,7 @@ def _simulated(point: Point, image: Image, frames: int, options: argparse.Namesp
 
 
 def _answer(rows: list[Beside]) -> str:
-    """Return a sentence that names the set-up closest to the capture, and its figures that differ."""
+    """Return a sentence that names the set-up closest to the capture and its figures that differ."""
     ratios: dict[str, dict[str, float]] = {}
     for row in rows:
         if row.measured.value > 0 and np.isfinite(row.simulated.value):

@@ -1,7 +1,7 @@
-"""Published figures of cameras (measured or specified), the simulated values, and the comparison.
+"""Published figures of cameras (measured or specified), the simulated values, and their comparison.
 
-The file of figures is YAML; adding an entry is all that a further figure needs. All problems of a file are reported
-together, each with its place. A figure that fails has its reason in the file; any other must pass."""
+The file of figures is YAML; a new figure needs only an entry there. All problems of a file are reported together, each
+with its place. The file states a reason for each figure that fails; all others must pass."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from scenes.sensor.camera import camera_names
 
 FIGURES_FILE = Path(__file__).with_name("figures.yaml")
 NEAR = 0.25
-"""A figure of reality passes within this share of a published value; a published bound must hold."""
+"""A figure of a real camera passes within this share of a published value; a published bound must hold."""
 PROGRESS_EVERY_S = 10.0
 Request = tuple[str, str, Config]
 """The camera, the quantity and its conditions."""
@@ -45,7 +45,7 @@ class Published(Config):
 
     value: float | None = Field(None, description="a value; needs a tolerance")
     tolerance: Annotated[float, Field(ge=0.0)] | None = Field(
-        None, description="how far the simulated value may lie from `value`, or beyond a bound (then 0 if left out)"
+        None, description="largest difference from `value`, or excess over a bound (0 if left out)"
     )
     above: float | None = Field(None, description="a lower bound")
     below: float | None = Field(None, description="an upper bound")
@@ -53,7 +53,7 @@ class Published(Config):
     @model_validator(mode="after")
     def _has_one_form(self) -> Self:
         if (self.value is None) == (self.above is None and self.below is None):
-            raise ValueError("either a value says what was published, or one or two bounds (above, below)")
+            raise ValueError("give either `value`, or one or both of the bounds `above` and `below`")
         if self.value is not None and self.tolerance is None:
             raise ValueError("a value needs a tolerance")
         if self.ends[0] > self.ends[1]:
@@ -62,17 +62,17 @@ class Published(Config):
 
     @property
     def ends(self) -> tuple[float, float]:
-        """The lowest and highest value that agree with what was published; infinite where there is no bound."""
+        """The lowest and highest value that agree with the publication; infinite if there is no bound."""
         low, high = (self.above, self.below) if self.value is None else (self.value, self.value)
         return (-float("inf") if low is None else low), (float("inf") if high is None else high)
 
     def limits(self, near: float, tolerance: float = 0.0) -> tuple[float, float]:
-        """Lowest and highest value that pass: ``tolerance`` beyond the ends, or the share ``near`` of it if more."""
+        """Return the lowest and highest value that pass: ``tolerance`` beyond the ends, or a share ``near`` if more."""
         slack = max(tolerance, near * abs(self.value or 0.0))
         return self.ends[0] - slack, self.ends[1] + slack
 
     def in_words(self) -> str:
-        """Text such as ``1.42 ± 0.05``, ``below 17`` or ``0.15 to 0.35``."""
+        """Return a text such as ``1.42 ± 0.05``, ``below 17`` or ``0.15 to 0.35``."""
         if self.value is not None:
             return f"{self.value:g} ± {self.tolerance:g}"
         ends = (("above", self.above), ("below", self.below))
@@ -81,9 +81,9 @@ class Published(Config):
 
 
 class Figure(Config):
-    """One published figure as the file holds it; ``calibration``: the camera's file was, or may be, fitted to it.
-    ``kind``: a figure of real cameras, or a check of the code against the arithmetic of a stated filter or limit.
-    ``fails``: why it is known to fail; without it a failure counts as a regression."""
+    """A published figure in the file. ``calibration``: the camera file was, or may have been, fitted to it. ``kind``: a
+    figure of real cameras, or a check of the code against the arithmetic of a stated filter or limit. ``fails``: why it
+    is known to fail; a failure without a reason counts as a regression."""
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9_]+$", description="small letters, digits and _; once in the file")]
     camera: str
@@ -99,17 +99,17 @@ class Figure(Config):
 
     @property
     def limits(self) -> tuple[float, float]:
-        """The lowest and highest simulated value that passes."""
+        """The lowest and highest simulated value that pass."""
         return self.published.limits(NEAR if self.kind == "reality" else 0.0, self.published.tolerance or 0.0)
 
     @property
     def use(self) -> Literal["blind", "calibration", "code"]:
-        """Use of the figure: a blind one tests the model against real cameras and did not shape it."""
+        """The use of the figure; a blind figure tests the model against real cameras and was not used to fit it."""
         return "code" if self.kind == "code" else "calibration" if self.calibration else "blind"
 
     @cached_property
     def measures(self) -> Quantity:
-        """The quantity that the figure names."""
+        """The figure's quantity."""
         return QUANTITIES[self.quantity]
 
     @cached_property
@@ -118,18 +118,18 @@ class Figure(Config):
         return self.camera, self.quantity, self.measures.conditions.from_data(self.conditions)
 
     def what(self) -> str:
-        """Text such as ``temporal deviation, 1.5 m, albedo 0.8``."""
+        """Return a text such as ``temporal deviation, 1.5 m, albedo 0.8``."""
         return f"{self.measures.title}, {in_words(self.request[2])}"
 
 
 class FiguresFile(Config):
-    """The file of figures: a list."""
+    """The file of figures, which holds a list."""
 
     figures: Annotated[tuple[Figure, ...], Field(min_length=1)]
 
 
 def read_figures(path: Path = FIGURES_FILE) -> tuple[Figure, ...]:
-    """Read a file of figures. Raises UserError naming each key that is missing, unknown or impossible, and where."""
+    """Read a file of figures. Raises UserError with each missing, unknown or illegal key and its place."""
     source = read_yaml(path)
     entries, problems = child(source.data, "figures"), list[Problem]()
     first: dict[str, int] = {}
@@ -153,52 +153,52 @@ def read_figures(path: Path = FIGURES_FILE) -> tuple[Figure, ...]:
 
 @dataclass(frozen=True)
 class Score:
-    """One figure and the simulated value."""
+    """A published figure and its simulated value."""
 
     figure: Figure
     simulated: Reading
 
     @property
     def ratio(self) -> float:
-        """The simulated over the published value, or over the nearer bound; NaN where that is 0."""
+        """The simulated value divided by the published value, or by the nearer bound; NaN if that is 0."""
         value = self.simulated.value
         nearest = min(self.figure.published.ends, key=lambda end: abs(end - value))
         return value / nearest if nearest else float("nan")
 
     @property
     def passes(self) -> bool:
-        """True where the simulated value lies within the entry's limits; False without a value."""
+        """True if the simulated value lies within the figure's limits; False without a value."""
         low, high = self.figure.limits
         return bool(low <= self.simulated.value <= high)
 
     @property
     def passes_by_tolerance(self) -> bool:
-        """True where a figure of reality passes by the source's tolerance, which is wider than `NEAR`."""
+        """True if a figure of a real camera passes only by the source's tolerance, which is wider than `NEAR`."""
         low, high = self.figure.published.limits(NEAR)
         return self.figure.kind == "reality" and self.passes and not low <= self.simulated.value <= high
 
     @property
     def fell_behind(self) -> bool:
-        """True where the figure fails and the file does not say why."""
+        """True if the figure fails and the file gives no reason."""
         return not self.passes and not self.figure.fails
 
     @property
     def verdict(self) -> str:
-        """The verdict: ``pass``, ``pass (tolerance)``, ``fail`` as the file says, or ``FAIL (new)``."""
+        """The verdict: ``pass``, ``pass (tolerance)``, ``fail`` with a reason in the file, or ``FAIL (new)``."""
         if self.passes:
             return "pass (tolerance)" if self.passes_by_tolerance else "pass"
         return "FAIL (new)" if self.fell_behind else "fail"
 
 
 def measured(requests: Iterable[Request], effort: Effort, jobs: int) -> dict[Request, Reading]:
-    """Measure all requests, ``jobs`` scenes at a time. The numbers do not depend on ``jobs`` or on the order."""
+    """Measure all requests, ``jobs`` scenes at a time. The results do not depend on ``jobs`` or on the order."""
     scenes: dict[str, list[Request]] = defaultdict(list)
     for request in requests:
         scenes[canonical_json([request[0], *scene_of(request[2])])].append(request)
     groups = list(scenes.values())
     results: dict[Request, Reading] = {}
     last_s = time.monotonic()
-    # processes that start anew: a forked one would share the locks of this one's libraries
+    # new processes are spawned, since a forked process would share the locks of this process's libraries
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
         mapped = map if jobs == 1 else pool.map
         found = mapped(measure_group, groups, [effort] * len(groups))
@@ -211,7 +211,7 @@ def measured(requests: Iterable[Request], effort: Effort, jobs: int) -> dict[Req
 
 
 def measure_group(group: Sequence[Request], effort: Effort) -> list[Reading]:
-    """Measure quantities of one camera on one scene, in this process."""
+    """Measure quantities of a camera on a single scene, in this process."""
     return [QUANTITIES[name].measure(Bench(camera, effort), conditions) for camera, name, conditions in group]
 
 
@@ -220,7 +220,7 @@ SCORE_FILE: dict[str, Any] = {"formats": ("csv",), "digits": "%.9g"}
 
 @dataclass(frozen=True)
 class Beside:
-    """One number of the capture and of the simulation; ``at``: the condition."""
+    """A reading of the capture and of the simulation; ``at`` is the condition."""
 
     where: str
     quantity: str
@@ -232,7 +232,7 @@ class Beside:
 
 
 def number(value: float) -> str:
-    """Return three significant digits, or ``none`` where there is no value."""
+    """Return three significant digits, or ``none`` if there is no value."""
     if np.isnan(value):
         return "none"
     if 0.0995 <= abs(value) < 99.95:
@@ -246,7 +246,7 @@ def _interval(between: Interval) -> str:
 
 
 def _reading(name: str, low: str, high: str, note: str) -> tuple[Column, ...]:
-    """Return a reading: its value and its interval's ends in three columns of a file, and in two of a page."""
+    """Return the columns of a reading, its value and the ends of its interval: three in a file, two on a page."""
     return (
         Column(name, name, f"{name}.value", note, number),
         Column(low, "", f"{name}.interval.low", "lower end of its 95 % interval"),
@@ -269,7 +269,7 @@ def _remarks(score: Score) -> str:
     return why + score.figure.note[:1].upper() + score.figure.note[1:]
 
 
-VERSION = Column("results_version", "", lambda row: RESULTS_VERSION, "version of the tables' meaning")
+VERSION = Column("results_version", "", lambda row: RESULTS_VERSION, "version of the tables' format")
 SCORES = Table(
     "scorecard",
     "one row per published figure",
@@ -284,17 +284,17 @@ SCORES = Table(
         *_reading("simulated", "low", "high", "simulated value"),
         Column("published", "", lambda score: score.figure.published.in_words(), "published value"),
         Column("", "published", lambda score: f"{score.figure.published.in_words()} {score.figure.measures.unit}"),
-        Column("ratio", "ratio", "ratio", "simulated by published, or by the nearer bound", number),
+        Column("ratio", "ratio", "ratio", "simulated divided by published value, or by the nearer bound", number),
         Column("passes_from", "", lambda score: score.figure.limits[0], "lowest value that passes"),
         Column("passes_to", "", lambda score: score.figure.limits[1], "highest value that passes"),
         Column(
             "verdict", "verdict", "verdict", "whether it passes", tone=lambda score: "good" if score.passes else "bad"
         ),
-        Column("use", "use", "figure.use", "blind, calibration (the camera's file may be fitted to it) or code"),
+        Column("use", "use", "figure.use", "blind, calibration (the camera file may be fitted to it) or code"),
         Column("tag", "", "figure.tag", "R read, D derived, S secondary, W measured on captures, M a guess"),
         Column("source", "", "figure.source", "source of the published value"),
         Column("", "source", lambda score: f"[{score.figure.tag}] {score.figure.source}"),
-        Column("note", "", "figure.note", "what was assumed"),
+        Column("note", "", "figure.note", "assumptions"),
         Column("fails", "", "figure.fails", "why it is known to fail"),
         Column("", "note", _remarks, brief=False),
         VERSION,
@@ -305,15 +305,15 @@ SCORES = Table(
 )
 BESIDE = Table(
     "capture",
-    "one row per number of a capture beside its simulation",
+    "one row per reading of a capture, beside that of its simulation",
     (
         Column("where", "where", "where", "plane or edge"),
         Column("quantity", "quantity", "quantity", "quantity that is measured"),
         Column("at", "at", "at", "condition"),
         Column("unit", "", "unit", "unit of the values"),
         Column("pixels", "pixels", "pixels", "pixels, or lines across an edge"),
-        *_reading("measured", "measured_low", "measured_high", "measured on the capture"),
-        *_reading("simulated", "simulated_low", "simulated_high", "measured on its simulation"),
+        *_reading("measured", "measured_low", "measured_high", "value in the capture"),
+        *_reading("simulated", "simulated_low", "simulated_high", "value in its simulation"),
         Column("", "ratio", _ratio),
         Column("", "unit", lambda row: row.unit or "–"),
         VERSION,

@@ -1,7 +1,7 @@
-"""The closed list of what the scorecard measures: each quantity with its conditions and how it is measured.
+"""All quantities that the scorecard measures, each with its conditions and the function that measures it.
 
-A published figure names a quantity and conditions, a curve is a quantity over a range of conditions; both are measured
-by the same function. All scenes lie about the optical axis. A published figure states what differs from the defaults.
+A published figure names a quantity and those conditions that differ from the defaults. A curve is a quantity over a
+range of conditions and is measured by the same function. All scenes lie about the optical axis.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ from scenes.sensor.amcw.facts import AmcwCamera
 from scenes.sensor.camera import CameraConfig, EffectsConfig
 
 PATCH = (40, 24)
-"""Height and width in pixels. Narrow: at 70 degrees of incidence z then varies by 6 % to either side on the coarsest
-camera, and the deviation's mean by under 1 %."""
+"""Height and width in pixels. The patch is narrow, so that at 70 degrees of incidence z varies by 6 % to either side on
+the coarsest camera, and the mean deviation by less than 1 %."""
 PATTERN_PATCH = (140, 180)
 LEAST_TILT = (0.05, 0.02)
-"""Slopes of the frontal plane: 3 degrees, so that rounding of the output meets every phase of its step."""
+"""Slopes of the nearly frontal plane: 3 degrees, so that all phases of the output's rounding step occur."""
 EDGE_PATCH = (40, 96)
 REACH_PX = 44.0
-"""Distance from the edge within which pixels are counted: beyond the widest shadow at 0.75 m shorter than 44 pixels."""
+"""Distance from the edge within which pixels are counted: more than the widest shadow at 0.75 m, under 44 pixels."""
 SLANT = 0.1
-"""Pixels across for each pixel along: every position of the edge within a pixel occurs, as in ISO 12233."""
+"""Slant of the edge, in pixels across per pixel along: all positions of an edge in a pixel occur, as in ISO 12233."""
 ROOM_LIGHT = CameraConfig().ambient_uw_cm2_nm
 
 Distance = Annotated[float, Field(ge=0.1, le=20.0, description="along the optical axis, in metres")]
@@ -58,34 +58,34 @@ Lag = Annotated[int, Field(ge=0, le=16, description="pixels from 0 to 16")]
 
 
 class PlaneConditions(Config):
-    """An endless matte plane that fills the field of view; ambient light as in `CameraConfig`. A continuous-wave
-    camera's plane may be given by the sum of its amplitudes in place of its albedo."""
+    """An infinite matte plane; ambient light is as in `CameraConfig`. For a continuous-wave camera, the sum of the
+    amplitudes may be given instead of the albedo."""
 
     distance_m: Distance = 1.5
     albedo: Albedo = 0.8
-    angle_deg: Annotated[float, Field(ge=0.0, le=80.0, description="of incidence, 0 to 80 degrees")] = 0.0
+    angle_deg: Annotated[float, Field(ge=0.0, le=80.0, description="angle of incidence, 0 to 80 degrees")] = 0.0
     ambient_uw_cm2_nm: Annotated[float, Field(ge=0.0, le=200.0, description="0 to 200 uW/(cm2 nm)")] = ROOM_LIGHT
-    amplitude_units: Annotated[float, Field(gt=0.0, description="of all frequencies, in converter units")] | None = None
+    amplitude_units: Annotated[float, Field(gt=0.0, description="sum over frequencies, in ADC units")] | None = None
 
 
 class LagConditions(PlaneConditions):
-    """Two pixels of a plane, so far apart."""
+    """Two pixels of a plane at a distance in pixels."""
 
     lag_x_px: Lag = 1
     lag_y_px: Lag = 0
 
 
 class PatchConditions(PlaneConditions):
-    """Square patches of a plane, each less its own plane, and a distance of pixels within them."""
+    """Square patches of a plane, each minus its own fitted plane, and a distance between pixels within them."""
 
     patch_px: Annotated[int, Field(ge=3, le=70, description="side of a patch in pixels, 3 to 70")] = 38
     apart_px: Annotated[int, Field(ge=0, le=16, description="pixels from 0 to 16")] = 0
-    rounded_mm: Annotated[float, Field(ge=0.0, le=10.0, description="step of the stored file, 0 to 10 mm")] = 0.0
+    rounded_mm: Annotated[float, Field(ge=0.0, le=10.0, description="step of the stored depth, 0 to 10 mm")] = 0.0
 
 
 class StepConditions(Config):
-    """A straight edge of one matte plane before another, both frontal, 6 degrees off the pixel grid. z steps along the
-    image axis ``across``; with ``shadow`` the front is on the emitter's side and throws its shadow on the back."""
+    """A straight edge of a matte plane in front of another, both frontal, 6 degrees off the pixel grid. z steps along
+    the image axis ``across``; with ``shadow``, the front is on the emitter's side and casts its shadow on the back."""
 
     distance_m: Distance = 0.75
     step_mm: Annotated[float, Field(ge=0.5, le=5e3, description="from front to back, 0.5 to 5000 mm")] = 50.0
@@ -111,7 +111,7 @@ _WORDS: dict[str, Callable[[Any], str]] = {
 
 
 def in_words(conditions: Config) -> str:
-    """Conditions as a short text with units: ``1.5 m, albedo 0.8``."""
+    """Return conditions as a short text with units: ``1.5 m, albedo 0.8``."""
     data = conditions.to_data()
     if data.get("amplitude_units") is not None:
         del data["albedo"]
@@ -121,7 +121,7 @@ def in_words(conditions: Config) -> str:
 
 
 def scene_of(conditions: Config) -> tuple[str, dict[str, Any]]:
-    """The scene to simulate for some conditions: equal for those that share it, such as all lags on one plane."""
+    """Return the scene for conditions; conditions that share a scene, such as lags on a plane, give equal results."""
     shared = _plane(conditions) if isinstance(conditions, PlaneConditions) else conditions
     return type(shared).__name__, shared.to_data()
 
@@ -135,7 +135,7 @@ Measure = Callable[[Bench, Any], Reading]
 
 @dataclass(frozen=True)
 class Quantity:
-    """Something that is measured. ``unit`` is empty for ratios; ``says`` is one sentence for the page."""
+    """A measured quantity. ``unit`` is empty for ratios; ``says`` is a sentence for the page."""
 
     name: str
     title: str
@@ -149,7 +149,7 @@ QUANTITIES: dict[str, Quantity] = {}
 
 
 def _quantity(title: str, conditions: type[Config]) -> Callable[[Measure], Measure]:
-    """List a measuring function by its name, whose ending is the unit; the page quotes its docstring's first lines."""
+    """Register a measuring function. The ending of its name is the unit; the page quotes its docstring's start."""
 
     def listed(measure: Measure) -> Measure:
         name, says = measure.__name__, " ".join((measure.__doc__ or "").partition("\n\n")[0].split())
@@ -170,13 +170,13 @@ def plane_stack(
     unit: int = 1,
     patch: tuple[int, int] = PATCH,
 ) -> FrameStack:
-    """Frames of a plane about the axis; all that is measured on one plane with the same effects shares them."""
+    """Return frames of a plane about the axis; all measurements of a plane with the same effects share them."""
     slope_x = max(float(np.tan(np.radians(c.angle_deg))), LEAST_TILT[0])
     albedo = c.albedo
     if c.amplitude_units is not None:
         camera = bench.camera
         if not isinstance(camera, AmcwCamera):
-            raise UserError(f"{camera.name} has no amplitude_units", fix="give the plane's albedo")
+            raise UserError(f"{camera.name}: does not support amplitude_units", fix="give the plane's albedo")
         electrons = c.amplitude_units * camera.photons.electrons_per_unit.value * c.distance_m**2
         albedo = electrons / (camera.photons.signal_electrons.value * sum(camera.modulation.contrast.value))
     view = plane_view(bench.camera, bench.patch(*patch), c.distance_m, albedo, slope_x, LEAST_TILT[1])
@@ -191,13 +191,13 @@ def _deviation(stack: FrameStack) -> Reading:
 
 @_quantity("temporal deviation", PlaneConditions)
 def temporal_sigma_mm(bench: Bench, c: PlaneConditions) -> Reading:
-    """Standard deviation over frames of one pixel's z, rms over pixels, noise alone."""
+    """Standard deviation of a pixel's z over frames, rms over pixels, noise alone."""
     return _deviation(plane_stack(bench, c))
 
 
 @_quantity("random error", PlaneConditions)
 def random_error_mm(bench: Bench, c: PlaneConditions) -> Reading:
-    """Standard deviation over frames of one pixel's z with whole-frame jitter and jumps, rms over pixels."""
+    """Standard deviation of a pixel's z over frames, with whole-frame jitter and jumps, rms over pixels."""
     return _deviation(plane_stack(bench, c, EffectsConfig(), bench.effort.whole_frames))
 
 
@@ -210,13 +210,13 @@ def noise_correlation(bench: Bench, c: LagConditions) -> Reading:
 @_quantity("valid fraction", PlaneConditions)
 def valid_fraction(bench: Bench, c: PlaneConditions) -> Reading:
     """Share of pixels about the axis that have a range."""
-    # as many neighbours count as a single pixel as the camera's own filter mixes
+    # all neighbours that the camera's own filter mixes count as a single pixel
     stack = plane_stack(bench, c, NOISE, bench.effort.few_frames)
     return share_of(np.isfinite(stack.z_m), (2 * bench.camera.optics.margin_px + 1) ** 2)
 
 
 def _left_of_patches(z_m: np.ndarray, n: int) -> np.ndarray:
-    """(patches, n, n): z (h, w) of square patches less each patch's own plane, mm."""
+    """Return z (h, w) as square patches (patches, n, n) minus each patch's own plane, mm."""
     v, u = np.mgrid[:n, :n].reshape(2, -1) - n / 2
     plane = np.column_stack([np.ones(n * n), u, v])
     corners = [(i, j) for i in range(0, len(z_m) - n + 1, n) for j in range(0, z_m.shape[1] - n + 1, n)]
@@ -226,13 +226,13 @@ def _left_of_patches(z_m: np.ndarray, n: int) -> np.ndarray:
 
 @lru_cache(maxsize=4)
 def _single_frames(bench: Bench, c: PlaneConditions) -> tuple[np.ndarray, ...]:
-    """One frame's z (h, w) of each of several units, kept for all patches of this plane."""
+    """Return one frame's z (h, w) for each of several units, cached for all patches of this plane."""
     units = range(1, bench.effort.few_frames + 1)
     return tuple(plane_stack(bench, c, PATTERNED, 1, unit, PATTERN_PATCH).z_m[0] for unit in units)
 
 
 def _patch_products(bench: Bench, c: PatchConditions) -> tuple[np.ndarray, np.ndarray]:
-    """(units, patches): variance about each patch's own plane in one frame, mm^2, and mean product so far apart."""
+    """Return (units, patches) in mm^2: the variance about each patch's plane in a frame, and the product at the lag."""
     n, k, found = c.patch_px, c.apart_px, []
     for z_m in _single_frames(bench, _plane(c)):
         stored_m = np.round(z_m / (c.rounded_mm * MM)) * (c.rounded_mm * MM) if c.rounded_mm else z_m
@@ -245,15 +245,15 @@ def _patch_products(bench: Bench, c: PatchConditions) -> tuple[np.ndarray, np.nd
 
 @_quantity("deviation within patches", PatchConditions)
 def patch_deviation_mm(bench: Bench, c: PatchConditions) -> Reading:
-    """Deviation over a patch of a single frame about the patch's own plane, noise and fixed pattern: median over
+    """Standard deviation of a single frame about the patch's own plane, with noise and fixed pattern: median over
     patches, mean over units."""
     return mean_of(np.sqrt(np.median(_patch_products(bench, c)[0], axis=1)))
 
 
 @_quantity("pattern within patches", PatchConditions)
 def patch_pattern_mm(bench: Bench, c: PatchConditions) -> Reading:
-    """Deviation over a patch about the patch's own plane that two averages of different frames have in common, rms over
-    patches, mean of units."""
+    """Standard deviation about the patch's own plane that two averages of different frames share: rms over patches,
+    mean over units."""
     found = []
     for unit in range(1, min(bench.effort.units, 5) + 1):
         z_m = plane_stack(bench, _plane(c), PATTERNED, bench.effort.noise_frames // 4, unit, PATTERN_PATCH).z_m
@@ -264,14 +264,14 @@ def patch_pattern_mm(bench: Bench, c: PatchConditions) -> Reading:
 
 @_quantity("correlation within patches", PatchConditions)
 def patch_correlation(bench: Bench, c: PatchConditions) -> Reading:
-    """Correlation of pixels of a patch of a single frame about the patch's own plane, mean of rows and columns."""
+    """Correlation between pixels of a single frame about the patch's own plane, mean over rows and columns."""
     variance, product = _patch_products(bench, c)
     return mean_of(product.mean(axis=1) / variance.mean(axis=1))
 
 
 @_quantity("systematic error", PlaneConditions)
 def systematic_error_mm(bench: Bench, c: PlaneConditions) -> Reading:
-    """Greatest absolute mean error of z among ten units an hour after power-on, direct light only."""
+    """Largest absolute mean error of z among ten units, one hour after power-on, direct light only."""
     errors = []
     for unit in range(1, bench.effort.units + 1):
         stack = plane_stack(bench, c, STEADY, bench.effort.few_frames, unit)
@@ -282,7 +282,7 @@ def systematic_error_mm(bench: Bench, c: PlaneConditions) -> Reading:
 
 @_quantity("fixed pattern", PlaneConditions)
 def fixed_pattern_mm(bench: Bench, c: PlaneConditions) -> Reading:
-    """Deviation over pixels of the average less a smooth surface and the noise left in it, mean of five units."""
+    """Standard deviation over pixels of the average minus a smooth surface and the remaining noise, mean of 5 units."""
     found = []
     for unit in range(1, min(bench.effort.units, 5) + 1):
         stack = plane_stack(bench, c, PATTERNED, bench.effort.noise_frames // 4, unit, PATTERN_PATCH)
@@ -294,12 +294,12 @@ def fixed_pattern_mm(bench: Bench, c: PlaneConditions) -> Reading:
 
 @lru_cache(maxsize=4)
 def _widths(bench: Bench, c: StepConditions) -> dict[str, np.ndarray]:
-    """Widths at a straight edge near the axis; the front is where sign (across - slant along) < 0, in ideal pixels."""
+    """Return widths at a straight edge near the axis; in front, sign (across - slant along) < 0 in ideal pixels."""
     camera, axis = bench.camera, ("x", "y").index(c.across)
     lens = camera.nominal_lens
     region = bench.patch(*(EDGE_PATCH if axis == 0 else EDGE_PATCH[::-1]))
     toward_emitter = -1.0 if camera.optics.emitter_m[axis] < 0 else 1.0
-    # the front lies where sign * (position across) < edge: on the emitter's side for a shadow
+    # in front, sign * (position across) < edge; for a shadow, the front is on the emitter's side
     sign = -toward_emitter if c.shadow else toward_emitter
 
     def signed_px(slopes: np.ndarray) -> np.ndarray:
@@ -313,31 +313,31 @@ def _widths(bench: Bench, c: StepConditions) -> dict[str, np.ndarray]:
     tolerance_m = on_surface_tolerance_m(temporal_sigma_m(stack.z_m, np.abs(from_edge) > FLAT_PX), c.step_mm * MM)
     front_z, back_z = (plane.z_along_m(stack.slopes) for plane in (front, back))
     widths = edge_widths(stack.z_m, front_z, back_z, from_edge, tolerance_m, REACH_PX, 2 - axis)
-    # each surface so far from the edge that the camera's filter sees it alone
+    # pixels so far from the edge that the camera's filter mixes in no other surface
     on_front, on_back = from_edge < -FLAT_PX, (from_edge > FLAT_PX) & np.isfinite(stack.z_m).all(axis=0)
     return widths | {"height": stack.z_m[:, on_back].mean(axis=1) - np.nanmean(stack.z_m[:, on_front], axis=1)}
 
 
 @_quantity("gap at an edge", StepConditions)
 def edge_gap_px(bench: Bench, c: StepConditions) -> Reading:
-    """Width across an edge of pixels without a range, shadow included."""
+    """Width across an edge of the pixels without a range, including the shadow."""
     return mean_of(_widths(bench, c)["gap"])
 
 
 @_quantity("flying pixels", StepConditions)
 def flying_pixels_px(bench: Bench, c: StepConditions) -> Reading:
-    """Width across an edge of pixels whose range is off both surfaces by more than four deviations and a tenth of the
-    step."""
+    """Width across an edge of the pixels whose range differs from both surfaces by more than four standard deviations
+    plus a tenth of the step."""
     return mean_of(_widths(bench, c)["flying"])
 
 
 @_quantity("edges with flying pixels", StepConditions)
 def flying_share(bench: Bench, c: StepConditions) -> Reading:
-    """Share of the lines of pixels across an edge that hold such a pixel."""
+    """Share of the lines of pixels across an edge that contain a flying pixel."""
     return mean_of(_widths(bench, c)["with_flying"])
 
 
 @_quantity("height of a step", StepConditions)
 def step_height_mm(bench: Bench, c: StepConditions) -> Reading:
-    """Mean z of the back less that of the front, more than 8 pixels from the edge, noise alone."""
+    """Mean z of the back minus that of the front, more than 8 pixels from the edge, noise alone."""
     return mean_of(_widths(bench, c)["height"] / MM)

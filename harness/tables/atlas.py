@@ -12,14 +12,14 @@ from harness.evaluation.atlas import Answer, LimitSurface, Outside
 from harness.tables.schema import Column, Estimate, Table
 
 DAMAGE = {"through": "through-hole", "blind": "blind hole", "dent": "dent"}
-"""Words for kinds of damage; other kinds keep their name."""
+"""Names of kinds of damage in words; other kinds keep their name."""
 DISTANCES = 25
 """Number of distances on a curve; their logarithms are evenly spaced."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """The answer of a surface at a place. ``title``: the camera's. ``size_mm``: the size in question, or NaN."""
+    """The answer of a surface at a place, with the title of its camera and the size in question (or NaN)."""
 
     surface: LimitSurface
     title: str
@@ -55,7 +55,7 @@ ATLAS = Table(
         Column("detector", "detector", "surface.detector", "name of the detector"),
         Column("distance_m", "distance (m)", lambda row: row.place["distance_m"], "distance of the target"),
         Column("frames", "frames", lambda row: int(row.place["frames"]), "number of averaged frames"),
-        Column("albedo", "albedo", lambda row: row.place.get("albedo"), "the target's, if the atlas has several"),
+        Column("albedo", "albedo", lambda row: row.place.get("albedo"), "the target's albedo, if it varies"),
         Column("depth_mm", "", lambda row: row.place.get("depth_mm"), "depth of the damage, if it has one"),
         Column(
             "a90_mm",
@@ -82,7 +82,7 @@ ATLAS = Table(
 def rows_at(
     surfaces: Iterable[LimitSurface], titles: Mapping[str, str], place: Mapping[str, float], size_mm: float = np.nan
 ) -> tuple[list[Row], list[tuple[str, str]]]:
-    """Return the rows at a place, smallest limit first, and (reason, camera's title) of surfaces without an answer."""
+    """Return the rows at a place, smallest limit first, and (reason, camera title) for surfaces without an answer."""
     rows, refused = [], []
     for surface in surfaces:
         own = {axis: place[axis] for axis in surface.grid if axis in place}
@@ -95,7 +95,7 @@ def rows_at(
 
 
 def curves(surfaces: Sequence[LimitSurface], titles: Mapping[str, str]) -> list[Row]:
-    """Return rows of every surface at `DISTANCES` distances and each computed number of frames, depth and albedo."""
+    """Return rows for every surface at `DISTANCES` distances and each computed number of frames, depth and albedo."""
     rows = []
     for surface in surfaces:
         ends = surface.grid["distance_m"]

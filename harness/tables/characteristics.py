@@ -12,12 +12,12 @@ from harness.tables.schema import Column, Estimate, Table
 from harness.vocabulary.geometry import MM
 
 LEAST = {"mm": 0.01, "px": 0.05, "1": 0.05, "1/px": 0.01}
-"""Measured values below these, by unit, are too small for a ratio to them to mean anything."""
+"""Measured values below these (by unit) are too small to divide by."""
 
 
 @dataclass(frozen=True)
 class OwnFigure:
-    """One figure: ``measured``, ``simulated`` from the camera file, and of the nearest ``known`` camera (or NaN)."""
+    """A figure as measured, as simulated from the camera file, and for the nearest known camera (or NaN)."""
 
     figure: str
     where: str
@@ -29,12 +29,12 @@ class OwnFigure:
 
     @property
     def ratio(self) -> float:
-        """Simulated over measured value; NaN where the measured value is close to 0."""
+        """The simulated value divided by the measured value; NaN if the measured value is close to 0."""
         return self._by_measured(self.simulated)
 
     @property
     def known_ratio(self) -> float:
-        """The known camera's over the measured value; NaN where the measured value is close to 0."""
+        """The known camera's value divided by the measured value; NaN if the measured value is close to 0."""
         return self._by_measured(self.known)
 
     def _by_measured(self, value: float) -> float:
@@ -46,14 +46,14 @@ OWN_FIGURES = Table(
     "characteristics",
     "one row per figure of the user's camera",
     (
-        Column("figure", "figure", "figure", "name of the figure, as makers name it"),
+        Column("figure", "figure", "figure", "name of the figure, as manufacturers use it"),
         Column("where", "where", "where", "surface, or direction and lag"),
         Column("unit", "unit", "unit", "mm, px or 1"),
         Column("measured", "measured", "measured", "value in the captures, with 95 % interval if known", interval=True),
         Column("simulated", "simulated", "simulated", "value in frames that are simulated from the camera file"),
-        Column("ratio", "ratio", "ratio", "simulated over measured value"),
+        Column("ratio", "ratio", "ratio", "simulated value divided by measured value"),
         Column("known", "known camera", "known", "value of the nearest known camera, simulated with the same surfaces"),
-        Column("known_ratio", "its ratio", "known_ratio", "known camera's over measured value", brief=False),
+        Column("known_ratio", "its ratio", "known_ratio", "known camera's value over measured value", brief=False),
         Column("meaning", "", "meaning", "meaning of the figure"),
     ),
     formats=("csv",),
@@ -67,8 +67,8 @@ OWN_CURVES = Table(
         Column("diagram", note="what y is, and what it is plotted against"),
         Column("source", note="measured, simulated or known camera"),
         Column("series", note="capture, or direction"),
-        Column("x", note="m, degrees, amplitude, pixels, cycles per pixel or number of the frame, by the diagram"),
-        Column("y", note="mm, share, correlation or density, by the diagram"),
+        Column("x", note="value on the x axis; the diagram decides whether m, degrees, amplitude, px, 1/px or frames"),
+        Column("y", note="value on the y axis; the diagram decides whether mm, share, correlation or density"),
     ),
     formats=("csv",),
 )
@@ -83,7 +83,7 @@ FLAT_SURFACES = Table(
         Column("form95_mm", "dispersion, 95 % (mm)", note="width of the layer that holds 95 % of a frame's points"),
         Column("form997_mm", "flatness, 99.7 % (mm)", note="width of the layer that holds 99.7 %"),
         Column("fill_rate", "fill rate", note="share of pixels and frames with a return"),
-        Column("lod95_1_mm", "LoD95, 1 frame (mm)", note="level of detection of one pixel's z, 1 frame"),
+        Column("lod95_1_mm", "LoD95, 1 frame (mm)", note="level of detection at 95 % of a pixel's z in 1 frame"),
         Column("lod95_10_mm", "10 frames (mm)", note="the same for the average of 10 frames"),
         Column("lod95_50_mm", "50 frames (mm)", note="the same for the average of 50 frames"),
     ),
@@ -111,12 +111,12 @@ FLAT_CAPTURES = Table(
         Column("distance_m", "distance (m)", "distance_m", "median distance along the optical axis"),
         Column("tilt_deg", "tilt (°)", "tilt_deg", "angle between the optical axis and the surface's normal"),
         Column("pixels", "pixels", "pixels", "number of pixels used"),
-        Column("noise_mm", "noise (mm)", lambda one: one.noise_m / MM, "deviation of the average by temporal noise"),
+        Column("noise_mm", "noise (mm)", lambda row: row.noise_m / MM, "temporal noise of the averaged distance"),
         Column(
             "residual_mm",
             "residual (mm)",
-            lambda one: float(np.sqrt(np.nanmean(one.residual_m**2))) / MM,
-            "root mean square of range minus a smooth fit: pattern, shape and noise",
+            lambda row: float(np.sqrt(np.nanmean(row.residual_m**2))) / MM,
+            "rms difference between the range and a smooth fit: pattern, shape and noise",
         ),
     ),
     formats=("csv",),
@@ -137,12 +137,12 @@ FLAT_FIGURES = Table(
 
 
 def figures_of(found: Any) -> Iterator[dict[str, Any]]:
-    """Yield the rows of `FLAT_FIGURES` of a `detectors.flat_captures.Separated`."""
+    """Yield the rows of `FLAT_FIGURES` for a `detectors.flat_captures.Separated`."""
 
     def row(figure: str, value: float | None, meaning: str, unit: str = "mm") -> dict[str, Any]:
         return {"figure": figure, "value": value, "unit": unit, "meaning": meaning}
 
-    yield row("pattern", found.field.rms_m / MM, "rms of the unit's fixed pattern, without the map's noise")
+    yield row("pattern", found.field.rms_m / MM, "rms of the unit's fixed pattern, corrected for the map's noise")
     yield row("noise of the map", found.noise_m / MM, "rms of the map's standard deviation")
     shape = "the surface's shape" if found.separated else "the surface's shape, or a part of the pattern that changes"
     yield row("between captures", found.surface_m / MM, f"deviation between captures beyond their noise: {shape}")

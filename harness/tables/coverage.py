@@ -1,4 +1,4 @@
-"""Tables of coverage: patches of a part, camera poses, and sets of poses that reach a goal. Rows are mappings."""
+"""Tables of coverage: patches of a part, camera poses, and sets of poses that reach a goal. Their rows are mappings."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ def _share(value: float) -> str:
 
 COVERAGE = Table(
     "coverage",
-    "one row per patch of the face: the size of damage that is found there nine times in ten",
+    "one row per patch of the face: the size of damage that is found there 90 % of the time",
     (
-        Column("x_mm", note="x of its centre in the board's frame"),
-        Column("y_mm", note="y of its centre"),
-        Column("z_mm", note="z of its centre"),
+        Column("x_mm", note="x of the patch's centre in the board's frame"),
+        Column("y_mm", note="y of the patch's centre"),
+        Column("z_mm", note="z of the patch's centre"),
         Column("area_m2", note="area of the patch"),
-        Column("a90_mm", note="size found 90 % of the time in its best pose; inf: none inspected; empty: not judged"),
-        Column("pose", note="number of its best pose"),
+        Column("a90_mm", note="size found 90 % of the time in the best pose; inf: no size is; empty: not judged"),
+        Column("pose", note="number of the best pose, in which the smallest damage is found"),
         Column("noise_mm", note="the detector's unit of score in the best pose; inf: not judged"),
         Column("angle_deg", note="angle of incidence in the best pose"),
         Column("range_m", note="distance from the camera in the best pose"),

@@ -1,4 +1,4 @@
-"""Tables of efficiency: every detector compared with the ideal observer, and the ideal observer on every damage."""
+"""Tables of efficiency: detectors compared with the ideal observer, and the ideal observer's result on each damage."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ IDEAL_A90 = "diameter that the ideal observer finds 90 % of the time"
 
 
 def _ideal_size(level: Level) -> Estimate:
-    """Return the ideal observer's size, without an interval if it misses nothing."""
+    """Return the ideal observer's size; it has no interval if the observer misses nothing."""
     ends = UNKNOWN if level.at_most else level.ideal_mm_interval
     return Estimate(level.ideal_mm, ends.low, ends.high, at_most=level.at_most)
 
@@ -34,14 +34,14 @@ EFFICIENCY = Table(
         Column(
             "ideal_a50_mm",
             "ideal a50 (mm)",
-            lambda one: _ideal_size(one.half),
+            lambda row: _ideal_size(row.half),
             "diameter that the ideal observer finds 50 % of the time, with its 95 % interval over boards",
             interval=True,
         ),
-        Column("ideal_is_at_most", "", "half.at_most", "whether it misses nothing, so that its sizes are upper bounds"),
-        Column("a50_mm", "a50 (mm)", lambda one: a50_of(one.limit), "the detector's a50", interval=True),
-        Column("ideal_a90_mm", "ideal a90 (mm)", lambda one: _ideal_size(one.most), IDEAL_A90, interval=True),
-        Column("a90_mm", "a90 (mm)", lambda one: a90_of(one.limit), "the detector's a90", interval=True),
+        Column("ideal_is_at_most", "", "half.at_most", "whether it misses nothing: its sizes are then upper bounds"),
+        Column("a50_mm", "a50 (mm)", lambda row: a50_of(row.limit), "the detector's a50", interval=True),
+        Column("ideal_a90_mm", "ideal a90 (mm)", lambda row: _ideal_size(row.most), IDEAL_A90, interval=True),
+        Column("a90_mm", "a90 (mm)", lambda row: a90_of(row.limit), "the detector's a90", interval=True),
         Column("ideal_index_50", "", "half.ideal_index", f"{INDEX} that it finds 50 % of the time"),
         Column("index_50", "d' at 50 %", ("half.index", "half.index_interval"), INDEX_50),
         Column(
@@ -60,8 +60,8 @@ EFFICIENCY = Table(
         ),
         replace(CALLS[0], value=("limit.false_calls.rate_per_m2", "limit.false_calls.interval_per_m2")),
         Column("units", "", "ideal.units", "number of units whose noise the ideal observer knows"),
-        Column("kurtosis", "", "ideal.kurtosis", "excess kurtosis of that noise; 0: Gaussian"),
-        Column("notes", "", "why", "reason if there is no efficiency"),
+        Column("kurtosis", "", "ideal.kurtosis", "excess kurtosis of that noise; 0 if Gaussian"),
+        Column("notes", "", "why", "reason why there is no efficiency, if there is none"),
     ),
     title="efficiency: detectors compared with the ideal observer",
     left=2,
@@ -70,13 +70,13 @@ EFFICIENCY = Table(
 
 @dataclass(frozen=True)
 class DamageRow:
-    """One damage of a set-up, by its index in the arrays of ``of``."""
+    """One damage of a set-up: the entry with the index ``number`` of every array of ``of``."""
 
     of: Efficiency
     number: int
 
     def __getattr__(self, name: str) -> object:
-        """Return the damage's entry of an array of ``of``."""
+        """Return the damage's entry in the array ``name`` of ``of``."""
         return getattr(self.of, name)[self.number].item()
 
 
@@ -89,9 +89,9 @@ DAMAGES = Table(
         Column("hole", "", "hole", "number of the damage on the board"),
         Column("diameter_mm", "", "size_mm", "true diameter"),
         Column("index", "", "index", INDEX),
-        Column("threshold", "", "threshold", "threshold of its statistic, in standard deviations; empty where d' is 0"),
+        Column("threshold", "", "threshold", "its threshold in standard deviations of its statistic; empty if d' is 0"),
         Column("pod", "", "pod", "the ideal observer's probability of detection"),
-        Column("hits", "", "hits", "number of the detector's hits by depth"),
+        Column("hits", "", "hits", "number of the detector's hits by depth (not by missing returns)"),
         Column("inspections", "", "inspections", "number of inspections of the damage, with different noise"),
     ),
 )

@@ -1,6 +1,6 @@
-"""The table of detection limits, and limits in words: the answer, a sentence for each set-up, and notes.
+"""The table of detection limits, and the limits in words: the answer, a sentence for each set-up, and notes.
 
-A curve says nothing about sizes that were not inspected: a size beyond the largest is written ``> 15.9``."""
+A curve says nothing about sizes that were not inspected, so a size beyond the largest is written as ``> 15.9``."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MOST_ANSWERS = 3
 ONE_UNIT = "One unit of the camera"
 NOT_DEMONSTRATED = "not demonstrated"
 BEYOND = "lies beyond the largest size inspected"
-"""Words in a statement's note on an extrapolated bound, which pages put differently."""
+"""Words of a statement's note on an extrapolated bound, which `notes_of` replaces by a sentence of its own."""
 
 
 def is_within_sizes(limit: SetUpLimit, bound: Bound | None = None) -> bool:
@@ -32,22 +32,22 @@ def is_within_sizes(limit: SetUpLimit, bound: Bound | None = None) -> bool:
 
 
 def name_of(limit: SetUpLimit) -> str:
-    """Return the set-up and its frames, for places where lines break."""
+    """Return the set-up with its frames, with no-break spaces between numbers and units."""
     return text.unbroken(limit.record.label)
 
 
 def bound_estimate(limit: SetUpLimit, bound: Bound) -> Estimate:
-    """Return a bound as a table shows it; NaN where it is not demonstrated."""
+    """Return a bound as tables need it; NaN if it is not demonstrated."""
     return Estimate(bound.value if bound.demonstrated else np.nan, most=limit.largest_mm)
 
 
 def bound_text(bound: Estimate) -> str:
-    """Return a bound in mm without its unit, or that there is none."""
+    """Return a bound in mm as text without its unit, or that it is not demonstrated."""
     return NOT_DEMONSTRATED if np.isnan(bound.value) else text.size(bound.value, bound.most)
 
 
 def size_estimate(limit: SetUpLimit, of: str) -> Estimate:
-    """Return a50 or a90 (``of``) with its interval; at most the smallest if all is found; unknown if not above 0."""
+    """Return a50 or a90 (``of``) with its interval; an upper bound if nothing was missed; unknown if not above 0."""
     size_mm, ends = getattr(limit, f"{of}_mm"), getattr(limit, f"{of}_interval_mm")
     if size_mm <= 0:
         return Estimate(np.nan)
@@ -57,8 +57,8 @@ def size_estimate(limit: SetUpLimit, of: str) -> Estimate:
 a50_of, a90_of = (partial(size_estimate, of=of) for of in ("a50", "a90"))
 FOUND_50, FOUND_90 = (f"size found {share} % of the time" for share in (50, 90))
 BRIEF: dict[str, Any] = {"interval": True, "brief": lambda estimate: estimate.text().partition(" ")[0]}
-OF = "kind of these sizes: diameter (for long damage, width or length), or depth where only the depth differs"
-MET = "whether that bound is demonstrated, beyond the inspected sizes or not demonstrated"
+OF = "what these sizes are: diameters (for long damage, widths or lengths), or depths if only the depth varies"
+MET = "status of that bound: demonstrated, beyond the sizes inspected, or not demonstrated"
 EFFECT = "variance of a90 with boards as sampling units over that with damages as sampling units"
 SET_UP = Column("set_up", "set-up", "record.label", "name of the set-up, with its frames", text.unbroken, brief=str)
 CALLS = (
@@ -66,21 +66,21 @@ CALLS = (
         "false_calls_per_m2",
         "calls/m² (95 %)",
         ("false_calls.rate_per_m2", "false_calls.interval_per_m2"),
-        "false calls on undamaged boards, with the exact 95 % Poisson interval",
+        "rate of false calls on undamaged boards, with the exact 95 % Poisson interval",
         lambda rate: "none inspected" if np.isnan(rate.value) else rate.text(),
     ),
-    Column("false_calls", "", "false_calls.calls", "number of false calls on them"),
-    Column("hole_free_m2", "", lambda one: float(one.record.unflawed.area_m2.sum()), "undamaged area inspected"),
+    Column("false_calls", "", "false_calls.calls", "number of these false calls"),
+    Column("hole_free_m2", "", lambda row: float(row.record.unflawed.area_m2.sum()), "undamaged area inspected"),
 )
 
 
 def quoted(limit: SetUpLimit) -> Bound:
-    """Return the limit to quote: that of a new unit if there are several units, else a90/95 of the single unit."""
+    """Return the limit to quote: that of a new unit if the study has several units, else a90/95 of its single unit."""
     return limit.a90_95 if limit.over_units is None else limit.over_units.new_unit
 
 
 def _one_unit(limit: SetUpLimit) -> Estimate:
-    """Return the a90/95 of a study of one unit; of several units, the median with the lowest and the highest."""
+    """Return the a90/95 of the single unit, or the median, lowest and highest a90/95 of several units."""
     bounds = limit.a90_95.value if limit.over_units is None else limit.over_units.a90_95_mm
     middle, low, high = (float(of(bounds)) for of in (np.median, np.min, np.max))
     ends = (low, high) if limit.over_units is not None else (np.nan, np.nan)
@@ -93,7 +93,7 @@ def _verdict(limit: SetUpLimit, bound: Bound) -> str:
 
 
 def _kinds(limit: SetUpLimit) -> tuple[int, int] | None:
-    """Return the hits by depth and by missing returns; None where they were not counted separately."""
+    """Return the numbers of hits by depth and by missing returns; None if they were not counted separately."""
     seen = limit.record.inspected
     if seen.by_depth is None or seen.by_no_return is None:
         return None
@@ -113,34 +113,34 @@ LIMITS = Table(
         SET_UP,
         Column("variant", "", "record.variant", "name of the set-up"),
         Column("frames", "", "record.frames", "number of averaged frames"),
-        Column("<axis>", "", "record.axes", "one column per axis, named by its dotted path: its value", spread=True),
+        Column("<axis>", "", "record.axes", "one column per axis, named by its dotted path: the value", spread=True),
         Column(
             "a90_95_mm",
             "a90/95 (mm)",
-            lambda one: bound_estimate(one, one.a90_95),
-            "upper bound of a90 at 95 % confidence, which is the limit to quote; empty where not demonstrated",
+            lambda row: bound_estimate(row, row.a90_95),
+            "upper bound of a90 at 95 % confidence, which is the limit to quote; empty if not demonstrated",
             bound_text,
-            tone=lambda one: "key" if is_within_sizes(one) else "bad",
+            tone=lambda row: "key" if is_within_sizes(row) else "bad",
         ),
-        Column("a90_95_verdict", "", lambda one: _verdict(one, one.a90_95), MET),
+        Column("a90_95_verdict", "", lambda row: _verdict(row, row.a90_95), MET),
         Column("a90_95_method", "", "a90_95.method", "method by which the bound was computed"),
         Column(
             "over_boards_mm",
             "over boards (mm)",
-            lambda one: bound_estimate(one, one.over_boards),
-            "a90/95 that allows for correlated results of damages on one board",
+            lambda row: bound_estimate(row, row.over_boards),
+            "a90/95 that allows for correlated results of the damages on a board",
             bound_text,
-            tone=lambda one: "" if is_within_sizes(one, one.over_boards) else "bad",
+            tone=lambda row: "" if is_within_sizes(row, row.over_boards) else "bad",
         ),
-        Column("over_boards_verdict", "", lambda one: _verdict(one, one.over_boards), MET),
+        Column("over_boards_verdict", "", lambda row: _verdict(row, row.over_boards), MET),
         Column(
             "new_unit_mm",
             "new unit (mm)",
-            lambda one: bound_estimate(one, quoted(one)) if one.over_units else None,
-            "with several units: upper bound at 95 % confidence of the a90 of a new unit",
+            lambda row: bound_estimate(row, quoted(row)) if row.over_units else None,
+            "if there are several units: upper bound, at 95 % confidence, of the a90 of a new unit",
             lambda bound: text.UNKNOWN_TEXT if bound is None else bound_text(bound),
         ),
-        Column("new_unit_verdict", "", lambda one: _verdict(one, quoted(one)) if one.over_units else None, MET),
+        Column("new_unit_verdict", "", lambda row: _verdict(row, quoted(row)) if row.over_units else None, MET),
         Column("one_unit_mm", "one unit (mm)", _one_unit, "a90/95 of single units: median, lowest, highest", **BRIEF),
         Column("unit_spread", "", "over_units.spread", "standard deviation of ln a90 between units, noise included"),
         Column("units", "", "record.units", "number of units of the camera"),
@@ -148,8 +148,8 @@ LIMITS = Table(
         Column("a50_mm", "a50 (mm)", a50_of, f"{FOUND_50}, with its 95 % interval over boards", **BRIEF),
         Column("limit_of", "", "record.inspected.limit_of", OF),
         Column("is_at_most", "", "is_at_most", "whether everything was found, so that a50 and a90 are upper bounds"),
-        Column("smallest_mm", "", lambda one: _ends_mm(one)[0], "smallest size inspected"),
-        Column("largest_mm", "", lambda one: _ends_mm(one)[1], "largest size inspected"),
+        Column("smallest_mm", "", lambda row: _ends_mm(row)[0], "smallest size inspected"),
+        Column("largest_mm", "", lambda row: _ends_mm(row)[1], "largest size inspected"),
         *CALLS,
         Column(
             "beside_per_m2",
@@ -159,7 +159,7 @@ LIMITS = Table(
             CALLS[0].text,
             brief=lambda rate: text.UNKNOWN_TEXT if np.isnan(rate.value) else f"{rate.value:.2g}",
         ),
-        Column("beside_calls", "", "beside.calls", "number of such findings"),
+        Column("beside_calls", "", "beside.calls", "number of these findings"),
         Column("", "found", _found, brief=False),
         Column("hits", "", "hits", "number of hits"),
         Column("inspections", "", "inspections", "number of inspections: damages times repeats"),
@@ -175,22 +175,22 @@ LIMITS = Table(
             "seconds_detect",
             "ms a cloud",
             "seconds_detect",
-            "median time to detect and measure on a damaged board",
+            "median time in seconds to detect and measure damage on a damaged board",
             lambda seconds: text.UNKNOWN_TEXT if np.isnan(seconds) else f"{1e3 * seconds:.0f}",
             brief=False,
         ),
-        Column("hits_by_depth", "", lambda one: (_kinds(one) or (None, None))[0], "hits by depth"),
-        Column("hits_by_no_return", "", lambda one: (_kinds(one) or (None, None))[1], "hits by missing returns"),
+        Column("hits_by_depth", "", lambda row: (_kinds(row) or (None, None))[0], "hits by depth"),
+        Column("hits_by_no_return", "", lambda row: (_kinds(row) or (None, None))[1], "hits by missing returns"),
         Column("targets", "targets", "targets", "number of damages", brief=False),
         Column("boards", "boards", "boards", "number of damaged boards"),
         Column("design_effect", "design effect", "design_effect", EFFECT, text.mm, brief=False),
         Column("threshold", "", "record.threshold", "threshold in the detector's units"),
-        Column("threshold_mm", "", "record.threshold_mm", "threshold times the mean scale"),
+        Column("threshold_mm", "", "record.threshold_mm", "threshold times the mean residual per unit of score"),
         Column("calibration_runs", "", "record.calibration_runs", "number of calibration runs; 0: threshold was given"),
         Column("detector", "", "record.detector", "name of the detector"),
         Column("detector_version", "", "record.detector_version", "version of the detector"),
         Column("failed", "", "record.failed", "number of trials that failed"),
-        Column("notes", "", lambda one: "; ".join(notes_of(one)), "remarks on the limit"),
+        Column("notes", "", lambda row: "; ".join(notes_of(row)), "remarks on the limit"),
     ),
     title="detection limits: sizes found 50 and 90 % of the time, and 90 % with 95 % confidence",
 )
@@ -200,7 +200,7 @@ SCORES = Table(
     "one row per category of a data set: quality of anomaly maps on the inspected pixels",
     (
         Column("category", "category", note="name of the category"),
-        Column("au_pro", "AU-PRO", note="area under the per-region overlap up to 30 % false pixels, over 0.3"),
+        Column("au_pro", "AU-PRO", note="area under the per-region overlap up to 30 % false pixels, divided by 0.3"),
         Column("pixel_auroc", "AUROC of pixels", note="area under the ROC curve of pixels"),
         Column("board_auroc", "AUROC of boards", note="area under the ROC curve of boards, by their highest pixels"),
     ),
@@ -209,7 +209,7 @@ SCORES = Table(
 
 
 def limits_grid(limits: Sequence[SetUpLimit], *, terminal: bool = False) -> Grid:
-    """Return the table. It has columns on units if there are several; with a single unit, its title says so."""
+    """Return the table. It has columns on units if there are several; if there is only one, the title says so."""
     if any(limit.over_units for limit in limits):
         return LIMITS.grid(limits, terminal=terminal, heads={"a90/95 (mm)": "all units (mm)", "over boards (mm)": ""})
     grid = LIMITS.grid(limits, terminal=terminal, heads={"new unit (mm)": "", "one unit (mm)": ""})
@@ -222,7 +222,7 @@ def _ends_mm(*limits: SetUpLimit) -> tuple[float, float]:
 
 
 def study_answer(limits: Sequence[SetUpLimit]) -> str:
-    """Return a sentence for each set-up, or the range of limits of many. With a single unit, it begins by saying so."""
+    """Return a sentence for each set-up, or the range of many limits. An answer for a single unit says so first."""
     if not limits:
         return "No set-up was inspected, so there is no answer."
     answer = _answer(limits)
@@ -252,7 +252,7 @@ def _answer(limits: Sequence[SetUpLimit]) -> str:
 
 
 def limit_sentence(limit: SetUpLimit, *, again: bool = False) -> str:
-    """Return ``50 frames: damage of 5.31 mm is found 90 % ...``; ``again``, where that was said, the size alone."""
+    """Return ``50 frames: damage of 5.31 mm is found 90 % ...``, or only the size after such a sentence (``again``)."""
     quote, new = quoted(limit), ""
     if limit.over_units is not None:
         new = f" by a new unit of the camera, judged from {limit.over_units.units},"
@@ -260,7 +260,7 @@ def limit_sentence(limit: SetUpLimit, *, again: bool = False) -> str:
         reason = _reason(quote)
         if reason.startswith("a constant probability"):
             reason = f"the hits do not grow clearly with {limit.record.inspected.limit_of}"
-        # the notes give the statistics in brackets
+        # the statistics in brackets are left to the notes
         found = f"a90/95 is {NOT_DEMONSTRATED}: {re.sub(r' [(][^()]*[<>=][^()]*[)]', '', reason)}"
     elif not is_within_sizes(limit, quote):
         found = f"no limit (a90/95) within the sizes inspected{_sizes(limit)}"
@@ -283,32 +283,32 @@ def limit_sentence(limit: SetUpLimit, *, again: bool = False) -> str:
 
 
 def notes_of(limit: SetUpLimit) -> list[str]:
-    """Return why there is no limit, or why it is cautious or doubtful."""
+    """Return the reasons why there is no limit, or why the limit is cautious or doubtful."""
     notes = [] if limit.a90_95.demonstrated else [_reason(limit.a90_95)]
     stated = limit.statement
     if stated is None:
         notes += [limit.a90_95.method] if limit.a90_95.demonstrated else []
     else:
         if limit.a90_95.demonstrated and not is_within_sizes(limit):
-            notes.append(f"a90/95 {BEYOND}, {limit.largest_mm:.3g} mm, and no inspection bears it out")
+            notes.append(f"a90/95 {BEYOND}, {limit.largest_mm:.3g} mm, so no inspection supports it")
         notes += [note.partition(": see --")[0] for note in stated.notes if BEYOND not in note]
     if limit.a50_mm <= 0:
-        notes.append("the curve hardly rises with size: it would put sizes found below 0, which are not stated")
+        notes.append("the curve hardly rises with size: the sizes found would lie below 0, so they are not stated")
     if limit.boards_matter and limit.over_units is None:
         effect = f"design effect {limit.design_effect:.1f}"
-        notes.append(f"damages of one board fare alike ({effect}): the limit over boards is the one to quote")
+        notes.append(f"the results of damages on one board are correlated ({effect}): quote the limit over boards")
     only = limit.hits - (_kinds(limit) or (limit.hits,))[0]
     if only:
-        notes.append(f"{only} of {limit.hits} hits by missing returns alone: nothing came back to measure")
+        notes.append(f"{only} of {limit.hits} hits by missing returns alone, which leave no depth to measure")
     if limit.record.failed:
-        notes.append(f"{limit.record.failed} trials failed and are missing")
+        notes.append(f"{limit.record.failed} trials failed and are not included")
     return notes
 
 
 def limit_notes(limits: Sequence[SetUpLimit]) -> list[str]:
     """Return notes on the limits: first those that all set-ups share, then a line for each set-up."""
     notes = [(limit.record.label, notes_of(limit)) for limit in limits]
-    shared = [one for one in notes[0][1] if all(one in these for _, these in notes)] if len(notes) > 1 else []
+    shared = [note for note in notes[0][1] if all(note in these for _, these in notes)] if len(notes) > 1 else []
     own = [("every set-up", shared), *((name, [one for one in these if one not in shared]) for name, these in notes)]
     return [f"{name}: {'; '.join(these)}" for name, these in own if these]
 
@@ -318,6 +318,6 @@ def _reason(bound: Bound) -> str:
 
 
 def _sizes(*limits: SetUpLimit) -> str:
-    """Return `` (4.3 to 15.9 mm)``: the sizes inspected; empty without any."""
+    """Return the range of sizes inspected as `` (4.3 to 15.9 mm)``; empty if there is none."""
     low, high = _ends_mm(*limits)
     return "" if np.isnan(low) else f" ({low:.3g} to {high:.3g} mm)"

@@ -1,4 +1,4 @@
-"""Declares the files that programs write into a folder of results, for `harness.clean` and `results/README.md`."""
+"""Declares the files that programs write into a results folder, for `harness.clean` and `results/README.md`."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ FolderKind = Literal["results", "capture"]
 
 @dataclass(frozen=True)
 class Output:
-    """A file; * and ? in its ``name`` stand for several. ``note``: its content. ``place``: a folder of results, or the
-    folder of a real capture in it. ``of``: the kind of experiment or program that writes it; empty: every sweep."""
+    """A file, or several if ``name`` holds * or ?. ``note`` describes its content. ``place`` is a results folder or a
+    real capture's folder in it. ``of`` is the kind of experiment or program that writes it; empty for every sweep."""
 
     name: str
     note: str
@@ -22,12 +22,12 @@ class Output:
     of: str = ""
 
 
-REPORT = Output("report.html", "the report, one file, readable offline")
+REPORT = Output("report.html", "the report: a single file that can be read offline")
 EXPERIMENT = Output("experiment.yaml", "the experiment with every default written out")
 PROVENANCE = Output("provenance.json", "command, commit, versions, seed, machine, failures")
 STUDY = Output("study.json", "every inspection of every set-up: what `harness.compare` reads", of="study")
 LEARNED = Output("learning-*.npz", "what a detector has learned from separate hole-free boards: arrays by name")
-MAPS = Output("map-*.html", "a map that turns in the browser", of="views")
+MAPS = Output("map-*.html", "a map that can be turned in the browser", of="views")
 CAPTURES = Output("summary.csv", "one row per point: threshold, frames, findings", of="capture")
 COMPARISON = Output("compare.json", "the comparison with another study, for programs", of="check")
 COMPARISON_PAGE = Output("compare.html", "the comparison as a page", of="check")
@@ -36,10 +36,10 @@ COVERAGE_PAGE = Output("coverage.html", "the part in 3-D, coloured by the size o
 ATLAS_PAGE = Output("atlas.html", "the atlas of limits: choose damage, size and distance", of="atlas")
 ATLAS_PICTURE = Output("atlas.png", "the atlas as a picture", of="atlas")
 FINDINGS = Output("findings.csv", "one row per finding", "capture", "capture")
-FINDINGS_DATA = Output("findings.json", "findings, both measures, target, settings, origin", "capture", "capture")
+FINDINGS_DATA = Output("findings.json", "findings by both measures, target, settings, origin", "capture", "capture")
 ANNOTATED = Output("annotated.png", "the findings drawn on the depth image", "capture", "capture")
 TARGETS = Output("targets.png", "the targets that were found, with the chosen target", "capture", "capture")
-BLIND = Output("blind.png", "the pixels from which nothing came back", "capture", "capture")
+BLIND = Output("blind.png", "the pixels without a return", "capture", "capture")
 GAUGE_ROWS = Output("gauge.csv", "hits and misses of a gauge board's holes", "capture", "capture")
 CLOUD = Output("cloud.ply", "the cloud, with findings in magenta", "capture", "capture")
 FILES = (
@@ -52,7 +52,7 @@ LOCK_NAME = re.compile(r"\.lock(-[0-9]+-of-[0-9]+)?")
 
 
 def outputs() -> Iterator[Output]:
-    """Yield every file, those of tables included."""
+    """Yield every file, including those of tables."""
     from harness.tables.atlas import ATLAS
     from harness.tables.coverage import COVERAGE_TABLES
     from harness.tables.efficiency import EFFICIENCY_TABLES
@@ -74,5 +74,5 @@ def outputs() -> Iterator[Output]:
 
 
 def is_output(name: str, place: FolderKind) -> bool:
-    """Return whether a program writes a file of this name at this place."""
+    """Return whether a program writes a file with this name to this place."""
     return any(one.place == place and fnmatchcase(name, one.name) for one in outputs())

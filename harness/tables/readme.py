@@ -14,9 +14,9 @@ from harness.tables.trials import FINDINGS_OF_CAPTURE, POINTS_OF_CAPTURES, STORE
 
 HEAD = f"""# Results
 
-Written by `python -m harness.tables.readme` from the declarations in `harness/tables`; a test keeps it current.
+`python -m harness.tables.readme` writes this file from the declarations in `harness/tables`; a test keeps it current.
 
-Sweeps write into `results/<experiment>/<digest>/`; the digest covers all settings that can change a result.
+Sweeps write to `results/<experiment>/<digest>/`; the digest covers all settings that can change a result.
 `results/<experiment>/{LATEST}` is a link to the newest run that has a report (a text file with its name where the
 system has no links). `python -m harness.ls results` lists all runs, the settings in which they differ, and their
 detection limits; `python -m harness.clean results` removes them. `{JOURNAL}/` holds finished trials, so that the same
@@ -25,15 +25,15 @@ command resumes an interrupted sweep. `harness.check` compares with `baselines/`
 TABLES = """
 # Tables
 
-Parquet files hold all digits. Their schema holds each column's unit and description, and their origin (key `tofpod`:
+Parquet files hold all digits. Their schema holds each column's unit and description, and the origin (key `tofpod`:
 commit, versions, seed). CSV files hold six digits. The ending of a column's name is its unit. An empty cell means that
 the value is unknown or not demonstrated. `x_low` and `x_high` are the ends of the 95 % interval of `x`. Tables without
 rows are not written. An experiment with axes has another column for each axis, named by its dotted path."""
 GROUPS = {
     "": "Every sweep",
-    "study": "Also in a study of detection limits",
-    "views": "Also in an experiment with several views",
-    "capture": "In an experiment on real captures (in `point-000/`, ..., but for `summary.csv`)",
+    "study": "Additional files of a study of detection limits",
+    "views": "Additional files of an experiment with several views",
+    "capture": "Files of an experiment on real captures (in `point-000/`, ..., except `summary.csv`)",
     "check": "Also written by `harness.check`",
     "efficiency": "Also written by `harness.efficiency`",
     "coverage": "Written by `harness.coverage`",
@@ -45,7 +45,7 @@ def results_readme() -> Iterator[str]:
     yield HEAD
     for of, title in GROUPS.items():
         yield from ("", f"## {title}", "", "| file | content |", "|---|---|")
-        yield from (f"| `{one.name}` | {one.note} |" for one in FILES if one.of == of)
+        yield from (f"| `{output.name}` | {output.note} |" for output in FILES if output.of == of)
     yield TABLES
     of_trials = [table for table in STORED if table not in STUDY_ONLY]
     yield from _tables("Trials", of_trials)

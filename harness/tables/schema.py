@@ -1,10 +1,10 @@
 """Declarations of result tables: a new column is one line.
 
-A `Table` is a name, what a row is, and its columns. A `Column` says how it is called in data files (``name``, whose
-ending is its unit) and on pages and terminals (``label``); either may be empty. Its ``value`` is a dotted path of a
-row's attributes (a pair of paths for an estimate and its interval), or a function of the row; without it, the entry of
-the same name in a mapping. Its ``note`` says what it means, its ``text`` how a value reads. An estimate with an
-interval fills three columns of a file (``speed_m``, ``speed_low_m``, ``speed_high_m``) and one of a page.
+A `Table` has a name, a note on what a row is, and columns. A `Column` has a ``name`` for data files, whose ending is
+its unit, and a ``label`` for pages and terminals; either may be empty. Its ``value`` is a dotted path of a row's
+attributes (a pair of paths for an estimate and its interval) or a function of the row; without it, the row is a mapping
+with an entry of the same name. The ``note`` gives the column's meaning; ``text`` formats a value. An estimate with an
+interval fills three columns of a file (``speed_m``, ``speed_low_m``, ``speed_high_m``) and one column of a page.
 
     name = Column("animal", "animal", "species.name", "name of the species")
     speed = Column("speed_m", "speed (m/s)", ("speed", "interval"), "metres in a second")
@@ -34,13 +34,13 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LISTS_AT_ONCE = 1_000
-"""Number of rows with lists whose elements become rows of a file at a time, some 5 MB."""
+"""Number of rows whose lists are expanded to rows of a file at a time; they take about 5 MB."""
 UNITS = {"_per_m2": "1/m²", "_m2": "m²", "_mm3": "mm³", "_mm": "mm", "_m": "m", "_s": "s", "_mb": "MB", "_px": "pixels"}
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with the ends of its interval, NaN where unknown; ``> most`` beyond ``most``, ``≤`` if ``at_most``."""
+    """A number with its interval, NaN if unknown; shown as ``> most`` beyond ``most``, with ``≤`` if ``at_most``."""
 
     value: float
     low: float = np.nan
@@ -56,7 +56,7 @@ class Estimate:
 
 
 def _share(share: float | Estimate) -> str:
-    """``0.12 % (0.05 to 0.2 %)``."""
+    """Return a share as text, such as ``0.12 % (0.05 to 0.2 %)``."""
     one = share if isinstance(share, Estimate) else Estimate(share)
     value, low, high = (f"{100 * x:.{2 if x < 0.995 else 3}g}" for x in (one.value, one.low, one.high))
     ends = f" ({low} to {high} %)" if np.isfinite(one.low) else ""
@@ -70,13 +70,13 @@ FORMATS: dict[str, Callable[[Any], str]] = {
     "_p": text.p_value,
     "": lambda value: value.text() if isinstance(value, Estimate) else text.plain(value),
 }
-"""Default texts of numbers by the endings of columns' names."""
+"""Default formats of numbers, by the endings of column names."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a result table; see the module's first lines. ``interval``: its values are `Estimate`; ``spread``:
-    mappings, each key a column of its own; ``brief``: its text at a terminal, False where it is not shown there."""
+    """A column of a result table, as the module's docstring describes it. ``interval``: its values are `Estimate`.
+    ``spread``: they are mappings, and each key becomes a column. ``brief``: text at a terminal, False to hide it."""
 
     name: str
     label: str = ""
@@ -90,12 +90,12 @@ class Column:
 
     @property
     def unit(self) -> str:
-        """The unit that the name's ending says, or empty."""
+        """The unit that the ending of the name states, or an empty text."""
         return next((unit for ending, unit in UNITS.items() if self.name.endswith(ending)), "")
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The column's names in files: of an interval three."""
+        """The column's names in files; an interval has three."""
         if not (self.interval or isinstance(self.value, tuple)):
             return (self.name,)
         ending = next((ending for ending in UNITS if self.name.endswith(ending)), "")
@@ -103,7 +103,7 @@ class Column:
         return (self.name, f"{stem}_low{ending}", f"{stem}_high{ending}")
 
     def of(self, row: Any) -> Any:
-        """Return the row's value; None where a mapping lacks it or an attribute on its path is None."""
+        """Return the row's value; None if a mapping lacks it or an attribute on its path is None."""
         if self.value is None:
             values = [row.get(name) for name in self.names]
             return values[0] if len(values) == 1 or values[0] is None else Estimate(*values)
@@ -126,9 +126,9 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """A result table. ``note``: what a row is; ``order``: sorts rows; ``formats``: its files, ``digits`` those of CSV;
-    ``title``: above it at a terminal; ``always``: written without rows too; ``left``: columns of text on a page;
-    ``lists``: columns whose values are lists in memory, of which each element is a row of the files."""
+    """A result table. ``note`` says what a row is, ``order`` names the columns that sort rows, ``formats`` its files,
+    ``digits`` the precision of CSV, ``title`` the title at a terminal. ``always`` writes it even without rows; ``left``
+    columns hold text on a page; ``lists`` names columns whose list elements become rows of the files."""
 
     name: str
     note: str
@@ -169,7 +169,7 @@ class Table:
         return found
 
     def frame(self, rows: Iterable[Any]) -> pd.DataFrame:
-        """Return the rows as a DataFrame; columns that hold numbers and text are text."""
+        """Return the rows as a DataFrame; columns with both numbers and text become text."""
         import pandas as pd
 
         records = self.records(rows)
@@ -187,7 +187,7 @@ class Table:
         return frame
 
     def data(self, rows: Iterable[Any]) -> list[dict[str, Any]]:
-        """Return the rows as JSON's types; what is no finite number is None."""
+        """Return the rows as JSON types; numbers that are not finite become None."""
         return [jsonable(record) for record in self.records(rows)]
 
     def grid(
@@ -198,8 +198,8 @@ class Table:
         heads: Mapping[str, str] | None = None,
         only: Collection[str] = (),
     ) -> Grid:
-        """Return the labelled columns as text, for a page or in brief for a ``terminal``. ``only``: labels of those
-        shown. ``heads``: other labels in place of those declared; empty for a column to be left out."""
+        """Return the labelled columns as text, for a page or in brief for a ``terminal``. ``only`` lists the labels to
+        show; ``heads`` replaces declared labels, and an empty label hides its column."""
         shown = [column for column in self.columns if column.label and not (terminal and column.brief is False)]
         labels = {one: (heads or {}).get(one.label, one.label) for one in shown if not only or one.label in only}
         shown = [column for column, label in labels.items() if label]
@@ -208,8 +208,8 @@ class Table:
 
 
 def write_table(folder: Path, table: Table, frame: pd.DataFrame, about: Mapping[str, Any] | None = None) -> None:
-    """Write a table's files: CSV; Parquet with units and notes in its schema, ``about`` as JSON under "tofpod". Without
-    rows none, and those of an earlier run are removed. Raises UserError where the folder cannot be written."""
+    """Write a table's files: CSV, and Parquet with units and notes in its schema and ``about`` as JSON under "tofpod".
+    Without rows, the files of an earlier run are removed. Raises UserError if the folder cannot be written."""
     for ending, name in zip(table.formats, table.files, strict=True):
         if frame.empty and not table.always:
             (Path(folder) / name).unlink(missing_ok=True)
@@ -242,11 +242,11 @@ def write_table(folder: Path, table: Table, frame: pd.DataFrame, about: Mapping[
 
 
 def _unfolded(frame: pd.DataFrame, lists: Sequence[str]) -> pd.DataFrame:
-    """Return one row for each element of the rows' ``lists``."""
+    """Return a row for each element of the rows' ``lists``."""
     if not lists or frame.empty:
         return frame
     rows = np.repeat(np.arange(len(frame)), frame[lists[0]].map(len))
-    whole = np.zeros(0, int)  # makes counts whole numbers of 64 bits
+    whole = np.zeros(0, int)  # makes counts 64-bit integers
     elements = {name: np.concatenate([*frame[name].to_numpy(), whole]) for name in lists}
     return frame.drop(columns=list(lists)).iloc[rows].assign(**elements)[list(frame.columns)]
 

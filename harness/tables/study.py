@@ -1,4 +1,4 @@
-"""Tables of a study besides its limits: thresholds, hits by chance, operating points, axes, limits of depth."""
+"""Tables of a study besides its limits: thresholds, chance hits, operating points, axes, and limits of depth."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ from harness.tables.text import Grid
 from harness.vocabulary.path_names import camera_title, differing, names_of, on_one_line, unit_of, value_text
 
 BLOB_PX = 5.0
-"""Distance on the sensor within which two highest scores belong to one blob: the width of a camera's filter."""
+"""Distance on the sensor within which two highest scores belong to the same blob: the width of a camera's filter."""
 HIGH_THRESHOLD = 10.0
-"""Standard deviations: a hole-free board's highest score is 4 with Gaussian noise, 5 to 6 with a fixed pattern."""
+"""Standard deviations. A hole-free board's highest score is 4 with Gaussian noise, 5 to 6 with a fixed pattern."""
 OFF_BOARD = "off the board"
 SHOWN_ROWS = 60
-BOUND = "upper bound of a90 at 95 % confidence; empty where not demonstrated"
+BOUND = "upper bound of a90 at 95 % confidence; empty if not demonstrated"
 
 SET_UP_OF = Column("set_up", "set-up", "limit.record.label", SET_UP.note, text.unbroken)
 UNFLAWED = ("chance.of_sites", "chance.sites_interval")
 CHANCE = Table(
     "chance",
-    "one row per set-up and number of frames: how often a finding of something else would count as a hit",
+    "one row per set-up and number of frames: how often an unrelated finding would count as a hit",
     (
         SET_UP_OF,
         Column("shuffled_share", "shuffled positions", "chance.probability", "places near another board's finding"),
@@ -50,14 +50,14 @@ CHANCE = Table(
         Column("expected_share", "from the rate", "chance.expected", "share if false calls were spread evenly"),
     ),
 )
-GIVEN, UNSET = "number of calibration runs; 0: threshold was given", "none: given"
+GIVEN, UNSET = "number of calibration runs; 0 for a given threshold", "none: given"
 THRESHOLDS = Table(
     "thresholds",
     "one row per set-up and number of frames: its threshold, and the false calls at that threshold on other boards",
     (
         SET_UP,
         Column("threshold", "threshold", "record.threshold", "threshold in the detector's units"),
-        Column("threshold_mm", "in mm", "record.threshold_mm", "threshold times the mean scale"),
+        Column("threshold_mm", "in mm", "record.threshold_mm", "threshold times the mean residual per unit of score"),
         Column("calibration_runs", "calibration runs", "record.calibration_runs", GIVEN, lambda n: str(n or UNSET)),
         replace(CALLS[0], label="per m² (95 %)"),
         replace(CALLS[1], label="false calls on other boards"),
@@ -68,7 +68,7 @@ THRESHOLDS = Table(
 
 @dataclass(frozen=True)
 class SetBy:
-    """The hole-free run that set a threshold. ``same_pixels``: runs with their highest score on the same pixels."""
+    """The hole-free run that set a threshold. ``same_pixels`` counts runs with the highest score on the same pixels."""
 
     limit: SetUpLimit
     board: int
@@ -79,7 +79,7 @@ class SetBy:
 
     @property
     def place(self) -> str:
-        """The place in mm as text."""
+        """The place on the board in mm, as text."""
         return f"{self.x_mm:.0f}, {self.y_mm:.0f}".replace("-", "−") if np.isfinite(self.x_mm) else OFF_BOARD
 
 
@@ -98,24 +98,24 @@ def set_by(limits: Sequence[SetUpLimit]) -> list[SetBy]:
 
 
 def threshold_warnings(limits: Sequence[SetUpLimit]) -> list[str]:
-    """Return warnings of calibrated thresholds that are too high for noise, or that one place on the sensor sets."""
+    """Return warnings about calibrated thresholds that are too high for noise or set by one place on the sensor."""
     rows = set_by(limits)
-    warnings, crowded = [], [one for one in rows if (one.same_pixels or 0) > max(one.runs / 2, 1)]
+    warnings, crowded = [], [row for row in rows if (row.same_pixels or 0) > max(row.runs / 2, 1)]
     if crowded:
-        counts = sorted({one.same_pixels or 0 for one in crowded})
+        counts = sorted({row.same_pixels or 0 for row in crowded})
         where = crowded[0].limit.record.label if len(crowded) == 1 else f"{len(crowded)} of {len(limits)} set-ups"
         warnings.append(
             f"{where}: {' to '.join(map(str, counts[:1] + counts[1:][-1:]))} of {crowded[0].runs} calibration boards "
             "have their highest score on the same pixels of the sensor: one place of this unit's fixed pattern sets "
-            "the threshold (study.units draws several units)"
+            "the threshold (set study.units to draw several units)"
         )
-    for one in rows:
-        threshold = one.limit.record.threshold
+    for row in rows:
+        threshold = row.limit.record.threshold
         if threshold > HIGH_THRESHOLD:
-            where = one.place if one.place == OFF_BOARD else f"at x, y = {one.place} mm"
+            where = row.place if row.place == OFF_BOARD else f"at x, y = {row.place} mm"
             warnings.append(
-                f"{one.limit.record.label}: the threshold is {threshold:.3g} deviations, above {HIGH_THRESHOLD:g}: "
-                f"something other than noise sets it (calibration board {one.board}, {where}), and the limit with it"
+                f"{row.limit.record.label}: the threshold is {threshold:.3g} deviations, above {HIGH_THRESHOLD:g}: "
+                f"something other than noise sets it (calibration board {row.board}, {where}) and thus the limit"
             )
     return warnings
 
@@ -125,12 +125,12 @@ def threshold_note(record: StudyRecord) -> str:
     if stated := record.provenance.get("thresholds"):
         return str(stated)
     if record.false_calls_per_m2 is None:
-        return "Thresholds were given, not calibrated: the rates beside them are what came of it."
+        return "Thresholds were given, not calibrated; the rates beside them are those that were observed."
     wanted = record.false_calls_per_m2
     return (
-        f"Calibrated to {wanted:g} false call{'' if wanted == 1 else 's'} per m² on undamaged boards of their own: the "
-        "threshold is the lowest of their runs' highest scores that, by order statistics (Wilks 1941), keeps to that "
-        "rate. It is itself an estimate: the rate on other boards scatters about the wanted one."
+        f"Thresholds are calibrated to {wanted:g} false call{'' if wanted == 1 else 's'} per m² on separate undamaged "
+        "boards: a threshold is the lowest of their runs' highest scores that keeps to that rate by order statistics "
+        "(Wilks 1941). It is itself an estimate: the rate on other boards scatters about the wanted rate."
     )
 
 
@@ -150,16 +150,16 @@ OPERATING = Table(
 def operating_notes(results: Sequence[SetUpResult]) -> list[str]:
     """Return the definition of AU-PRO, and the set-ups for which it could not be computed."""
     text = (
-        "AU-PRO: mean over damages of the share of pixels above, against undamaged pixels above, up to a share of "
-        f"{PRO_LIMIT:g} and divided by it, as MVTec AD does."
+        "AU-PRO: area under the mean share of a damage's pixels above the threshold, against the share of undamaged "
+        f"pixels above it, up to a share of {PRO_LIMIT:g} and divided by {PRO_LIMIT:g}, as in MVTec AD."
     )
-    without = [one for one in results if one.pixels is not None and one.pixels.why]
+    without = [result for result in results if result.pixels is not None and result.pixels.why]
     return [text, *(f"{name_of(one.limit)}: no AU-PRO: {one.pixels.why}." for one in without if one.pixels)]
 
 
 @dataclass(frozen=True, eq=False)
 class AxisGroup:
-    """One axis: its ``values``, ascending if they are numbers, and its ``lines``, by their values on other axes."""
+    """An axis: its ``values``, ascending if they are numbers, and its ``lines`` by their values on the other axes."""
 
     path: str
     name: str
@@ -168,7 +168,7 @@ class AxisGroup:
 
     @property
     def numeric(self) -> bool:
-        """True where the values have places on a scale."""
+        """True if the values have places on a scale."""
         return all(line.numeric for line in self.lines.values())
 
     def words(self, value: Any) -> str:
@@ -177,13 +177,13 @@ class AxisGroup:
 
     @property
     def title(self) -> str:
-        """The axis with its unit."""
+        """The name of the axis with its unit."""
         unit = unit_of(self.path)
         return f"{self.name} ({unit})" if unit else self.name
 
 
 def axis_groups(lines: Sequence[AxisLine]) -> list[AxisGroup]:
-    """Return the lines of each axis; a line's label gives the values of the other axes that differ among lines."""
+    """Return the lines of each axis. A line's label gives its values on those other axes on which the lines differ."""
     names = names_of(dict.fromkeys(path for line in lines for path in (line.axis, *line.held)))
     groups = []
     for path in dict.fromkeys(line.axis for line in lines):
@@ -193,7 +193,7 @@ def axis_groups(lines: Sequence[AxisLine]) -> list[AxisGroup]:
         varied = [other for other, values in taken.items() if len(set(map(on_one_line, values))) > 1]
 
         def held(line: AxisLine, other: str, values: Sequence[Any]) -> str:
-            """Return a label: a name such as ``kinect_v2`` explains itself, a number needs its key (``albedo=0.2``)."""
+            """Return a label; a name such as ``kinect_v2`` explains itself, a number needs a key (``albedo=0.2``)."""
             words = axis_value(other, differing(line.held[other], values))
             return words if other == FRAMES or isinstance(line.held[other], str) else f"{names[other]}={words}"
 
@@ -216,7 +216,7 @@ def axis_value(path: str, value: Any) -> str:
 
 
 class AxisRow(NamedTuple):
-    """One value of one line of an axis. ``step``: the change of a90 from the previous value."""
+    """One value of one line of an axis. ``step`` is the change of a90 from the previous value."""
 
     group: AxisGroup
     line: str
@@ -252,14 +252,14 @@ AXES = Table(
     (
         Column("axis", "", "group.path", "dotted path of the axis"),
         Column("line", "set-ups", "line", "values of the line's set-ups on the other axes"),
-        Column("value", "", lambda one: on_one_line(one.value), "value on the axis"),
-        Column("", "value", lambda one: one.group.words(one.value)),
+        Column("value", "", lambda row: on_one_line(row.value), "value on the axis"),
+        Column("", "value", lambda row: row.group.words(row.value)),
         replace(SET_UP_OF, label=""),
-        Column("a50_mm", "a50 (mm)", lambda one: a50_of(one.limit), f"{FOUND_50}, with interval", interval=True),
-        Column("a90_mm", "a90 (mm)", lambda one: a90_of(one.limit), f"{FOUND_90}, with interval", interval=True),
-        Column("a90_95_mm", "a90/95 (mm)", lambda one: bound_estimate(one.limit, one.limit.a90_95), BOUND, bound_text),
-        Column("", "a90 over that above", _step_text),
-        Column("ratio", "", ("step.ratio", "step.interval"), "a90 over that of the previous value, with interval"),
+        Column("a50_mm", "a50 (mm)", lambda row: a50_of(row.limit), f"{FOUND_50}, with interval", interval=True),
+        Column("a90_mm", "a90 (mm)", lambda row: a90_of(row.limit), f"{FOUND_90}, with interval", interval=True),
+        Column("a90_95_mm", "a90/95 (mm)", lambda row: bound_estimate(row.limit, row.limit.a90_95), BOUND, bound_text),
+        Column("", "a90 over the row above", _step_text),
+        Column("ratio", "", ("step.ratio", "step.interval"), "a90 over a90 at the previous value, with interval"),
         Column("beyond_chance", "", "step.beyond_chance", "whether that interval excludes 1"),
         Column("paired", "", "step.paired", "whether both set-ups inspected the same boards"),
     ),
@@ -273,15 +273,15 @@ def axis_grid(group: AxisGroup) -> Grid:
 
 
 def axis_note(group: AxisGroup) -> str:
-    """Return an explanation of the changes and their intervals."""
+    """Explain the changes of a90 and their intervals."""
     steps = [step for line in group.lines.values() for step in line.steps]
     paired = "the same boards, resampled together" if all(step.paired for step in steps) else "not all of them the same"
     beyond = sum(step.beyond_chance for step in steps)
     rows = sum(len(line.values) for line in group.lines.values())
     cut = f" The first {SHOWN_ROWS} of {rows} rows are shown." if rows > SHOWN_ROWS else ""
     return (
-        f"Ratio of a90 with its 95 % interval over boards ({paired}). A * marks an interval without 1: {beyond} of "
-        f"{len(steps)}. The intervals are a little narrow: 8 to 9 % of equal pairs get a *, not 5 %.{cut}"
+        f"Ratio of a90 with its 95 % interval over boards ({paired}). A * marks an interval that excludes 1: {beyond} "
+        f"of {len(steps)}. The intervals are a little narrow: 8 to 9 % of equal pairs get a *, not 5 %.{cut}"
     )
 
 
@@ -294,9 +294,9 @@ class DepthAt(NamedTuple):
 
 
 def depths_at(results: Sequence[SetUpResult]) -> list[DepthAt]:
-    """Return the contours of all surfaces."""
+    """Return the contours at a probability of 90 % of all surfaces."""
     rows = []
-    for limit, surface in ((one.limit, one.surface) for one in results if one.surface is not None):
+    for limit, surface in ((result.limit, result.surface) for result in results if result.surface is not None):
         depths = np.stack([surface.d90_mm, surface.d90_low_mm, surface.d90_high_mm], axis=1).tolist()
         for diameter, (depth, low, high) in zip(surface.diameter_mm.tolist(), depths, strict=True):
             rows.append(DepthAt(limit, diameter, Estimate(depth, low, high, surface.depth_range_mm[1])))
@@ -309,7 +309,7 @@ DEPTH_LIMITS = Table(
     (
         SET_UP_OF,
         Column("diameter_mm", "diameter (mm)", "diameter_mm", "diameter of the damage"),
-        Column("depth_mm", "depth (mm)", "depth", "depth found 90 % of the time; inf: no depth is", interval=True),
+        Column("depth_mm", "depth (mm)", "depth", "depth found 90 % of the time; inf if no depth is", interval=True),
     ),
 )
 STUDY_TABLES = (LIMITS, THRESHOLDS, CHANCE, OPERATING, AXES, DEPTH_LIMITS)
@@ -321,7 +321,7 @@ def study_tables(result: StudyResult) -> dict[Table, list[Any]]:
     return {
         LIMITS: list(limits),
         THRESHOLDS: list(limits),
-        CHANCE: [one for one in set_ups if one.chance is not None],
+        CHANCE: [set_up for set_up in set_ups if set_up.chance is not None],
         OPERATING: list(set_ups),
         AXES: [row for group in axis_groups(result.axes) for row in axis_rows(group)],
         DEPTH_LIMITS: depths_at(set_ups),

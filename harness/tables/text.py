@@ -1,4 +1,4 @@
-"""Numbers and tables as text: for a terminal with colours, for plain lines and for a page."""
+"""Formats numbers and tables as text: for a terminal with colours, as plain lines, and for a page."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ INCHES = {n: str(Fraction(n, 16)) for n in (1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 16)}
 
 
 def plain(value: Any) -> str:
-    """Return text and counts as they are, other numbers with three digits, and a dash for what is unknown."""
+    """Return text and counts unchanged, other numbers with three digits, and a dash for unknown values."""
     if value is None or (isinstance(value, float | np.floating) and np.isnan(value)):
         return UNKNOWN_TEXT
     if isinstance(value, bool | np.bool_):
@@ -29,25 +29,25 @@ def plain(value: Any) -> str:
 
 
 def mm(value: float, digits: int = 2) -> str:
-    """Return a number of millimetres, or a dash where it is not finite."""
+    """Return a number of millimetres, or a dash if it is not finite."""
     return f"{value:.{digits}f}" if np.isfinite(value) else UNKNOWN_TEXT
 
 
 def plus_minus(mean: float, std: float, sign: str = "") -> str:
-    """Return ``3.20 ± 0.10``, or a dash where the mean is unknown; ``sign``: "+" for differences."""
+    """Return ``3.20 ± 0.10``, or a dash if the mean is unknown; ``sign`` is "+" for differences."""
     text = f"{mean:{sign}.2f}".replace("-", "−") + ("" if np.isnan(std) else f"\u00a0±\u00a0{std:.2f}")
     return UNKNOWN_TEXT if np.isnan(mean) else text
 
 
 def size(value: float, most: float = np.inf) -> str:
-    """Return a limit in mm with two digits; ``> 15.9`` beyond ``most``, the largest inspected; ``none`` for NaN."""
+    """Return a limit in mm with two digits; ``> 15.9`` beyond the largest inspected, ``most``; ``none`` for NaN."""
     if np.isnan(value) or value > most:
         return "none" if np.isnan(value) else f">\u00a0{most:.3g}"
     return "∞" if np.isinf(value) else f"{value:#.2g}".removesuffix(".") if abs(value) < 99.5 else f"{value:.3g}"
 
 
 def percent(share: float) -> str:
-    """Return ``93`` for 0.93; near 0 and 1 with a decimal, since a whole number would mean impossible or certain."""
+    """Return ``93`` for 0.93. Shares near 0 and 1 get a decimal, since 0 and 100 would mean impossible and certain."""
     value = 100 * share
     if np.isnan(value) or 1 <= value <= 99:
         return UNKNOWN_TEXT if np.isnan(value) else f"{value:.0f}"
@@ -60,16 +60,16 @@ def p_value(p: float) -> str:
 
 
 def interval(low: float, high: float, digits: int = 2, most: float = np.inf) -> str:
-    """Return ``4.80 to 5.62``, or ``4.80 to > 15.9`` with an end beyond ``most``; ``unknown`` where there is none."""
+    """Return ``4.80 to 5.62``, or ``4.80 to > 15.9`` if an end lies beyond ``most``; ``unknown`` without interval."""
     if np.isnan(low) or np.isnan(high):
         return "unknown"
     return " to ".join(_number(end, digits, most) for end in (low, high))
 
 
 def with_interval(value: float, low: float, high: float, digits: int = 2, most: float = np.inf) -> str:
-    """Return ``5.1 (4.8 to 5.6)``; the estimate alone where its interval is unknown or beyond ``most``. Numbers have
-    ``digits`` decimals at most, and two significant digits where the interval is wider than `ROUGH` of the value (of
-    its upper end where the value is 0)."""
+    """Return ``5.1 (4.8 to 5.6)``, or only the estimate if its interval is unknown or beyond ``most``. Numbers have at
+    most ``digits`` decimals. They have two significant digits if the interval is wider than `ROUGH` times the value
+    (or times its upper end if the value is 0)."""
     if np.isnan(low) or np.isnan(high) or np.isnan(value) or min(value, low) > most:
         return _number(value, digits, most)
     scale = abs(value or high)
@@ -84,12 +84,12 @@ def many(count: int, what: str) -> str:
 
 
 def unbroken(text: str) -> str:
-    """Return ``text`` with numbers held to the words after them by unbreakable spaces: ``0.7 m``, ``50 frames``."""
+    """Return ``text`` with no-break spaces between numbers and the words after them: ``0.7 m``, ``50 frames``."""
     return re.sub(r"(?<=\d) (?=[^\W\d])", "\u00a0", text)
 
 
 def inches(diameter_mm: float) -> str:
-    """Return a drill's size as a fraction of an inch where it is a common one, else nothing: ``1/4 in``."""
+    """Return the size of a common inch drill as a fraction, such as ``1/4 in``; an empty text for other sizes."""
     sixteenths = diameter_mm / 25.4 * 16
     known = INCHES.get(round(sixteenths)) if abs(sixteenths - round(sixteenths)) < 1e-3 else None
     return f"{known} in" if known else ""
@@ -101,16 +101,16 @@ def _number(value: float, digits: int, most: float) -> str:
 
 Tone = Literal["", "good", "key", "bad", "open", "changed"]
 COLOURS = {"good": "green", "key": "bold green", "bad": "bold red", "open": "yellow"}
-"""Colours of a terminal; the text says the same without them."""
+"""Colours at a terminal; the text alone conveys the same."""
 ROUGH = 0.1
-"""Ratio of an interval's width to the value from which a third digit means nothing."""
+"""Ratio of an interval's width to the value beyond which a third digit is meaningless."""
 CLASSES = {"good": "good", "key": "key", "bad": "none", "open": "open", "changed": "changed"}
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell's text, and how it is meant. On a page ``share`` (0 to 1) shades it, and what follows a line's end or, in
-    columns of numbers, `` (`` stands below in small letters."""
+    """A cell's text and tone. On a page, ``share`` (0 to 1) shades the cell, and text after a line break or, in columns
+    of numbers, after `` (`` stands below in small letters."""
 
     text: str
     tone: Tone = ""
@@ -119,7 +119,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Grid:
-    """Rows of cells below their ``heads``; the first ``left`` columns are flush left. ``kind``: its class on a page."""
+    """Rows of cells below their ``heads``; the first ``left`` columns are flush left. ``kind`` is a class on pages."""
 
     heads: tuple[str, ...]
     rows: tuple[tuple[Cell, ...], ...]
@@ -136,7 +136,7 @@ class Grid:
         return Grid(tuple(heads), cells, left, title, kind)
 
     def lines(self) -> list[str]:
-        """Return plain lines, columns below each other."""
+        """Return plain lines with aligned columns."""
         lines = [self.heads, *([cell.text for cell in row] for row in self.rows)]
         widths = [max(len(line[place]) for line in lines) for place in range(len(self.heads))]
         signs = "<" * self.left + ">" * len(self.heads)
@@ -146,7 +146,7 @@ class Grid:
         ]
 
     def rich(self) -> RichTable:
-        """Return the table for a terminal; without a box, so that many columns fit 80 characters."""
+        """Return the table for a terminal; it has no box, so that many columns fit into 80 characters."""
         from rich.table import Table
         from rich.text import Text
 
@@ -159,7 +159,7 @@ class Grid:
         return table
 
     def html(self) -> Markup:
-        """Return the table for a page: the first cell of a row is its head, an interval stands below its estimate."""
+        """Return the table for a page. The first cell of a row is its head; an interval stands below its estimate."""
         from markupsafe import Markup
 
         number = [Markup("" if place < self.left else ' class="n"') for place in range(len(self.heads))]
@@ -211,6 +211,6 @@ def show(parts: Sequence[str | Grid]) -> None:
             console.print(part, markup=False, highlight=False)
             continue
         table = part.rich()
-        # rich would cut the numbers on a narrow terminal; wrapped lines can still be read
+        # rich would cut off numbers on a narrow terminal; wrapped lines remain readable
         fits = console.measure(table, options=console.options.update(max_width=1000)).maximum <= console.width
         console.print(table) if fits else print(text_of([part]))

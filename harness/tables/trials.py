@@ -43,31 +43,31 @@ TRUTH = _columns(
     kind="kind of damage",
     true_diameter_mm="true diameter",
     true_depth_mm="true depth of removed material",
-    seen_depth_mm="depth of the surface that is visible in it; behind a through-hole, the backing",
+    seen_depth_mm="depth of the surface that is visible in the damage; for a through-hole, of the backing",
     true_x_mm="x of its centre on the board",
     true_y_mm="y of its centre on the board",
-    true_offset_mm="distance of its centre from that of the largest hole",
+    true_offset_mm="distance of its centre from the centre of the largest hole",
 )
 SHAPE = _columns(
-    size_of="what true_diameter_mm holds: diameter or, for long damage, width or length",
+    size_of="what true_diameter_mm is: the diameter or, for long damage, the width or length",
     true_length_mm="true length; empty for holes and ball dents",
     true_width_mm="true width; empty for holes and ball dents",
-    true_angle_deg="angle from the board's x to its length",
+    true_angle_deg="angle from the board's x axis to its length",
 )
 SIZES = _columns(
     extent_diameter_mm="measured diameter (the thesis' measure)",
     extent_offset_mm="distance of its centre from the largest cluster's (the thesis' measure)",
     extent_error_mm="distance of its centre from the true centre (the thesis' measure)",
     model_diameter_mm="measured diameter (the fitted model of a blurred hole)",
-    model_diameter_se_mm="standard error of that diameter, as estimated by the fit",
+    model_diameter_se_mm="standard error of that diameter, as the fit estimates it",
     model_depth_mm="measured depth (the model)",
-    model_depth_se_mm="standard error of that depth, as estimated by the fit",
+    model_depth_se_mm="standard error of that depth, as the fit estimates it",
     model_offset_mm="distance of its centre from the largest cluster's (the model)",
     model_error_mm="distance of its centre from the true centre (the model)",
-    length_mm="length of the rectangle that has the second moments of the residual, less the blur",
+    length_mm="length of the rectangle with the second moments of the residual, corrected for blur",
     width_mm="width of that rectangle",
-    angle_deg="angle from the board's x to that rectangle's length, -90 to 90",
-    model_note="remark of the fit on its own result",
+    angle_deg="angle from the board's x axis to that rectangle's length, -90 to 90",
+    model_note="remark of the fit about its result",
 )
 STATISTICS = {
     "measured": "number of trials with a finite diameter",
@@ -99,15 +99,15 @@ TRIALS = Table(
     (
         *(*POINT, *COMMON, *BOARD, *_columns(hole="number of the damage"), *TRUTH, *SHAPE),
         *_columns(
-            detected="whether it was hit: a finding matches it",
+            detected="whether it was hit, which means that a finding matches it",
             threshold="threshold in use, in the detector's units",
             invalid_fraction="share of its pixels without a range",
             median_residual_mm="median distance of its pixels behind the surface",
-            state="state of its pixels, whatever the detector finds: found, wrong depth, invalid or invisible",
+            state="state of its pixels, independent of the detector: found, wrong depth, invalid or invisible",
             score="score of the finding that matches it",
             points="number of points of that finding",
             signal="in a study: highest score within the hit radius",
-            no_return="in a study: whether a finding of pixels without return matches it",
+            no_return="in a study: whether a finding of pixels without a return matches it",
         ),
         *SIZES,
     ),
@@ -123,14 +123,14 @@ RUNS = Table(
         *_columns(
             threshold="threshold in use; empty in calibration runs",
             quiet_threshold="hole-free boards: score above which nothing is found",
-            scale_mm="residual that makes one unit of score",
+            scale_mm="residual per unit of score",
             surface_noise_mm="robust deviation from the fitted surface on the undamaged face",
             frames_used="number of frames in the average",
             left_out="number of frames left out as disturbed",
             detections="number of findings",
             false_calls="number of findings that match no damage",
             inspected_m2="in a study: judged area of the face",
-            no_return_calls="in a study: false calls made of pixels without return",
+            no_return_calls="in a study: false calls that consist of pixels without a return",
             loudest_x_mm="calibration: x of the highest score on the board",
             loudest_y_mm="calibration: y of the highest score on the board",
             loudest_u_px="calibration: column of the highest score on the sensor",
@@ -155,7 +155,7 @@ PROBES = Table(
             pixel="number of the pixel, in sensor order",
             mean_error_mm="mean error of z",
             temporal_std_mm="standard deviation of z over repeats",
-            displacement_std_mm="standard deviation of the displacement of whole clouds, which the others exclude",
+            displacement_std_mm="standard deviation of whole clouds' displacement, which the other columns exclude",
             repeats="number of repeats",
         ),
     ),
@@ -172,7 +172,7 @@ NOISE = Table(
             pitch_u_mm="median distance on the board between neighbouring pixels of a row",
             pitch_v_mm="median distance on the board between neighbouring pixels of a column",
             single_frame_mm="standard deviation of one frame's temporal noise of z",
-            **{name: "correlation of that noise between pixels so many columns (u) or rows (v) apart" for name in LAGS},
+            **{name: "correlation of that noise between pixels n columns (u) or rows (v) apart" for name in LAGS},
         ),
     ),
     ("variant", "frames", "repeat"),
@@ -188,24 +188,24 @@ REGISTRATIONS = Table(
             tre_mm="target registration error, root mean square over the board",
             tre_in_plane_mm="part of that error in the board's plane",
             tre_across_mm="part of that error perpendicular to the plane",
-            predicted_in_plane_mm="error in the plane that the method predicts; empty if it predicts none",
-            predicted_across_mm="error perpendicular to the plane that the method predicts",
+            predicted_in_plane_mm="predicted error in the plane; empty if the method predicts none",
+            predicted_across_mm="predicted error perpendicular to the plane",
             guess_tre_mm="error of the nominal pose from which it started",
             residual_mm="root mean square residual",
             overlap="share of points with a partner",
             pairs="number of pairs of points",
-            marks="number of marks that were relied on",
+            marks="number of marks that were used",
             iterations="number of iterations",
             converged="whether it converged",
             seconds="time in seconds",
-            failure="why it failed; empty if it did not",
+            failure="reason for a failure; empty if it succeeded",
         ),
     ),
     ("variant", "role", "frames", "repeat", "view"),
 )
 SITES = Table(
     "sites",
-    "one row per repeat and place on a hole-free board where its damage was left out",
+    "one row per repeat and place on a hole-free board from which the damage was left out",
     (
         *(*COMMON, *BOARD, *ROLE, *_columns(hole="number of the place"), *TRUTH[1:3], *TRUTH[4:6]),
         *_columns(detected="whether a finding lies there by chance", signal="highest score within the hit radius"),
@@ -245,12 +245,12 @@ PIXELS = Table(
 
 
 def _mean(of: str, label: str) -> Column:
-    """Return a page's column of a mean with its standard deviation."""
+    """Return a column for pages with a mean and its standard deviation."""
     return Column("", label, lambda row: text.plus_minus(row[f"{of}_mean_mm"], row[f"{of}_std_mm"]))
 
 
 def _error(of: str, label: str) -> Column:
-    """Return a page's column of a mean error with its standard deviation and number."""
+    """Return a column for pages with a mean error, its standard deviation and the number of values."""
 
     def error(row: Mapping[str, Any]) -> str:
         count = int(row[f"{of}_n"])
@@ -260,7 +260,7 @@ def _error(of: str, label: str) -> Column:
 
 
 def _found(row: Mapping[str, Any]) -> Cell:
-    """Return the number of holes found, and their names where there are few enough to read."""
+    """Return the number of holes found, and their names if there are few enough to read."""
     from harness.evaluation.summary import hole_list
 
     names = hole_list(row["found"]) if row["holes"] <= MOST_NAMES else ""
@@ -270,7 +270,7 @@ def _found(row: Mapping[str, Any]) -> Cell:
 
 
 MOST_NAMES = 15
-"""Most holes that a cell lists by name; of more it gives the number."""
+"""Most holes that a cell lists by name; for more holes it gives only the number."""
 CALLS_OF = Column(
     "", "false calls", lambda row: f"{row['false_calls']:.0f} in {row['runs']:.0f}" if row["runs"] > 0 else "–"
 )
@@ -280,7 +280,7 @@ SUMMARY = Table(
     (
         *COMMON[:2],
         Column("hole", "hole", note="number of the damage"),
-        *(replace(one, label={"true_diameter_mm": "true (mm)"}.get(one.name, "")) for one in TRUTH),
+        *(replace(column, label={"true_diameter_mm": "true (mm)"}.get(column.name, "")) for column in TRUTH),
         *_columns(n="number of trials", detected="number of trials that detected it"),
         Column("rate", note="share of trials that detected it, with Wilson's interval", interval=True),
         *_columns(status="found, missed or undecided: the interval lies above, lies below or contains 0.5"),
@@ -289,12 +289,12 @@ SUMMARY = Table(
         *(Column(f"{of}_{name}", note=f"{note} ({by})") for of, by in BY for name, note in STATISTICS.items()),
         *(Column(f"{of}_bias_mm", note=f"mean diameter minus true diameter ({by})", interval=True) for of, by in BY),
         *(Column(f"{of}_error_mean_mm", f"centre off, {of} (mm)", note=f"mean error of place ({by})") for of, by in BY),
-        Column("model_diameter_se_mean_mm", "its stated error (mm)", note="mean standard error that fits state"),
+        Column("model_diameter_se_mean_mm", "its stated error (mm)", note="mean standard error stated by the fits"),
         Column("model_diameter_covered", "truth within 1.96 of it", None, COVERED, _percent),
         Column("model_depth_mean_mm", "depth (mm)", note="mean depth (the model)"),
         *_columns(
             model_depth_std_mm="standard deviation of that depth",
-            model_depth_se_mean_mm="mean standard error that fits state for it",
+            model_depth_se_mean_mm="mean standard error of depth stated by the fits",
             model_depth_bias_mm="mean depth minus seen_depth_mm",
             median_residual_mm="mean of the trials' median residuals",
             invalid_fraction="mean share of pixels without a range",
@@ -312,12 +312,12 @@ NOISE_BY_FRAMES = Table(
         Column("frames", "frames", note="number of averaged frames"),
         *_columns(pixels="number of sample pixels", repeats="number of repeats"),
         Column("temporal_rms_mm", "temporal noise (mm)", None, "root mean square deviation over repeats", _fine),
-        Column("guide_mm", "1/√N guide (mm)", None, "the shortest average's noise, scaled by 1/sqrt(N)", _fine),
+        Column("guide_mm", "1/√N guide (mm)", None, "noise of the shortest average, scaled by 1/sqrt(N)", _fine),
         Column("offset_mm", "offset (mm)", None, "mean error", lambda mm: f"{mm:+.3f}"),
         Column("pattern_mm", "pattern (mm)", None, "standard deviation over pixels of the mean error", _fine),
         Column("systematic_mm", "systematic (mm)", None, "offset and pattern combined", _fine),
         Column("total_rms_mm", "total (mm)", None, "temporal and systematic error combined", _fine),
-        Column("displacement_mm", "whole cloud displaced (mm)", None, "deviation of displacements of clouds", _fine),
+        Column("displacement_mm", "whole cloud displaced (mm)", None, "deviation of whole clouds' displacement", _fine),
     ),
 )
 FALSE_CALLS = Table(
@@ -334,7 +334,7 @@ FALSE_CALLS = Table(
         Column("threshold_mm", "threshold (mm)", note="mean of threshold times scale"),
         Column("surface_noise_mm", "surface noise (mm)", None, "mean deviation from the fitted surface", _fine),
         Column("quiet_runs", "hole-free runs", note="number of hole-free runs"),
-        Column("quiet_highest", "highest quiet k", note="highest of their quiet_threshold"),
+        Column("quiet_highest", "highest quiet k", note="highest quiet_threshold of these runs"),
     ),
 )
 SET_UPS = Table(
@@ -349,7 +349,7 @@ SET_UPS = Table(
         *_columns(holes="number of holes", repeats="number of repeats"),
         *_columns(found="numbers of the holes found", undecided="numbers of the undecided holes"),
         Column("", "found", _found),
-        Column("limit_mm", "from (mm)", note="smallest diameter from which on all holes are found"),
+        Column("limit_mm", "from (mm)", note="smallest diameter at and above which all holes are found"),
         Column("half_mm", "50 % size (mm)", note="size found half of the time", interval=True, brief=False),
         *(_error(of, label) for of, label in ERRORS.items()),
         *(
@@ -374,13 +374,13 @@ SET_UPS = Table(
             runs="number of runs on the damaged board",
             place="maps: values on the other axes",
             is_variation="whether it is a variation of another set-up",
-            reference="the set-up that it varies",
+            reference="the set-up that it is a variation of",
             surface_std_mm="maps: standard deviation over runs of the surface's deviation",
         ),
         Column("views_left_out", "views left out", note="maps: mean number of views left out"),
         Column("seconds_map", "time (s)", note="maps: median time to make the map"),
     ),
-    title="holes found, and the smallest diameter from which on all holes are found",
+    title="holes found, and the smallest diameter at and above which all holes are found",
 )
 REGISTRATION_ERRORS = Table(
     "registration_errors",
@@ -420,7 +420,7 @@ CLAIMS = Table(
             tone=lambda row: MARKS[row["verdict"]][1],
         ),
         Column("evidence", "evidence", note="the numbers that support the verdict"),
-        Column("rule", "criterion", note="the criterion, which was fixed in advance"),
+        Column("rule", "criterion", note="the criterion, fixed in advance"),
     ),
     formats=("csv",),
     left=5,
@@ -430,10 +430,10 @@ POSTERIOR = Table(
     "posterior",
     "one row per set-up and per value of an axis: how well it agrees with the thesis' result (from 20 set-ups on)",
     (
-        Column("axis", note="fact that the thesis does not state; `set-up`: the combination of all"),
+        Column("axis", note="fact that the thesis does not state; `set-up` for the combination of all facts"),
         Column("value", "set-up", None, "value of that fact, or name of the set-up", in_words),
         Column("prior_share", note="prior probability"),
-        Column("likelihood", "likelihood", note="probability of the thesis' exact result with 1 and 50 frames; mean"),
+        Column("likelihood", "likelihood", note="mean probability of the thesis' exact result with 1 and 50 frames"),
         Column("posterior_share", "posterior", note="posterior probability"),
     ),
     formats=("csv",),
@@ -445,11 +445,11 @@ EFFECTS = Table(
     (
         Column("place", "place", note="values of the other axes"),
         Column("frames", "frames", note="number of averaged frames"),
-        Column("effect", "effect", note="effect that is switched on; `all`: all effects together"),
-        Column("against", "against", note="the other effects that are on: none or all"),
+        Column("effect", "effect", note="effect that is switched on; `all` for all effects together"),
+        Column("against", "against", note="whether none or all of the other effects are on"),
         Column("loss_mm", "loss (mm)", note="change of the 50 % size when the effect is switched on"),
         *_columns(loss_low_mm="lower end of its 95 % bootstrap interval", loss_high_mm="upper end of that interval"),
-        Column("on_ladder", note="whether both sizes lie within the range of sizes; otherwise the loss is a bound"),
+        Column("on_ladder", note="whether both sizes lie within the range inspected; otherwise the loss is a bound"),
     ),
 )
 STORED = (TRIALS, RUNS, PROBES, NOISE, REGISTRATIONS, SITES, FINDINGS, OPERATING, PIXELS)
@@ -465,9 +465,9 @@ def _empty() -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class ResultTables:
-    """Tables of trials as declared above; ``holes`` is `TRIALS`, and a table that an experiment lacks is empty.
-    ``variants`` has a row per set-up, then per variation: variant, reason, settings, is_variation, reference, switches,
-    and the axes. ``axes`` has path, name and unit of every axis on which set-ups differ, in their order."""
+    """Tables of trials as declared above; ``holes`` is `TRIALS`. A table that an experiment lacks is empty.
+    ``variants`` has a row per set-up and then per variation: variant, reason, settings, is_variation, reference,
+    switches, and the axes. ``axes`` has the path, name and unit of every axis on which set-ups differ, in order."""
 
     holes: pd.DataFrame
     runs: pd.DataFrame
@@ -482,14 +482,14 @@ class ResultTables:
     pixels: pd.DataFrame = field(default_factory=_empty)
 
     def stored(self) -> dict[Table, pd.DataFrame]:
-        """Return the tables that are written, in their order."""
+        """Return the tables that are written to files, in order."""
         return {table: getattr(self, "holes" if table is TRIALS else table.name) for table in STORED}
 
 
 # ---------------------------------------------------------------- real captures
 
 FINDINGS_VERSION = 3
-"""Increased when the meaning of a column or key changes; the last column of the CSV states it."""
+"""The version is increased when the meaning of a column or key changes; the last column of the CSV states it."""
 FINDINGS_OF_CAPTURE = Table(
     outputs.FINDINGS.name.removesuffix(".csv"),
     outputs.FINDINGS.note,
@@ -501,15 +501,15 @@ FINDINGS_OF_CAPTURE = Table(
         Column("x_mm", "", "x_mm", "x of its centre in the camera's frame (to the right)"),
         Column("y_mm", "", "y_mm", "y of its centre in the camera's frame (down)"),
         Column("z_mm", "", "z_mm", "z of its centre in the camera's frame (away from the camera)"),
-        Column("diameter_mm", "", "diameter_mm", "diameter; that of the model where the model fits"),
+        Column("diameter_mm", "", "diameter_mm", "diameter, from the model if the model fits"),
         Column("depth_mm", "", "depth_mm", "depth; negative for a bump"),
         Column("volume_mm3", "", "volume_mm3", "volume between the surface and the points behind it"),
         Column("points", "", "points", "number of points of the cluster"),
         Column("score", "", "score", "the detector's score"),
-        Column("length_mm", "", "length_mm", "length of the rectangle with the second moments, less the blur"),
+        Column("length_mm", "", "length_mm", "length of the rectangle with its second moments, corrected for blur"),
         Column("width_mm", "", "width_mm", "width of that rectangle"),
-        Column("angle_deg", "", "angle_deg", "angle of its length from x towards y (down), -90 to 90"),
-        Column("findings_version", "", lambda finding: FINDINGS_VERSION, "version of the table's meaning"),
+        Column("angle_deg", "", "angle_deg", "angle of the rectangle's length from x towards y (down), -90 to 90"),
+        Column("findings_version", "", lambda finding: FINDINGS_VERSION, "version of this table's format"),
     ),
     formats=("csv",),
     always=True,
@@ -521,7 +521,7 @@ POINTS_OF_CAPTURES = Table(
     (
         Column("point", note="folder of its findings"),
         Column("variant", note="name of the set-up"),
-        Column("what", note="the set-up with its number of frames"),
+        Column("what", note="name of the set-up with its number of frames"),
         Column("frames_used", note="number of frames in the average"),
         Column("frames_left_out", note="number of frames left out as disturbed"),
         Column("threshold_k", note="threshold in the detector's units"),

@@ -1,1 +1,1 @@
-"""The claims of the thesis that the reference experiments repeat: their rules, their verdicts, their tables."""
+"""The claims of the reference thesis: their rules, their verdicts and the inference of its unknown set-up."""

@@ -1,4 +1,4 @@
-"""Rules for the claims on one view (C1 to C6, C9) and on cameras (C11), the same for every run.
+"""Rules for the claims on a single view (C1 to C6, C9) and on cameras (C11), the same for every run.
 
 A verdict needs certainty in either direction: if an interval allows both, it is "undecided". No experiment can change a
 rule, and no rule was chosen to make a claim come out."""
@@ -68,7 +68,7 @@ FOUND_WITH_MANY, FOUND_WITH_FEW = frozenset(THESIS_HOLES[3:]), frozenset(THESIS_
 RULER_MM = 25.4 / 16
 """One graduation of the ruler (1/16 in) with which the thesis read its reference positions."""
 SLOPE_MARGIN = 0.05
-"""Exponents within this of -0.5 count as 1/sqrt(N); over 50 frames the margin is a factor of 1.22 in noise."""
+"""Exponents within this distance of -0.5 count as 1/sqrt(N); over 50 frames, it is a factor of 1.22 in noise."""
 UNCHANGED = 0.9
 """The systematic error counts as lowered if it falls below this share, while white noise falls to 0.14."""
 FEWEST_UNITS = 3
@@ -76,13 +76,13 @@ FEWEST_UNITS = 3
 FEWEST_PAIRS = 5
 """Fewest pairs of views to compare registrations."""
 FEWEST_RANKED = 4
-"""Fewest holes to rank: with less, even a perfect order has a probability above 1 in 20 by chance."""
+"""Fewest holes to rank; with fewer, even a perfect order has a probability above 1 in 20 by chance."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """The tables of one variant that rules use, and its averaged clouds. ``units``: summary rows of this variant and of
-    the variations that change only the camera's unit."""
+    """The tables of a variant that rules use, and its averaged clouds. ``units`` are the summary rows of this variant
+    and of the variations that change only the camera's unit."""
 
     variant: str
     summary: pd.DataFrame
@@ -105,7 +105,7 @@ def _c2(case: Case) -> tuple[Answer, str]:
     few, many = (in_mm[damaged["frames"] == frames].dropna() for frames in (FEW, MANY))
     interval = mean_difference(few, many)
     if not interval.known:
-        return decide([set_agrees, None]), f"{evidence} The thresholds cannot be compared: too few runs."
+        return decide([set_agrees, None]), f"{evidence} There are too few runs to compare the thresholds."
     threshold = f"Threshold {few.mean():.2f} mm with 1 frame, {many.mean():.2f} mm with 50"
     return decide([set_agrees, interval.over(0)]), f"{evidence} {threshold} (difference {span(interval)} mm)."
 
@@ -127,12 +127,12 @@ def _c3(case: Case) -> tuple[Answer, str]:
 
 
 def _between_units(case: Case, rows: pd.DataFrame) -> str:
-    """Return the error of the mean size in deviations between units of the camera; ``rows``: the holes found."""
+    """Return the error of the mean size of the holes found (``rows``) in standard deviations between units."""
     means = case.units[case.units["frames"] == MANY].pivot(
         index="variant", columns="hole", values="extent_diameter_mean_mm"
     )
     if len(means) < FEWEST_UNITS:
-        return "Between units: not judged, because all repeats share one unit's fixed pattern."
+        return "Between units: not judged, because all repeats have the same unit's fixed pattern."
     true = rows.set_index("hole")["true_diameter_mm"]
     off = ((means.mean() - true) / means.std())[true.index]
     return f"Between {len(means)} units: {', '.join(f'hole {hole} {ratio:+.1f}' for hole, ratio in off.items())}."
@@ -161,7 +161,7 @@ def _c5(case: Case) -> tuple[Answer, str]:
     rows = case.found_with_many()
     rows = rows[(rows["true_offset_mm"] > 0) & rows["extent_offset_mean_mm"].notna()]
     if rows.empty:
-        return "undecided", "No hole but the reference is found with 50 frames."
+        return "undecided", "With 50 frames, only the reference hole is found."
     off = rows["extent_offset_bias_mm"].abs()
     agrees = off <= np.maximum(rows["extent_offset_std_mm"].fillna(0.0), RULER_MM)
     many = case.holes[(case.holes["frames"] == MANY) & case.holes["hole"].isin(rows["hole"])]
@@ -170,9 +170,9 @@ def _c5(case: Case) -> tuple[Answer, str]:
     worst = rows.iloc[int(off.to_numpy().argmax())]
     evidence = (
         f"{int(agrees.sum())} of {len(rows)} mean positions agree"
-        f"{'' if agrees.all() else ' (not: ' + hole_list(rows['hole'][~agrees]) + ')'}; the largest difference is "
+        f"{'' if agrees.all() else ' (except ' + hole_list(rows['hole'][~agrees]) + ')'}; the largest difference is "
         f"{worst['extent_offset_bias_mm']:+.2f} mm, std {worst['extent_offset_std_mm']:.2f} mm (hole {worst['hole']}). "
-        f"Median variance ratio position to size {ratio:.2f} ({span(interval)})."
+        f"Median ratio of the variances of position and size {ratio:.2f} ({span(interval)})."
     )
     return decide([bool(agrees.all()), larger]), evidence
 
@@ -192,8 +192,8 @@ def _c6(case: Case) -> tuple[Answer, str]:
     control = sum(shape.true_bowl_rms_mm < shape.true_cylinder_rms_mm for shape in shapes)
     evidence = (
         f"Of {len(shapes)} holes judged, like a bowl: {hole_list(looks['bowl'])}; like a cylinder: "
-        f"{hole_list(looks['cylinder'])}; neither clearly: {hole_list(looks['neither'])}. Median misfit of the bowl "
-        f"{ratio:.2f} of the cylinder's. Control: the true geometry at the same pixels is closer to a bowl in "
+        f"{hole_list(looks['cylinder'])}; unclear: {hole_list(looks['neither'])}. Median misfit of the bowl relative "
+        f"to the cylinder {ratio:.2f}. Control: the true geometry at the same pixels is closer to a bowl in "
         f"{control} of {len(shapes)} holes."
     )
     return answer, evidence
@@ -202,7 +202,7 @@ def _c6(case: Case) -> tuple[Answer, str]:
 def _c9(case: Case) -> tuple[Answer, str]:
     law = noise_law(case.probes, case.variant)
     if law is None:
-        return "undecided", "Too few probe pixels or numbers of frames to tell."
+        return "undecided", "Not judged: too few sample pixels or numbers of frames."
     low, high = -0.5 - SLOPE_MARGIN, -0.5 + SLOPE_MARGIN
     slope, ratio = law.slope_interval, law.systematic_ratio_interval
     falls = True if slope.within(low, high) else (False if slope.below(low) or slope.above(high) else None)
@@ -225,7 +225,7 @@ RULES: dict[str, Callable[[Case], tuple[Answer, str]]] = {
 def score_claims(
     tables: ResultTables, variant: str = MAIN, examples: Sequence[Any] = (), summary: pd.DataFrame | None = None
 ) -> list[Verdict]:
-    """Return a verdict for each of `RULES` on one variant. ``summary``: that of `summarise_holes`, if at hand."""
+    """Return a verdict for each of `RULES` on a variant. ``summary`` is the result of `summarise_holes`, if known."""
     summary = summarise_holes(tables.holes) if summary is None else summary
     alone = tables.variants["settings"].map(lambda text: list(json.loads(text or "{}")) == [CAMERA_UNIT])
     units = summary[summary["variant"].isin({variant, *tables.variants["variant"][alone]})]
@@ -236,7 +236,7 @@ def score_claims(
 
 
 def falling_rank(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Return Spearman's rho and one-sided permutation p of "y falls as x grows" (exact to 8 pairs); constant: 0, 1."""
+    """Return Spearman's rho and the one-sided permutation p of "y falls as x grows", exact up to 8 pairs, or (0, 1)."""
     ranks, other = rankdata(x), rankdata(y)
     if np.ptp(ranks) == 0 or np.ptp(other) == 0:
         return 0.0, 1.0
@@ -248,7 +248,7 @@ def falling_rank(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
 
 @lru_cache
 def _orders(count: int) -> np.ndarray:
-    """Return all orders of up to 8 numbers, or 20,000 random ones of more, the given order among them."""
+    """Return all orders of up to 8 numbers, or 20,000 random orders of more numbers, including the given order."""
     if count <= 8:
         return np.array(list(permutations(range(count))))
     random = np.random.default_rng(0).permuted(np.tile(np.arange(count), (20_000, 1)), axis=1)
@@ -256,8 +256,8 @@ def _orders(count: int) -> np.ndarray:
 
 
 def scatter_ratio(holes: pd.DataFrame, first: str, second: str) -> tuple[float, Interval]:
-    """Return the median over holes of var(first) / var(second) over repeats that have both, with its bootstrap interval
-    over repeats; infinite if no hole's second column varies. ``holes``: one row per repeat and hole."""
+    """Return the median over holes of var(first) / var(second) over repeats with both values, and its bootstrap
+    interval over repeats; infinite if no hole's second column varies. ``holes`` has a row per repeat and hole."""
     top, bottom = (holes.pivot(index="repeat", columns="hole", values=c).to_numpy(float) for c in (first, second))
     both = np.isfinite(top) & np.isfinite(bottom)
 
@@ -271,7 +271,7 @@ def scatter_ratio(holes: pd.DataFrame, first: str, second: str) -> tuple[float, 
 
 
 def _found(case: Case, frames: int, expected: frozenset[str], unexpected: frozenset[str]) -> tuple[Answer, str]:
-    """Judge whether expected holes of the thesis are found and unexpected ones missed; return the counts too."""
+    """Judge whether the expected holes are found and the unexpected holes missed; return also the counts."""
     status = found_holes(case.summary, case.variant, frames)
     if set(status) != set(THESIS_HOLES):
         why = f"no trial has {frames} frames" if not status else "the target is not the thesis' row of eleven holes"
@@ -319,7 +319,7 @@ def claim_c11(summary: pd.DataFrame, axes: Sequence[str]) -> Verdict | None:
     ]
     evidence = [f"Holes found with {MANY} frames by {BEST} / {' / '.join(OTHERS)}: {'; '.join(counts)}."]
     if units < FEWEST_UNITS:
-        evidence.insert(0, f"Only {units} of each camera's units: no verdict on other units.")
+        evidence.insert(0, f"Only {units} of each camera's units: too few for a verdict on other units.")
     answers: list[bool | None] = []
     for camera in OTHERS:
         standings: dict[str, list[str]] = {word: [] for word in ("ahead", "level", "behind", "open")}

@@ -2,7 +2,7 @@
 
 The result is a cloud of 1 frame in which holes 5 to 11 were found, and a cloud of 50 frames with holes 4 to 11. A hole
 is found with probability (hits + 1/2) / (repeats + 1), so that few repeats neither prove nor exclude anything. Holes
-count as independent given the set-up. All set-ups have the same prior probability."""
+are assumed independent given the set-up. All set-ups have the same prior probability."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ DOUBTED = 0.5
 SET_UP = "set-up"
 KIND = "source.target.hole_kind"
 SPEAKS_OF = {"source.target.blind_depth_mm": "blind", "source.target.backing_distance_mm": "through"}
-"""Facts that only one kind of hole has: if both kinds are tried, shares are those among set-ups of that kind."""
+"""Facts that only one kind of hole has; if both kinds are tried, probabilities are those given that kind."""
 
 
 def posterior_of(summary: pd.DataFrame, axes: Sequence[str]) -> pd.DataFrame | None:
     """Return rows of `harness.tables.trials.POSTERIOR`: every set-up, likeliest first, then every value of each axis.
-    Return None for another target, too few set-ups, several cameras, or without both numbers of frames. Shares of a
-    fact that only one kind of hole has are those among set-ups of this kind."""
+    Return None for another target, too few set-ups, several cameras, or without both numbers of frames. The probability
+    of a fact that only one kind of hole has is conditional on this kind."""
     rows = summary[summary["frames"].isin([FEW, MANY]) & summary["hole"].isin(THESIS_HOLES)]
     whole = rows.groupby("variant")["hole"].transform("size") == 2 * len(THESIS_HOLES)
     rows = rows[whole]
@@ -57,15 +57,15 @@ def posterior_of(summary: pd.DataFrame, axes: Sequence[str]) -> pd.DataFrame | N
 
 
 def borne_out_if(posterior: pd.DataFrame) -> str:
-    """Return a sentence on the facts that the thesis' result requires (of each axis the values that are not `DOUBTED`,
-    without facts of a kind of hole that is doubted) and its probability in the likeliest set-up."""
+    """Return a sentence on the facts that the thesis' result requires (the values of each axis that are not `DOUBTED`,
+    without facts of a doubted kind of hole) and its probability in the likeliest set-up."""
     best, doubted = posterior.iloc[0], posterior["posterior_share"] < DOUBTED * posterior["prior_share"]
     required = []
     for name, rows in posterior[posterior["axis"] != SET_UP].groupby("axis", sort=False):
         kept = rows["value"][~doubted[rows.index]]
         without = any(str(name).endswith(f" of {kind} holes") for kind in posterior["value"][doubted])
         required += [f"{name} is {' or '.join(kept)}"] if len(kept) < len(rows) and not without else []
-    facts = "; ".join(required) or "nothing in particular holds: every value of every axis remains possible"
+    facts = "; ".join(required) or "no particular fact holds (every value of every axis remains possible)"
     return (
         f"The thesis' outcome is borne out if {facts} (of {int((posterior['axis'] == SET_UP).sum())} set-ups; values "
         f"that the outcome makes less than half as probable are left out). In the likeliest set-up, "

@@ -1,8 +1,7 @@
-"""Rules for the claims on several views (C7, C8, C10) and the thesis' proposal (H1), each for one place of an
-experiment.
+"""Rules for the claims on several views (C7, C8, C10) and the thesis' proposal (H1), each for a place of an experiment.
 
 Repeats vary the noise and the errors of the nominal poses, but not the poses, the board or the camera's unit. So C7 is
-judged over pairs of views, and C8 and C10, which have one pair, over units of the camera."""
+judged over pairs of views; C8 and C10, which have a single pair, are judged over units of the camera."""
 
 from __future__ import annotations
 
@@ -21,7 +20,7 @@ from harness.thesis.claims import FEWEST_PAIRS, FEWEST_UNITS, Answer, Verdict, d
 Standing = Literal["ahead", "behind", "level", "open"]
 
 SLAM = ("odometry", "volume")
-"""Registration and merge of the map that represents a SLAM system: without marks or loop closure."""
+"""Registration and merging of the map that represents a SLAM system, without marks or loop closure."""
 NOISE_REDUCING = "fusion"
 MARKED = ("joint", "marks")
 RESPECTS = ("holes", "size", "noise")
@@ -33,7 +32,7 @@ def _c7(case: maps.MapCase) -> tuple[Answer, str]:
     if alone is None:
         return "undecided", "Not judged: the experiment has no single view to compare with."
     rows = case.registrations(alone.frames)
-    most = max(one.views for one in case.set_ups)
+    most = max(set_up.views for set_up in case.set_ups)
     pairs = {method: maps.of_map(rows, method, most) for method in dict.fromkeys(rows["method"])}
     if not {"icp", "cpd"} <= set(pairs):
         return "undecided", "Not judged: the experiment does not try both ICP and CPD."
@@ -48,7 +47,7 @@ def _c7(case: maps.MapCase) -> tuple[Answer, str]:
         plane, across = (float(good[f"tre_{way}_mm"].median()) for way in ("in_plane", "across"))
         errors.append(f"{method} {plane:.2f} and {across:.2f} mm, {len(part) - len(good)} of {len(part)}")
     evidence = (
-        f"With {maps.frames_text(alone.frames)}, median error in the plane, across it, and registrations that failed: "
+        f"With {maps.frames_text(alone.frames)}, median errors in the plane and across it, and failed registrations: "
         f"{'; '.join(errors)}. The noise of a single cloud's surface is {noise_mm:.2f} mm. In the plane, CPD has "
         f"{ratio:.2f} times the error of ICP ({maps.span(intervals.Interval(low, high))}, {many(n, 'pair')} of views)."
     )
@@ -94,7 +93,7 @@ def _c10(case: maps.MapCase) -> tuple[Answer, str]:
         missing = ", no ".join(name for name, found in there.items() if not found)
         return "undecided", f"Not judged: the experiment has no {missing}."
     three = (slam, alone, two)
-    # holes that all three maps measure often enough
+    # holes that all three maps measure in enough repeats
     counts = [case.holes(each).groupby("hole", sort=False)["extent_diameter_mm"].count() for each in three]
     common = [str(hole) for hole in counts[0].index if all(count.get(hole, 0) >= maps.FEWEST_BOTH for count in counts)]
 
@@ -165,8 +164,8 @@ def _h1(case: maps.MapCase) -> tuple[Answer, str]:
 
 
 def duels_of(case: maps.MapCase) -> list[tuple[tuple[Standing, ...], str]]:
-    """Compare H1's map with one view of as many frames as each of its views, and with one view of as many exposures in
-    total, if the experiment has them. Return the standing in each respect, and the numbers as text."""
+    """Compare H1's map with a single view that has as many frames as each of its views, and with a single view that has
+    as many exposures in total, if they exist. Return the standing in each respect, and the numbers as text."""
     fused = [one for one in case.set_ups if one.merge == NOISE_REDUCING and one.views > 1 and case.frames(one.variant)]
     registration = next((name for name in MARKED if any(one.registration == name for one in fused)), None)
     fused = sorted((one for one in fused if one.registration == registration), key=lambda one: -one.views)
@@ -226,7 +225,7 @@ VIEW_CLAIMS: dict[str, Callable[[maps.MapCase], tuple[Answer, str]]] = {"C7": _c
 
 
 def score_views(cases: Sequence[maps.MapCase]) -> list[Verdict]:
-    """Return a verdict for each of `VIEW_CLAIMS` and place; with several places, the evidence names the place."""
+    """Return a verdict for each of `VIEW_CLAIMS` and each place; if there are several, the evidence names the place."""
     verdicts: list[Verdict] = []
     for claim, rule in VIEW_CLAIMS.items():
         judged = [(case, verdict_of(claim, *rule(case))) for case in cases]
@@ -241,11 +240,11 @@ def score_views(cases: Sequence[maps.MapCase]) -> list[Verdict]:
 
 
 def _over_units(verdicts: Sequence[Verdict]) -> Verdict:
-    """Combine verdicts on units of the camera into one: theirs if they agree and are enough, else "undecided"."""
-    evidence = " ".join(one.evidence for one in verdicts)
-    answers = [one.verdict for one in verdicts]
+    """Combine the verdicts on units of a camera: their common verdict if they agree and are enough, or "undecided"."""
+    evidence = " ".join(verdict.evidence for verdict in verdicts)
+    answers = [verdict.verdict for verdict in verdicts]
     if len(verdicts) < FEWEST_UNITS and set(answers) != {"undecided"}:
         on = f"{many(len(verdicts), 'unit')} of the camera"
-        evidence = f"Judged on {on} only, so nothing follows for others; there: {', '.join(answers)}. {evidence}"
+        evidence = f"Judged on only {on}, so nothing follows for others: {', '.join(answers)}. {evidence}"
     agreed = len(verdicts) >= FEWEST_UNITS and len(set(answers)) == 1
     return replace(verdicts[0], verdict=answers[0] if agreed else "undecided", evidence=evidence)

@@ -11,11 +11,11 @@ import threading
 from collections.abc import Callable
 from functools import partial
 
-CLOSED_PIPE = 141  # Exit code that a shell reports of a program that SIGPIPE ended: 128 + 13
+CLOSED_PIPE = 141  # Exit code that a shell reports when SIGPIPE ends a program: 128 + 13
 
 
 class UserError(Exception):
-    """A mistake that the user can fix: what is wrong and where; ``legal``: what would be; ``fix``: what to do next."""
+    """A user's mistake: ``message`` says what is wrong and where, ``legal`` what is allowed, ``fix`` what to do."""
 
     def __init__(self, message: str, *, legal: str | None = None, fix: str | None = None) -> None:
         super().__init__(message)
@@ -24,7 +24,7 @@ class UserError(Exception):
         self.fix = fix
 
     def __reduce__(self) -> tuple[object, ...]:
-        # Exceptions with keyword arguments do not survive pickling between worker processes otherwise.
+        # Without this, exceptions with keyword arguments do not survive pickling between worker processes.
         return partial(type(self), legal=self.legal, fix=self.fix), (self.message,)
 
     def __str__(self) -> str:
@@ -37,20 +37,20 @@ class DiskFull(UserError):
 
 
 def exit_code_of(program: Callable[[], int]) -> int:
-    """Run a program's body; a UserError becomes one message on stderr and exit code 2, Ctrl-C becomes 130, and output
-    that nobody reads to its end (``| head``) ends it silently with 141. Further Ctrl-C are ignored while it ends."""
-    ours = threading.current_thread() is threading.main_thread()
-    ours = ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    """Run a program's body and return its exit code. A UserError gives one message on stderr and code 2, Ctrl-C gives
+    130, and a closed output pipe (``| head``) silently gives 141. Further Ctrl-C are ignored during the shutdown."""
+    owns_interrupt = threading.current_thread() is threading.main_thread()
+    owns_interrupt = owns_interrupt and signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
     def interrupt(number: int, frame: object) -> None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         raise KeyboardInterrupt
 
-    if ours:
+    if owns_interrupt:
         signal.signal(signal.SIGINT, interrupt)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
-            stream.reconfigure(errors="replace")  # a terminal without the sign for "plus or minus" shows "?"
+            stream.reconfigure(errors="replace")  # a terminal that lacks a character such as "±" shows "?"
     try:
         code = program()
         sys.stdout.flush()
@@ -66,12 +66,12 @@ def exit_code_of(program: Callable[[], int]) -> int:
         print("interrupted", file=sys.stderr)
         return 130
     finally:
-        if ours:
+        if owns_interrupt:
             signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _nobody_reads() -> bool:
-    """Return whether it is the standard output whose pipe is closed."""
+    """Return whether the closed pipe is that of the standard output."""
     try:
         output, poll = sys.stdout.fileno(), select.poll()
     except (OSError, ValueError):

@@ -1,6 +1,6 @@
-"""Files: read within limits, as strict JSON; written whole or not at all; locked by the system's own locks.
+"""Reading files within size limits and as strict JSON, writing them atomically, and locking them.
 
-A hostile file may try to fill the memory: most are refused unread; libraries run within `limited_memory`."""
+A hostile file may try to fill the memory. Most such files are refused unread; libraries run in `limited_memory`."""
 
 from __future__ import annotations
 
@@ -22,37 +22,37 @@ from typing import IO, Any, Literal
 
 from harness.vocabulary.errors import DiskFull, UserError
 
-FRAME_PIXELS = 64_000_000  # Of a frame, picture or cloud: sixty times the largest depth sensor; 1.5 GB as points
+FRAME_PIXELS = 64_000_000  # A frame, picture or cloud: sixty times the largest depth sensor; 1.5 GB as points
 ARRAYS_BYTES = 4 << 30  # All arrays of one ``.npz`` or ``.mat``: 5,800 frames of an Azure Kinect in 16 bits
-READING_BYTES = 5 << 30  # Memory of a library that reads one file: `ARRAYS_BYTES`, and what unpacking needs beside
-PICTURE_BYTES = 512 << 20  # A picture's file: what `FRAME_PIXELS` of 48 bits need without compression, and more
-RECORD_BYTES = 256 << 20  # A study's record: three million inspections; as Python's values 10 times as large
-TEXT_BYTES = 16 << 20  # A file of settings, poses, a calibration, a bag's description: mostly some kB
+READING_BYTES = 5 << 30  # Memory of a library that reads one file: `ARRAYS_BYTES` and the memory to unpack them
+PICTURE_BYTES = 512 << 20  # A picture file: more than `FRAME_PIXELS` of 48 bits need without compression
+RECORD_BYTES = 256 << 20  # A study's record: three million inspections; Python objects take 10 times as much
+TEXT_BYTES = 16 << 20  # A file of settings, poses or calibration, or a bag's description: usually a few kB
 TABLE_BYTES = 256 << 20  # A table of inspections: five million rows
 RAISE = "if the file must be this large, raise the limit in harness/vocabulary/files.py"
 
 
 def size_text(count: int) -> str:
-    """Return bytes as text in the unit that is easiest to read."""
+    """Return a number of bytes as text in the unit that is easiest to read."""
     units = (("GiB", 1 << 30), ("MiB", 1 << 20), ("kiB", 1 << 10))
     return next((f"{count / factor:.4g} {unit}" for unit, factor in units if count >= factor), f"{count} bytes")
 
 
 def refuse_bytes(name: str, count: int, at_most: int, what: str = "has", fix: str = RAISE) -> None:
-    """Raise UserError where ``count`` bytes are more than ``at_most``."""
+    """Raise UserError if ``count`` bytes exceed ``at_most``."""
     if count > at_most:
         raise UserError(f"{name}: {what} {size_text(count)}", legal=f"at most {size_text(at_most)}", fix=fix)
 
 
 def refuse_pixels(name: str, width: int, height: int) -> None:
-    """Raise UserError where an image has no pixel, or more than `FRAME_PIXELS`."""
+    """Raise UserError if an image has no pixels, or more than `FRAME_PIXELS`."""
     if min(width, height) < 1 or width * height > FRAME_PIXELS:
         legal, fix = f"1 to {FRAME_PIXELS // 10**6} million pixels", RAISE if min(width, height) > 0 else None
         raise UserError(f"{name}: {width} x {height} pixels", legal=legal, fix=fix)
 
 
 def bounded_bytes(path: Path, at_most: int) -> bytes:
-    """Return a file's content. Raises UserError where it is larger, also of a device or pipe; OSError as files do."""
+    """Return the content of a file, device or pipe. Raises UserError if it exceeds ``at_most``, OSError as `open`."""
     with Path(path).open("rb") as stream:
         content = stream.read(at_most + 1)
     if len(content) > at_most:
@@ -61,20 +61,20 @@ def bounded_bytes(path: Path, at_most: int) -> bytes:
 
 
 def shipped(kind: str) -> Path:
-    """Return the folder of ``experiments`` or ``baselines`` of tofpod's checkout, else of the environment."""
+    """Return the folder ``experiments`` or ``baselines``: of tofpod's checkout, or else of the environment."""
     checkout = Path(__file__).resolve().parents[2]
     folder = checkout / ("results/baselines" if kind == "baselines" else kind)
     return folder if folder.is_dir() else Path(sysconfig.get_path("data")) / "share" / "tofpod" / kind
 
 
 _LOCK, _WANTED, _BEFORE = threading.Lock(), list[int](), list[tuple[int, int]]()
-"""Limits that the places inside `limited_memory` want, and the process's own limit from before the first of them."""
+"""The limits that active `limited_memory` contexts request, and the process's own limit before the first of them."""
 
 
 @contextmanager
 def limited_memory() -> Iterator[None]:
-    """Limit the memory that the process may take inside to `READING_BYTES` more; beyond, MemoryError is raised. The
-    limit (RLIMIT_AS) holds for all threads; of several the least counts. Systems without it or /proc set none."""
+    """Limit the additional memory of the process to `READING_BYTES`; an excess raises MemoryError. The limit
+    (RLIMIT_AS) holds for all threads; the lowest of several counts. Systems without it or /proc set no limit."""
     try:
         import resource
 
@@ -103,8 +103,8 @@ def limited_memory() -> Iterator[None]:
 
 
 def strict_json(content: bytes | str, *, nan: bool = False) -> Any:
-    """Return the value of a JSON text (UTF-8). Raises ValueError, saying why, for text that is not JSON: a key that
-    occurs twice in an object, NaN and Infinity (unless ``nan``), too deep nesting, too long integers."""
+    """Return the value of a JSON text (UTF-8). Raises ValueError with the reason if the text is not JSON, repeats a key
+    in an object, holds NaN or Infinity (unless ``nan``), is nested too deeply, or holds too long an integer."""
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         found: dict[str, Any] = {}
@@ -121,18 +121,18 @@ def strict_json(content: bytes | str, *, nan: bool = False) -> Any:
     try:
         return json.loads(text, object_pairs_hook=unique, parse_constant=None if nan else no_number)
     except RecursionError:
-        raise ValueError("it is nested too deep") from None
+        raise ValueError("it is nested too deeply") from None
 
 
 NOT_WRITABLE = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.ENOENT}
 NOT_WRITABLE |= {errno.ENAMETOOLONG, errno.EINVAL}
-"""Error numbers of a place where no file can be made (ENOENT for a place inside /proc)."""
+"""Error numbers for a place where no file can be created (ENOENT for a place inside /proc)."""
 
 
 @contextmanager
 def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
-    """Yield a temporary path beside ``path`` (same suffix); rename it on success, delete it on failure. ``durable``:
-    on the disk before the rename. Raises UserError where the folder cannot be written or the disk is full."""
+    """Yield a temporary path beside ``path`` (same suffix); rename it on success, delete it on failure. ``durable``
+    flushes the file to disk before the rename. Raises UserError if the folder is not writable or the disk is full."""
     path = Path(path)
 
     def make() -> str:
@@ -149,10 +149,10 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """Yield a new folder beside ``path``, which gets its name on success. Raises UserError where it cannot be."""
+    """Yield a temporary folder, which is renamed to ``path`` on success. Raises UserError if it cannot be created."""
     path = Path(path)
     if path.is_dir() and any(path.iterdir()):
-        raise UserError(f"{path}: the folder is not empty, and is left as it is", fix="name a new folder with --out")
+        raise UserError(f"{path}: the folder is not empty; it was not changed", fix="name a new folder with --out")
 
     def make() -> str:
         if path.exists() and not path.is_dir():
@@ -165,7 +165,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _renamed(path: Path, make: Callable[[], str], mode: int) -> Iterator[Path]:
-    """Make something temporary and rename it, with the user's umask: tempfile makes everything private."""
+    """Create a temporary file or folder and rename it, with the user's umask: tempfile makes everything private."""
     temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -183,8 +183,8 @@ def _renamed(path: Path, make: Callable[[], str], mode: int) -> Iterator[Path]:
 
 
 def inside(folder: Path, *parts: str) -> Path:
-    """``folder`` with ``parts`` below it, for names that somebody else may have chosen. Raises UserError where a part
-    is not a plain name, or where a link in ``folder`` leads out of it. ``folder`` itself may be a link."""
+    """Return ``folder`` joined with ``parts``, names that may come from an untrusted file. Raises UserError if a part
+    is not a plain name, or if a link in ``folder`` leads out of it. ``folder`` itself may be a link."""
     for part in parts:
         if part in ("", ".", "..") or any(letter in part for letter in "/\\\0"):
             raise UserError(f"{part!r} is not a name for a file or folder", legal="letters, digits, - and _")
@@ -207,22 +207,22 @@ def write_text(path: Path, content: str, *, durable: bool = True) -> None:
 
 
 def open_plain(path: Path, flags: int) -> IO[bytes]:
-    """Open a regular file, unbuffered where it is written, never through a link. ``flags`` as of `os.open`. Raises
-    UserError where the path is a link, a pipe or a folder; OSError as `os.open` does."""
-    odd = UserError(f"{path}: is not a regular file, so nothing is read from it or written to it", fix="remove it")
+    """Open a regular file, never through a link; a file opened for writing is unbuffered. ``flags`` are those of
+    `os.open`. Raises UserError if the path is a link, a pipe or a folder; OSError as `os.open` does."""
+    irregular = UserError(f"{path}: is not a regular file, so it is neither read nor written", fix="remove it")
     if path.is_symlink() or path.is_dir():
-        raise odd
+        raise irregular
     flags |= getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
     descriptor = os.open(path, flags, 0o666)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
-        raise odd
+        raise irregular
     writes = flags & (os.O_WRONLY | os.O_RDWR)
     return os.fdopen(descriptor, "r+b" if writes else "rb", buffering=0 if writes else -1)
 
 
 def explained(error: OSError, path: Path) -> Exception:
-    """Return the user's mistake behind an OSError of writing, or the error itself where it is not a known one."""
+    """Return the user's mistake that caused an OSError during writing, or the error itself if the cause is unknown."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         fix = "free some space and run the same command again; finished work is kept"
         return DiskFull(f"{path}: the disk is full", fix=fix)
@@ -232,16 +232,16 @@ def explained(error: OSError, path: Path) -> Exception:
     return error
 
 
-Answer = Literal["held", "busy", "no locks"]  # busy: by another process; none on Windows and some file systems
+Answer = Literal["held", "busy", "no locks"]  # busy: held by another process; no locks: Windows, some file systems
 
 
 def opened_lock(path: Path) -> IO[bytes]:
-    """Open a lock file, made where there is none. Raises OSError, or UserError where it is not a regular file."""
+    """Open a lock file; create it if it is missing. Raises OSError, or UserError if it is not a regular file."""
     return open_plain(path, os.O_RDWR | os.O_CREAT | os.O_APPEND)
 
 
 def lock(file: IO[bytes], *, shared: bool, wait: bool) -> Answer:
-    """Lock an open file until it is closed."""
+    """Lock an open file until it is closed; return whether the lock is held."""
     try:
         import fcntl
     except ImportError:
@@ -257,7 +257,7 @@ def lock(file: IO[bytes], *, shared: bool, wait: bool) -> Answer:
 
 @contextmanager
 def one_at_a_time(path: Path, number: int) -> Iterator[None]:
-    """Hold byte ``number`` of a lock file against other processes, where the system knows locks."""
+    """Lock byte ``number`` of a lock file against other processes, if the system supports locks."""
     try:
         import fcntl
 
@@ -272,7 +272,7 @@ def one_at_a_time(path: Path, number: int) -> Iterator[None]:
 
 
 def file_digest(path: Path) -> str:
-    """Return the digest of a file's content; it is read again where its size or its time of change is another."""
+    """Return the digest of a file's content; the file is read again if its size or modification time has changed."""
     found = path.stat()
     return _digest_of(path, found.st_size, found.st_mtime_ns)
 
@@ -294,7 +294,7 @@ def plain_json(data: Mapping[str, Any]) -> str:
 
 
 def jsonable(value: Any) -> Any:
-    """Return plain data, tuples, arrays and NumPy's numbers as JSON's types: None for a number that is not finite."""
+    """Convert plain data, tuples, arrays and NumPy numbers to JSON types; numbers that are not finite become None."""
     if isinstance(value, Mapping):
         return {str(key): jsonable(item) for key, item in value.items()}
     if hasattr(value, "tolist"):

@@ -1,6 +1,6 @@
 """Units, rigid transforms, regions of pixels, lenses, and what cameras capture: frames and their clouds.
 
-SI inside the program; millimetres, inches and degrees only in YAML, tables and reports.
+The program computes in SI units; millimetres, inches and degrees occur only in YAML, tables and reports.
 
 Frames. ``camera``: x right, y down, z along the optical axis, origin at the depth lens (OpenCV's convention), metres.
 ``board``: x along the row of holes, y up the face, z out of the face to the camera, origin at the centre, metres.
@@ -25,7 +25,7 @@ SPEED_OF_LIGHT_AIR = SPEED_OF_LIGHT_VACUUM / REFRACTIVE_INDEX_AIR  # m/s in indo
 
 
 def transform_points(T_a_b: np.ndarray, points_b: np.ndarray) -> np.ndarray:
-    """Map points (..., 3) from frame b to frame a by the 4x4 matrix ``T_a_b``."""
+    """Map points (..., 3) from frame b to frame a with the 4x4 matrix ``T_a_b``."""
     return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 
 
@@ -35,7 +35,7 @@ def rotate_vectors(T_a_b: np.ndarray, vectors_b: np.ndarray) -> np.ndarray:
 
 
 def invert(T_a_b: np.ndarray) -> np.ndarray:
-    """The inverse of a rigid 4x4 transform: ``T_b_a``."""
+    """Return the inverse of a rigid 4x4 transform, ``T_b_a``."""
     T_b_a = np.eye(4)
     T_b_a[:3, :3] = T_a_b[:3, :3].T
     T_b_a[:3, 3] = -T_a_b[:3, :3].T @ T_a_b[:3, 3]
@@ -43,7 +43,7 @@ def invert(T_a_b: np.ndarray) -> np.ndarray:
 
 
 def rotation_xyz_deg(about_x: float, about_y: float, about_z: float) -> np.ndarray:
-    """3x3 rotation Rz @ Ry @ Rx by angles in degrees (about x first)."""
+    """Return the 3x3 rotation Rz @ Ry @ Rx for angles in degrees (about x first)."""
     ax, ay, az = np.deg2rad([about_x, about_y, about_z])
     rx = np.array([[1, 0, 0], [0, np.cos(ax), -np.sin(ax)], [0, np.sin(ax), np.cos(ax)]])
     ry = np.array([[np.cos(ay), 0, np.sin(ay)], [0, 1, 0], [-np.sin(ay), 0, np.cos(ay)]])
@@ -65,24 +65,24 @@ class Region:
         return self.row1 - self.row0, self.col1 - self.col0
 
     def grown(self, margin: int, height: int, width: int) -> Region:
-        """This region with ``margin`` more pixels on each side, clipped to a sensor of ``height`` x ``width``."""
+        """Return the region with ``margin`` more pixels on each side, clipped to a sensor of ``height`` x ``width``."""
         rows = max(self.row0 - margin, 0), min(self.row1 + margin, height)
         return Region(*rows, max(self.col0 - margin, 0), min(self.col1 + margin, width))
 
     def within(self, outer: Region) -> tuple[slice, slice]:
-        """Slices that cut this region out of an array that covers ``outer``."""
+        """Return the slices that cut this region out of an array that covers ``outer``."""
         rows = slice(self.row0 - outer.row0, self.row1 - outer.row0)
         return rows, slice(self.col0 - outer.col0, self.col1 - outer.col0)
 
 
 UNDISTORT_STEPS = 200  # Fixed-point steps of the inversion: the Azure Kinect's corners converge to 1e-9 px within 60
-SAME_SLOPE = 1e-3  # Rays closer in slope are the same: where a lens' distortion turns back they differ by more
+SAME_SLOPE = 1e-3  # Rays closer in slope are the same; where a lens's distortion folds back they differ by more
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A central camera: pinhole with OpenCV's rational and Brown-Conrady distortion. ``distortion`` is (k1, k2, p1, p2,
-    k3, k4, k5, k6); zeros: none. Pixel (0, 0) is the first one's centre. Not modelled: tilted sensors, thin prisms."""
+    """A pinhole camera with OpenCV's rational and Brown-Conrady distortion. ``distortion`` is (k1, k2, p1, p2, k3, k4,
+    k5, k6); zeros mean none. (0, 0) is the centre of the first pixel. Not modelled: tilted sensors, thin prisms."""
 
     width: int
     height: int
@@ -103,7 +103,7 @@ class Lens:
         return Region(0, self.height, 0, self.width)
 
     def slopes(self, u_px: np.ndarray, v_px: np.ndarray) -> np.ndarray:
-        """Undistorted (x/z, y/z), shape (..., 2), of the rays through pixel positions (sub-pixel allowed)."""
+        """Return the undistorted (x/z, y/z), shape (..., 2), of rays through pixel positions (sub-pixel allowed)."""
         import cv2
 
         u, v = np.broadcast_arrays(np.asarray(u_px, float), np.asarray(v_px, float))
@@ -114,11 +114,11 @@ class Lens:
         return cv2.undistortPoints(pixels, self.matrix, np.array(self.distortion), criteria=stop).reshape(*u.shape, 2)
 
     def region_slopes(self, region: Region) -> np.ndarray:
-        """(x/z, y/z) through the pixel centres of a region, shape (h, w, 2); kept, so not to be written to."""
+        """Return (x/z, y/z) through the pixel centres of a region, shape (h, w, 2); cached, so do not write to it."""
         return _region_slopes(self, region)
 
     def project(self, points_camera_m: np.ndarray) -> np.ndarray:
-        """Pixel positions (u, v), shape (..., 2), of points (..., 3) in front of the camera (z > 0)."""
+        """Return the pixel positions (u, v), shape (..., 2), of points (..., 3) in front of the camera (z > 0)."""
         import cv2
 
         flat = np.ascontiguousarray(points_camera_m.reshape(-1, 3), dtype=float)
@@ -126,7 +126,7 @@ class Lens:
         return pixels.reshape(*points_camera_m.shape[:-1], 2)
 
     def images(self, points_camera_m: np.ndarray) -> np.ndarray:
-        """Tell which points (..., 3) have an image, (...) bool: in front, and met by the ray of their own pixel."""
+        """Return which points (..., 3) have an image, (...) bool: in front, and on the ray of their own pixel."""
         ahead = points_camera_m[..., 2] > 0
         points = np.where(ahead[..., None], points_camera_m, [0.0, 0.0, 1.0])
         u, v = np.moveaxis(self.project(points), -1, 0)
@@ -137,9 +137,9 @@ class Lens:
 
 @dataclass(frozen=True)
 class OtherLens(Lens):
-    """A lens that was not measured for the images themselves, with remarks on it: ``note`` and ``warning``, "" for
-    none. ``mode``: of a camera's nominal lens, its depth mode by name; ``unit_m``: metres in a stored number there;
-    ``others``: the lenses of the same camera's other modes."""
+    """A lens that was not calibrated for the images at hand. ``note`` and ``warning`` are remarks on it, "" for none. A
+    camera's nominal lens has three more: ``mode`` is the name of its depth mode, ``unit_m`` the metres per stored
+    number in that mode, and ``others`` the lenses of the same camera's other modes."""
 
     note: str = ""
     warning: str = ""
@@ -149,18 +149,18 @@ class OtherLens(Lens):
 
     @property
     def plain(self) -> Lens:
-        """The lens alone."""
+        """The lens without these remarks."""
         return Lens(self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.distortion)
 
 
-@lru_cache(maxsize=6)  # 6 MB for each region of 640 x 576 pixels, which takes 0.3 s
+@lru_cache(maxsize=6)  # a region of 640 x 576 pixels takes 6 MB and 0.3 s
 def _region_slopes(lens: Lens, region: Region) -> np.ndarray:
     v, u = np.mgrid[region.row0 : region.row1, region.col0 : region.col1]
     return lens.slopes(u, v)
 
 
 class Reason(IntEnum):
-    """The reason why a pixel has no range; a recording says NO_RETURN or NOT_FINITE only, a simulated camera all."""
+    """The reason why a pixel has no range. A recording gives only NO_RETURN or NOT_FINITE, a simulated camera all."""
 
     VALID = 0
     NO_RETURN = 1  # the file holds the code for "no depth" (0), or the ray met nothing
@@ -177,9 +177,9 @@ class Reason(IntEnum):
 
 @dataclass(frozen=True)
 class Frame:
-    """One exposure. ``z_m`` (h, w) float32: distance along the optical axis, NaN where invalid. ``reason`` (h, w) uint8
-    of `Reason`. ``xy_m`` (h, w, 2) only where the source has no lens (a stored point cloud). ``rgb`` (h, w, 3) uint8
-    and ``amplitude`` (h, w) float32 where known. ``name`` is for messages. ``notes``: how stored numbers were read."""
+    """One exposure. ``z_m`` (h, w) float32 is the distance along the optical axis, NaN where invalid. ``reason`` (h, w)
+    uint8 holds `Reason`. ``xy_m`` (h, w, 2) is given only if the source has no lens (a stored point cloud); ``rgb`` (h,
+    w, 3) uint8 and ``amplitude`` (h, w) float32 if known. ``notes`` say how stored numbers were interpreted."""
 
     name: str
     z_m: np.ndarray
@@ -191,8 +191,8 @@ class Frame:
 
 
 class FrameSource(Protocol):
-    """A source of frames: a simulated camera or a recording. Frames are streamed, never all held. ``slopes`` (h, w, 2)
-    are x/z and y/z per pixel, None where each frame carries ``xy_m``. ``organised`` is False for a cloud without a
+    """A source of frames: a simulated camera or a recording. Frames are streamed, never all in memory. ``slopes`` (h,
+    w, 2) are x/z and y/z per pixel, None if each frame carries ``xy_m``. ``organised`` is False for a cloud without a
     pixel grid (then h == 1). ``z_step_m`` is the rounding step of the stored distance (0 if none)."""
 
     @property
@@ -214,7 +214,7 @@ class FrameSource(Protocol):
 
 @dataclass(frozen=True)
 class LeftOut:
-    """A frame that averaging did not use, and why."""
+    """A frame that the average excludes, and the reason."""
 
     name: str
     why: str
@@ -222,8 +222,8 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class MapViews:
-    """The views that a map was made from. ``T_cloud_cameras`` (k, 4, 4): their camera frames to the map's; ``shares``
-    (k,): their weights in it, which sum to 1. ``pixel_m``: sides in x and y of what their pixels see of its surface."""
+    """The views that a map was made from. ``T_cloud_cameras`` (k, 4, 4) map their camera frames to the map's frame.
+    ``shares`` (k,) are their weights, which sum to 1. ``pixel_m`` are a pixel's sides in x and y on the surface."""
 
     T_cloud_cameras: np.ndarray
     shares: np.ndarray
@@ -232,14 +232,14 @@ class MapViews:
 
 @dataclass(frozen=True)
 class Cloud:
-    """The average of frames as points in the camera's frame: the input of a detector. ``points_m`` (h, w, 3) float64,
-    NaN where invalid; ``reason`` (h, w) uint8 of `Reason` (the commonest among the frames where no sample was valid);
-    ``count`` (h, w) valid samples; ``variance_m2`` (h, w) sample variance of one frame's z, NaN below two samples. An
-    unorganised cloud has h == 1 and ``organised`` False. ``region`` places the grid on the sensor; ``z_step_m`` is the
-    rounding step of one frame's z. A map of several views is a cloud too: its frame is its maker's, with z away from
-    the viewer. ``projection``: the grid's samples are "central" (rays through the origin, a camera) or "parallel"
-    (equal cells in x and y, a map). ``mean_variance_m2`` (h, w): variance of the point's z itself, systematic parts
-    included, where stated. ``noise_reach_px``: side of the square over which noise is blurred; 0: unknown."""
+    """The average of frames as points in the camera's frame: the input of a detector. ``points_m`` (h, w, 3) float64 is
+    NaN where invalid. ``reason`` (h, w) uint8 holds `Reason` (the most frequent one, if no sample was valid). ``count``
+    (h, w) is the number of valid samples, ``variance_m2`` (h, w) the sample variance of one frame's z, NaN below two
+    samples. An unorganised cloud has h == 1 and ``organised`` False. ``region`` places the grid on the sensor;
+    ``z_step_m`` is the rounding step of one frame's z. ``projection`` is "central" for rays through the origin (a
+    camera) and "parallel" for equal cells in x and y. A map of several views is such a cloud, in a frame with z away
+    from the viewer. ``mean_variance_m2`` (h, w), if stated, is the variance of each averaged z with its systematic
+    parts. ``noise_reach_px`` is the side of the square over which noise is blurred; 0 means unknown."""
 
     points_m: np.ndarray
     reason: np.ndarray
@@ -260,5 +260,5 @@ class Cloud:
 
     @property
     def valid(self) -> np.ndarray:
-        """(h, w) bool: pixels with a point."""
+        """The pixels that have a point, (h, w) bool."""
         return np.isfinite(self.points_m[..., 2])

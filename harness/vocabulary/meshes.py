@@ -1,4 +1,4 @@
-"""Reads meshes of parts from files: with a bound on their size, in metres, and with their front facing the camera."""
+"""Reads meshes of parts from files of limited size, in metres and with the front facing the camera."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FRONTS = {
 
 
 def read_mesh(file: str) -> Any:
-    """Return a file's triangles as a `trimesh.Trimesh`, without flat and doubled ones. Raises UserError."""
+    """Return a file's triangles as a `trimesh.Trimesh`, without degenerate or duplicate triangles. Raises UserError."""
     import trimesh
 
     path = Path(file)
@@ -52,5 +52,5 @@ def read_mesh(file: str) -> Any:
 
 
 def front_first(mesh: Any, unit: str, front: str) -> np.ndarray:
-    """Return a mesh's vertices (n, 3) in metres: z along its front axis, y as upright as that leaves it."""
+    """Return a mesh's vertices (n, 3) in metres, with z along its front axis and y as close to upright as possible."""
     return np.asarray(np.asarray(mesh.vertices, float) @ np.array(FRONTS[front], float).T * UNITS_M[unit])

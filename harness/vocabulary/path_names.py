@@ -1,4 +1,4 @@
-"""Dotted paths and their values in the words of tables: ``source.target.distance_m`` is "distance", in m."""
+"""Dotted paths and their values as tables show them: ``source.target.distance_m`` becomes "distance", in m."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from pathlib import Path
 from typing import Any
 
 UNITS = {"_mrad": "mrad", "_deg": "°", "_mm": "mm", "_nm": "nm", "_px": "px", "_hz": "Hz", "_m": "m"}
-"""Endings of keys that name a unit, longer ones first."""
-CHOICES = ("name", "kind", "method")  # keys that choose one of several kinds; the key before them says of what
+"""Endings of keys that name a unit; longer endings come first."""
+CHOICES = ("name", "kind", "method")  # keys that select one of several kinds of what the key before them names
 NAMED = ("camera", "detector", "damage")  # axes whose values explain themselves
 LONGEST = 60  # Characters of a value that a table can show
 
 
 def names_of(paths: Iterable[str]) -> dict[str, str]:
-    """Return a name for each path, without unit: its last meaningful key, or the whole path if that is not unique."""
+    """Return a name without unit for each path: its last meaningful key, or the whole path if that is not unique."""
     short = {path: _split(path)[0] for path in paths}
     return {path: name if list(short.values()).count(name) == 1 else path for path, name in short.items()}
 
 
 def unit_of(path: str) -> str:
-    """The unit that the last key's ending names, or empty."""
+    """Return the unit that the ending of the last key names, or an empty text."""
     return _split(path)[1]
 
 
 def value_text(path: str, value: Any) -> str:
-    """A value on one short line, with its unit; of a mapping which of several it is, then its keys and values."""
+    """Return a value with its unit on one short line; a mapping as its kind, then its keys and values."""
     if isinstance(value, dict) and value:
         choice = next((key for key in CHOICES if key in value), "")
         rest = (f"{_split(key)[0]} {value_text(key, held)}" for key, held in value.items() if key != choice)
@@ -45,7 +45,7 @@ def value_text(path: str, value: Any) -> str:
 
 @cache
 def camera_title(name: str) -> str:
-    """Return the title of a camera of tofpod without commas; of any other name or path its words."""
+    """Return the title of one of tofpod's cameras without commas; for any other name or path, its words."""
     if re.fullmatch(r"\w+", name):
         file = resources.files("scenes") / "cameras" / f"{name}.yaml"
         found = re.search(r"^title: (.+)$", file.read_text(encoding="utf-8"), re.MULTILINE) if file.is_file() else None
@@ -55,11 +55,11 @@ def camera_title(name: str) -> str:
 
 
 def in_words(variant: str) -> str:
-    """Return a set-up's name as people read it: ``camera=kinect_v2, distance=0.5 m`` is "Kinect v2, distance 0.5 m"."""
-    return ", ".join(_said(part) for part in re.split(r", (?=[^=,]+=)", variant))
+    """Return a set-up's name in words: ``camera=kinect_v2, distance=0.5 m`` becomes "Kinect v2, distance 0.5 m"."""
+    return ", ".join(_setting_in_words(part) for part in re.split(r", (?=[^=,]+=)", variant))
 
 
-def _said(part: str) -> str:
+def _setting_in_words(part: str) -> str:
     name, is_set, text = part.partition("=")
     if not is_set or name.endswith(" "):  # a label of the user's own
         return part
@@ -71,7 +71,7 @@ def _said(part: str) -> str:
 
 
 def differing(value: Any, others: Iterable[Any]) -> Any:
-    """Return a mapping without what it has in common with all ``others``; any other value as it is."""
+    """Return a mapping without the entries that all ``others`` share; return any other value unchanged."""
     held = list(others)
     if not all(isinstance(other, dict) for other in (value, *held)):
         return value
@@ -83,7 +83,7 @@ def _is_number(value: Any) -> bool:
 
 
 def on_one_line(value: Any) -> str:
-    """A value as text of at most `LONGEST` characters; of a mapping first which of several it is: ``flat {...}``."""
+    """Return a value as text of at most `LONGEST` characters; a mapping starts with its kind, as in ``flat {...}``."""
     choice = next((key for key in CHOICES if key in value), "") if isinstance(value, dict) else ""
     if choice:
         rest = {key: other for key, other in value.items() if key != choice}

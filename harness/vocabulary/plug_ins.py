@@ -1,4 +1,4 @@
-"""Detectors, cameras and others by name: tofpod's own and those of entry points; looked up without an import."""
+"""Finds built-in and plug-in detectors, cameras and others by name, without importing them."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from typing import Any
 
 from harness.vocabulary.errors import UserError
 
-OWN = "tofpod"  # name of the package of the built-in ones
+OWN = "tofpod"  # name of the package with the built-in parts
 
 
 @dataclass(frozen=True)
 class Offer:
-    """A name, its ``target`` (``module:attribute``, of a built-in also a file), and the package it is from."""
+    """A name, its ``target`` (``module:attribute``, or a file for some built-in parts), and the package it is from."""
 
     name: str
     target: str
@@ -37,7 +37,7 @@ class Offer:
 
 @dataclass(frozen=True)
 class PlugIns:
-    """The names of an entry point group: ``noun`` for messages, ``built_in`` ones by name, ``fix`` as advice."""
+    """The names of an entry point group. ``noun`` is used in messages, ``fix`` is advice; ``built_in`` maps names."""
 
     group: str
     noun: str
@@ -45,15 +45,15 @@ class PlugIns:
     fix: str = ""
 
     def offers(self) -> tuple[Offer, ...]:
-        """Return every offer, by name; a name that two packages claim occurs twice."""
+        """Return every offer, sorted by name; a name that two packages claim occurs twice."""
         return _offers(self.group, tuple(self.built_in().items()), tuple(sys.path))
 
     def names(self) -> tuple[str, ...]:
-        """Every known name, sorted; a name that is taken twice is one of them."""
+        """Return every known name once, sorted."""
         return tuple(sorted({offer.name for offer in self.offers()}))
 
     def offer(self, name: str) -> Offer:
-        """Find the offer of a name. Raises UserError where it is unknown, with the nearest one, or taken twice."""
+        """Find the offer of a name. Raises UserError if the name is unknown (with the nearest name) or taken twice."""
         found = [offer for offer in self.offers() if offer.name == name]
         if not found:
             from harness.vocabulary.declaration.diagnose import nearest
@@ -69,21 +69,21 @@ class PlugIns:
         return found[0]
 
     def load(self, offer: Offer) -> Any:
-        """The attribute behind an offer. Raises UserError where a plug-in fails; a built-in one is a bug."""
+        """Import and return an offer's attribute. Raises UserError if a plug-in fails; built-in parts must not fail."""
         module, _, attribute = offer.target.partition("[")[0].strip().partition(":")
         try:
             found: Any = importlib.import_module(module)
             for part in filter(None, attribute.split(".")):
                 found = getattr(found, part)
             return found
-        # whatever a foreign module does on import, sys.exit() too, the mistake is that it is installed here
+        # whatever a foreign module does on import, even sys.exit(), the user must repair or uninstall it
         except (Exception, SystemExit) as error:
             if offer.built_in:
                 raise
             raise self.broken(offer, f"{type(error).__name__}: {error}", f"python -c 'import {module}'") from error
 
     def broken(self, offer: Offer, why: str, command: str = "") -> UserError:
-        """Return the mistake of a plug-in that does not fit its group. ``command`` would show more."""
+        """Return the error for a plug-in that does not fit its group. ``command`` shows the user more."""
         fix = f"repair or uninstall the package {offer.package}" + (f"; `{command}` shows more" if command else "")
         what = f"{self.noun} {offer.name!r} ({offer.target}, of the package {offer.origin}) cannot be loaded: {why}"
         return UserError(what, fix=fix)
@@ -91,7 +91,7 @@ class PlugIns:
 
 @lru_cache(maxsize=8)
 def _offers(group: str, built_in: tuple[tuple[str, str], ...], _path: tuple[str, ...]) -> tuple[Offer, ...]:
-    """Return tofpod's own offers and the group's. Remembered: reading every installed package takes 7 ms."""
+    """Return tofpod's own offers and the group's. Cached, since reading every installed package takes 7 ms."""
     from harness import __version__
 
     found = [Offer(name, target, OWN, __version__) for name, target in built_in]

@@ -1,4 +1,4 @@
-"""The frame of every program: its parser, one message for a mistake, an exit code."""
+"""The frame of all programs: the parser, one message for a user's mistake, and exit codes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Run = Callable[[argparse.Namespace, str], int]
 
 @dataclass(frozen=True)
 class Program:
-    """``python -m <name>``: called, it parses arguments (None: the command line's) and runs."""
+    """A program, ``python -m <name>``. A call parses the arguments (None: those of the command line) and runs it."""
 
     name: str
     options: Options
@@ -28,7 +28,7 @@ class Program:
 
     @property
     def command(self) -> str:
-        """Its name as it was called: ``tofpod sweep`` or ``python -m harness.sweep``."""
+        """The name by which it was called: ``tofpod sweep`` or ``python -m harness.sweep``."""
         return self.name.replace("harness.", "tofpod " if Path(sys.argv[0]).name == "tofpod" else "python -m harness.")
 
     def parser(self) -> argparse.ArgumentParser:
@@ -38,17 +38,17 @@ class Program:
         return parser
 
     def __call__(self, arguments: list[str] | None = None) -> int:
-        """Run the program; returns what ``run`` returns, 2 on a mistake of the user, 130 after Ctrl-C."""
+        """Run the program. Returns the result of ``run``, 2 after a user's mistake, or 130 after Ctrl-C."""
         given = sys.argv[1:] if arguments is None else arguments
         parsed = self.parser().parse_args(given)
         if arguments is None:
-            # what batch systems and containers send first is to end as Ctrl-C does
+            # batch systems and containers first send SIGTERM, which must end the program as Ctrl-C does
             signal.signal(signal.SIGTERM, signal.default_int_handler)
         return exit_code_of(lambda: self.run(parsed, f"{self.command} {shlex.join(given)}".rstrip()))
 
 
 def program(options: Options, description: str, epilog: str | None = None) -> Callable[[Run], Program]:
-    """Return a decorator that makes a program of a function; the module's name is the program's name."""
+    """Return a decorator that turns a function into a program, which is named after the function's module."""
     return lambda run: Program(f"harness.{Path(run.__code__.co_filename).stem}", options, run, description, epilog)
 
 

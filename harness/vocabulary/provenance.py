@@ -1,7 +1,7 @@
-"""The origin of a result: code and its digest, versions of packages and of stored files, machine.
+"""The origin of a result: the code and its digest, versions of packages and stored files, and the machine.
 
-Every stored file says of which version it is: in JSON and Parquet by a key, in CSV by a column, in YAML by a comment on
-the first line, in HTML by ``<meta name="generator">``. A newer file is refused; an older file is read or made again."""
+Every stored file states its version: JSON and Parquet in a key, CSV in a column, YAML in a comment on the first line,
+HTML in ``<meta name="generator">``. A newer file is refused; an older file is read or made again."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PACKAGES = ("mitsuba", "drjit", "trimesh", "numpy", "scipy", "numba", "pandas", 
 
 
 def commit_and_dirty() -> tuple[str | None, bool | None]:
-    """The commit of the checkout that this code runs from, and whether it has changes; None outside a checkout."""
+    """Return the commit of the checkout that this code runs from, and whether it has changes; None without checkout."""
     here = Path(__file__).resolve().parents[2]
 
     def git(*arguments: str) -> str | None:
@@ -42,7 +42,7 @@ def commit_and_dirty() -> tuple[str | None, bool | None]:
 
 
 def versions() -> dict[str, str]:
-    """Versions of tofpod, Python and the packages that decide numbers."""
+    """Return the versions of tofpod, Python and the packages that affect results."""
     from harness import __version__
 
     found = {"tofpod": __version__, "python": platform.python_version()}
@@ -53,13 +53,13 @@ def versions() -> dict[str, str]:
 
 
 def record(command: str) -> dict[str, Any]:
-    """Return the origin that every stored result states: command, commit, dirty flag, versions, machine; no names."""
+    """Return the origin for a stored result: command, commit, dirty flag, versions and machine, without any names."""
     commit, dirty = commit_and_dirty()
     machine = {"system": platform.system(), "machine": platform.machine(), "processors": os.cpu_count()}
     return {"command": command, "commit": commit, "dirty": dirty, "versions": versions(), "machine": machine}
 
 
-RESULTS_VERSION = 1  # of files without their own version; increased when the tables' meaning changes
+RESULTS_VERSION = 1  # version of files that have none of their own; increased when the tables' meaning changes
 GENERATOR = f"tofpod results {RESULTS_VERSION}"  # written into pages
 STAMP = re.compile(r"#\s*tofpod (\w+)(.*)")
 
@@ -67,13 +67,13 @@ STAMP = re.compile(r"#\s*tofpod (\w+)(.*)")
 def check_version(
     found: object, known: int, path: Path, what: str, *, oldest: int | None = None, again: str | None = None
 ) -> int:
-    """The version of a file that can be read: from ``oldest`` (default: ``known``) to ``known``. ``what`` the file is:
-    "a record". ``again``: what makes an older one anew. Raises UserError where it is newer, older, missing or none."""
+    """Return a file's version if it lies between ``oldest`` (default: ``known``) and ``known``; else raise UserError.
+    ``what`` names the kind of file, such as "a record"; ``again`` says how to make an outdated file again."""
     first = known if oldest is None else oldest
     legal, fix = f"version {known}" if first == known else f"versions {first} to {known}", again
     if isinstance(found, bool) or not isinstance(found, int) or found < 0:
-        fault = "states no version" if found is None else f"states the version {str(found)[:40]!r}, which is none"
-        message = f"{fault} of {what}"
+        fault = "states no version" if found is None else f"states the invalid version {str(found)[:40]!r}"
+        message = f"is {what} that {fault}"
     elif found > known:
         message = f"was written by a newer tofpod: it is {what} of version {found}"
         fix = "upgrade tofpod, or use the version that wrote it"
@@ -85,13 +85,13 @@ def check_version(
 
 
 def stamped(kind: str, version: int) -> str:
-    """The first line of a text file of ours, with its end."""
+    """Return the first line of a text file that tofpod writes, with its newline."""
     return f"# tofpod {kind} {version}\n"
 
 
 def stamp_of(text: str, kind: str) -> object:
-    """Return the version that a text's first line states: an int; the text after the kind where it is no number; None
-    where the line is no stamp of this kind, as in a file that somebody wrote by hand."""
+    """Return the version that a text's first line states: an int, or the text after the kind if it is not a number, or
+    None if the line is not a stamp of this kind, as in a file that was written by hand."""
     match = STAMP.match(text.partition("\n")[0].removeprefix("\ufeff").strip())
     number = match[2].strip() if match and match[1] == kind else None
     return int(number) if number and re.fullmatch(r"[0-9]{1,9}", number) else number
@@ -102,13 +102,13 @@ OWN = ("detectors", "harness", "scenes")  # The project's packages
 IMPORT = re.compile(
     r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n#]+)|import[ \t]+([^\n#]+))", re.MULTILINE
 )
-"""An import statement: a hundred times faster than parsing; a sentence that looks like one only adds a file."""
+"""Matches import statements, a hundred times faster than a parser; a false match in a text only adds a file."""
 
 
 @lru_cache
 def source_digest(modules: tuple[str, ...], packages: tuple[str, ...]) -> str:
-    """Digest of the project's sources that ``modules`` reach, and of the versions of ``packages``. A module of another
-    project counts with all sources of its package. Taken once a process: later changes are not what it runs."""
+    """Return the digest of all project sources that ``modules`` reach, and of the versions of ``packages``. A module of
+    another project counts with all sources of its package. Computed once, since a process runs what it first read."""
     state = hashlib.blake2b(digest_size=8)
     own = tuple(name for name in modules if name.partition(".")[0] in OWN)
     files = {path.relative_to(ROOT).as_posix(): path for path in reached_sources(own)}
@@ -125,8 +125,8 @@ def source_digest(modules: tuple[str, ...], packages: tuple[str, ...]) -> str:
 
 @lru_cache
 def reached_sources(modules: tuple[str, ...]) -> tuple[Path, ...]:
-    """Source files that modules reach by import statements, those inside functions and for type checking included,
-    sorted. A module that is loaded by a name in a variable is not seen: name it among ``modules``."""
+    """Return the sorted source files that modules reach by import statements, also inside functions and for type
+    checking. A module that is loaded by a name in a variable is not seen: list it in ``modules``."""
     found: dict[str, Path] = {}
     waiting = list(modules)
     while waiting:
@@ -135,33 +135,33 @@ def reached_sources(modules: tuple[str, ...]) -> tuple[Path, ...]:
         if path is None:
             continue
         found[name] = path
-        waiting.append(name.rpartition(".")[0])  # a package runs before its modules
+        waiting.append(name.rpartition(".")[0])  # a package's own code runs before its modules
         waiting += _imported(_content(path).decode())
     return tuple(sorted(found.values()))
 
 
 @cache
 def _content(path: Path) -> bytes:
-    """Return a source as this process first read it: later edits have no effect on it, nor on forks of it."""
+    """Return a source as this process first read it: later edits do not affect this process or its forks."""
     return path.read_bytes()
 
 
 def _source_of(name: str) -> Path | None:
-    """Return the file of a module of the project; None where there is no such module."""
+    """Return the file of a module of the project, or None if there is no such module."""
     place = ROOT.joinpath(*name.split("."))
     files = (place / "__init__.py", place.with_suffix(".py")) if name.partition(".")[0] in OWN else ()
     return next((path for path in files if path.is_file()), None)
 
 
 def _imported(text: str) -> Iterator[str]:
-    """Yield every dotted name that absolute imports may mean: of ``from a import b`` both ``a`` and ``a.b``."""
+    """Yield every dotted name that absolute imports may mean: both ``a`` and ``a.b`` for ``from a import b``."""
     for start, names, plain in IMPORT.findall(text):
         words = [name.split()[0] for name in (names or plain).strip("()\n ").split(",") if name.strip()]
         yield from ([start, *(f"{start}.{word}" for word in words)] if start else words)
 
 
 def _foreign_sources(module: str) -> Iterable[tuple[str, Path]]:
-    """Yield (name to show, file) of the sources of the package that a module of another project belongs to."""
+    """Yield (display name, file) for all sources of the package that a module of another project belongs to."""
     try:
         spec = importlib.util.find_spec(module.partition(".")[0])
     except (ImportError, ValueError):

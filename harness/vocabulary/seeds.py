@@ -1,4 +1,4 @@
-"""Random streams and digests derived from content, so that order, process and resumption cannot change a number."""
+"""Random streams and digests derived from content, so that order, processes and resumption cannot change a result."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy as np
 
 
 def canonical_json(value: Any) -> str:
-    """The one JSON text of plain data: sorted keys, no white space, no NaN."""
+    """Return the unique JSON text of plain data: sorted keys, no white space, no NaN."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
 
 
 def digest(value: Any, length: int = 16) -> str:
-    """Hexadecimal BLAKE2b digest of plain data (``length`` hex digits)."""
+    """Return the hexadecimal BLAKE2b digest of plain data (``length`` hex digits)."""
     return hashlib.blake2b(canonical_json(value).encode(), digest_size=32).hexdigest()[:length]
 
 
 def random_stream(seed: int, *labels: str | int) -> np.random.Generator:
-    """The random stream of (seed, labels): equal labels give equal numbers in any process, in any order. SFC64 is the
-    fastest of NumPy's generators that passes PractRand; streams are separated by a 128-bit hash."""
+    """Return the random stream of (seed, labels): equal labels give equal numbers in any process and order. SFC64 is
+    the fastest of NumPy's generators that passes PractRand; streams are separated by a 128-bit hash."""
     key = hashlib.blake2b(canonical_json([seed, *labels]).encode(), digest_size=16).digest()
     return np.random.Generator(np.random.SFC64(np.random.SeedSequence(int.from_bytes(key, "little"))))

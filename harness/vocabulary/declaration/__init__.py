@@ -1,1 +1,1 @@
-"""Declarations that users write in YAML: text with places, validation, and every problem with its place."""
+"""Reads and validates declarations that users write in YAML, and reports every problem with its place."""

@@ -1,4 +1,4 @@
-"""Translation of pydantic's errors into problems: place, mistake, legal values, nearest legal word."""
+"""Translates pydantic's errors into problems with a place, the legal values and the nearest legal word."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from harness.vocabulary.declaration.yaml_source import MAX_PROBLEMS, Declaration
 from harness.vocabulary.errors import UserError
 
 YES_AND_NO = {"yes": "true", "on": "true", "no": "false", "off": "false"}  # Booleans of YAML 1.1, text in YAML 1.2
-LEAST_HELD = 3  # Letters of a word that is looked for within others: fewer are in too many
+LEAST_HELD = 3  # Least letters of a word that is searched for within others; shorter words match too often
 WORDS = {"Input should be": "it should be", "an object": "a mapping", "valid array": "list", "valid tuple": "list"}
 WORDS |= {"valid string": "text", "valid boolean": "true or false", " in strict mode": ""}
 WORDS |= {"be a true": "be true", "be a text": "be text"}
-"""pydantic's words in those of YAML."""
+"""Replaces pydantic's words with those of YAML."""
 
 C = TypeVar("C", bound=Config)
 
 
 def validated(model: type[C], source: Source, splices: shape.Splices) -> tuple[C | None, list[Problem]]:
-    """Validate a source's data, and free data at ``splices`` by the model that belongs there. Returns the declaration
-    with spliced data completed by its defaults (None where anything is wrong) and all problems."""
+    """Validate a source's data, and free data at ``splices`` against the models that belong there. Returns all problems
+    and the declaration, whose spliced data is completed with defaults (None if there is any problem)."""
     problems: list[Problem] = []
     declared, data, config = shape.Declared(model, source.data, splices), source.data, None
     for path, spliced in splices.items():
@@ -46,7 +46,7 @@ def validated(model: type[C], source: Source, splices: shape.Splices) -> tuple[C
 
 
 def with_value_at(data: Any, path: KeyPath, value: Any) -> Any:
-    """Return data with a value at a path; unchanged where something other than a mapping or list is in the way."""
+    """Return data with a value set at a path; unchanged if the path passes anything but mappings and lists."""
     if not path:
         return value
     inner = with_value_at(shape.child(data, path[0]), path[1:], value)
@@ -56,7 +56,7 @@ def with_value_at(data: Any, path: KeyPath, value: Any) -> Any:
 
 
 def read_as(models: Mapping[str, type[C]], key: str, source: Source) -> C:
-    """Return the declaration in a file whose ``key`` names which of ``models`` it fills. Raises DeclarationError."""
+    """Return the declaration in a file whose ``key`` selects one of ``models``. Raises DeclarationError."""
     name, place = source.data.get(key), source.place_of((key,))
     if name is None:
         problems = [Problem(f"the file lacks the key `{key}`", place, legal="one of " + ", ".join(models))]
@@ -70,12 +70,12 @@ def read_as(models: Mapping[str, type[C]], key: str, source: Source) -> C:
 
 
 def settings_of(model: type[C], data: Mapping[str, Any], what: str, within: str | None = None) -> C:
-    """Return plain data that options of the command line state, as a declaration. Raises UserError with every problem
-    at once, under ``what``; ``within``: the key that stands before each path there."""
+    """Validate plain data from command line options and return it as a declaration. Raises a single UserError with all
+    problems under the heading ``what``; ``within`` is the key that precedes each path there."""
     try:
         return model.from_data(data)
     except ValidationError as error:
-        # there is no text to point into: a path alone says which option is wrong
+        # without a source text, only the path says which option is wrong
         base: KeyPath = () if within is None else (within,)
         whole = data if within is None else {within: data}
         source = Source(what, "", whole, {(): Place(what, 0, 1, "")}, {})
@@ -86,9 +86,9 @@ def settings_of(model: type[C], data: Mapping[str, Any], what: str, within: str 
 
 
 def problems_of(error: ValidationError, declared: shape.Declared, source: Source, base: KeyPath = ()) -> list[Problem]:
-    """Return the problems behind a ValidationError whose locations start at ``base``; the first `MAX_PROBLEMS` of them.
-    pydantic's locations mix keys of the data with labels of union branches. For a union without a discriminator, only
-    the errors of the intended branch are reported; if that branch is unclear, the union as a whole is the problem."""
+    """Return the first `MAX_PROBLEMS` problems of a ValidationError whose locations start at ``base``. pydantic's
+    locations mix keys of the data with labels of union branches. For a union without a discriminator, only the errors
+    of the intended branch are reported; if that branch is unclear, the union as a whole is the problem."""
     alone: list[tuple[KeyPath, Any]] = []
     unions: dict[KeyPath, list[tuple[str, KeyPath, Any]]] = defaultdict(list)
     for each in error.errors(include_url=False, include_input=False)[:MAX_PROBLEMS]:
@@ -120,7 +120,7 @@ def problems_of(error: ValidationError, declared: shape.Declared, source: Source
 
 
 def _problem(path: KeyPath, error: Any, declared: shape.Declared, source: Source) -> Problem:
-    """Return one of pydantic's errors, at a path in the data, in the user's terms."""
+    """Describe one of pydantic's errors, at a path in the data, in the user's terms."""
     value, slot, place = shape.get(source.data, path), declared.at(path), source.place_of(path)
     kind, legal, kinds, fix = error["type"], shape.legal_at(slot), shape.kinds_of(slot), None
     if kind == "missing":
@@ -148,7 +148,7 @@ def _problem(path: KeyPath, error: Any, declared: shape.Declared, source: Source
         return wrong_choice(path, value, choices, place)
     if kind in ("value_error", "assertion_error"):
         message = (f"`{dotted(path)}`: " if path else "") + str(error.get("ctx", {}).get("error", error["msg"]))
-        # what a validator of a whole mapping says is complete; its keys are no help
+        # the message of a whole mapping's validator is complete; a list of keys would not help
         return Problem(message, place, legal=None if isinstance(value, dict) else legal)
     if isinstance(value, dict | list) and kind in ("model_type", "dict_type", "tuple_type", "list_type"):
         return Problem(f"`{dotted(path)}` is {shown(value)}", place, legal)
@@ -163,8 +163,8 @@ def _problem(path: KeyPath, error: Any, declared: shape.Declared, source: Source
 
 
 def nearest(word: object, words: Iterable[object], cutoff: float = 0.6) -> str | None:
-    """Return the likeliest of ``words`` that the user meant, whatever the case and dashes: a similar spelling, else the
-    shortest that holds the word (three letters at least), as realsense_l515 holds l515. None where there is neither."""
+    """Return which of ``words`` the user most likely meant, ignoring case and dashes: the most similar spelling, else
+    the shortest that contains the word (three letters or more), as realsense_l515 contains l515; None if neither."""
     folded = {str(known).lower().replace("-", "_"): str(known) for known in words}
     sought = str(word).lower().replace("-", "_")
     found = difflib.get_close_matches(sought, folded, n=1, cutoff=cutoff)
@@ -174,12 +174,12 @@ def nearest(word: object, words: Iterable[object], cutoff: float = 0.6) -> str |
 
 
 def dotted(path: Sequence[str | int]) -> str:
-    """Return a path as it is written in ``sweep:``: keys and indices with dots between."""
+    """Return a path as it is written in ``sweep:``, with dots between keys and indices."""
     return ".".join(map(str, path))
 
 
 def shown(value: Any) -> str:
-    """Return a value in a message: as YAML's flow style would have it, cut at 40 characters."""
+    """Return a value as messages show it: in YAML's flow style, cut at 40 characters."""
     if isinstance(value, dict | list):
         noun = "mapping" if isinstance(value, dict) else "list"
         return f"a {noun}" if value else f"an empty {noun}"
@@ -189,7 +189,7 @@ def shown(value: Any) -> str:
 
 
 def wrong_choice(path: Sequence[str | int], value: Any, choices: Iterable[Any], place: Place) -> Problem:
-    """Return the problem of a value that is not legal."""
+    """Return the problem for a value that is not among its legal ``choices``."""
     words = [shape.plain(choice) for choice in choices]
     message = f"`{dotted(path)}` is {shown(value)}, which is none of the legal values"
     return Problem(message, place, legal="one of " + ", ".join(words), nearest=nearest(value, words))
@@ -198,7 +198,7 @@ def wrong_choice(path: Sequence[str | int], value: Any, choices: Iterable[Any], 
 def unknown_key(
     name: str, where: KeyPath, legal: Sequence[str], place: Place | None, taken: Iterable[str] = ()
 ) -> Problem:
-    """Return the problem of a key that is not legal in the mapping at ``where``, which has the keys ``taken``."""
+    """Return the problem for an illegal key in the mapping at ``where``, which already has the keys ``taken``."""
     inside = f" in `{dotted(where)}`" if where else ""
     free = [key for key in legal if key not in set(taken)]
     return Problem(f"unknown key `{name}`{inside}", place, ", ".join(legal) or "no key here", nearest(name, free))

@@ -1,5 +1,5 @@
-"""The shape that a declaration's models give to data, read from the annotations of their fields. A *splice* puts a
-model where another holds free data (the settings of a detector chosen by name)."""
+"""The structure that a declaration's models require, read from the annotations of their fields. A *splice* places a
+model where another model holds free data, such as the settings of a detector that is chosen by name."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from pydantic.fields import FieldInfo
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration.yaml_source import KeyPath
 
-LONGEST_NOTE = 100  # Characters of a field's description that a message repeats; longer ones are essays, not limits
+LONGEST_NOTE = 100  # Characters of the longest field description that a message repeats as a statement of limits
 BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 Splices = Mapping[KeyPath, type[Config]]
 
 
 @dataclass(frozen=True)
 class Slot:
-    """A place for data: the alternatives of its type, each with its constraints, and the field behind it."""
+    """A place for data: the alternatives of its type, each with its constraints, and its field."""
 
     branches: tuple[tuple[Any, Mapping[str, Any]], ...]
     field: FieldInfo | None = None
@@ -43,7 +43,7 @@ class Declared:
     splices: Splices
 
     def at(self, path: KeyPath) -> Slot | None:
-        """Return what belongs at ``path``; None where some key on the way is unknown."""
+        """Return the slot at ``path``, or None if a key on the way is unknown."""
         slot, data = slot_of(self.model), self.data
         for depth, key in enumerate(path, start=1):
             spliced = self.splices.get(path[:depth])
@@ -54,13 +54,13 @@ class Declared:
         return slot
 
     def names(self, path: KeyPath) -> tuple[str, ...]:
-        """Return the legal keys of the mapping at ``path``: its model's fields, or the keys that free data has."""
+        """Return the legal keys of the mapping at ``path``: the fields of its model, or the keys of free data."""
         data = get(self.data, path)
         model = model_for(self.at(path), data)
         return tuple(model.model_fields if model else data if isinstance(data, Mapping) else ())
 
     def paths(self, path: KeyPath = (), depth: int = 8) -> Iterator[KeyPath]:
-        """Yield every path that can be set: fields of models to ``depth`` levels, list items as the data has them."""
+        """Yield every path that can be set: model fields down to ``depth`` levels, and the list items in the data."""
         data = get(self.data, path)
         for key in (range(len(data)) if isinstance(data, list) else self.names(path)) if depth else ():
             yield (*path, key)
@@ -68,11 +68,11 @@ class Declared:
 
 
 DeclaredOf = Callable[[Any], Declared]
-"""Function from data to what is declared for it (which detector's settings belong in it depends on the data)."""
+"""A function that returns what is declared for given data; the data decides which detector's settings belong in it."""
 
 
 def slot_of(annotation: Any, field: FieldInfo | None = None) -> Slot:
-    """Return what an annotation, or a field with this annotation, accepts."""
+    """Return the slot for an annotation, or for a field with this annotation."""
     return Slot(tuple(_branches(annotation, tuple(field.metadata) if field else ())), field)
 
 
@@ -89,7 +89,7 @@ def _branches(annotation: Any, metadata: tuple[Any, ...]) -> Iterator[tuple[Any,
 
 
 def kinds_of(slot: Slot | None) -> tuple[str, Mapping[str, type[BaseModel]]] | None:
-    """Return the key that tells several models of a place apart and the model of each value; None where none does."""
+    """Return the key that distinguishes the models of a slot, and the model for each value; None without such a key."""
     return _kinds(slot.models) if slot else None
 
 
@@ -105,7 +105,7 @@ def _kinds(models: tuple[type[BaseModel], ...]) -> tuple[str, Mapping[str, type[
 
 
 def model_for(slot: Slot | None, data: Any) -> type[BaseModel] | None:
-    """Return the model that a mapping is meant to fill: by its kind, else by most keys in common."""
+    """Return the model that a mapping is meant to fill: by its kind, or else the model with most keys in common."""
     kinds, given = kinds_of(slot), data if isinstance(data, Mapping) else {}
     if kinds and str(given.get(kinds[0])) in kinds[1]:
         return kinds[1][str(given[kinds[0]])]
@@ -113,7 +113,7 @@ def model_for(slot: Slot | None, data: Any) -> type[BaseModel] | None:
 
 
 def _below(slot: Slot, data: Any, key: str | int) -> Slot | None:
-    """Return the slot one key (or index) deeper, given the data here; None where the key is unknown there."""
+    """Return the slot one key (or index) deeper, given the data at this level; None if the key is unknown."""
     model = model_for(slot, data)
     if model is not None and isinstance(key, str):
         field = model.model_fields.get(key)
@@ -131,8 +131,8 @@ def _below(slot: Slot, data: Any, key: str | int) -> Slot | None:
 
 
 def default_at(slot: Slot | None) -> tuple[Any, ...]:
-    """Return the default of a field as plain data, () where it has none; of a model in the fewest keys that mean the
-    same, so that what a preset fills in is left to it."""
+    """Return a field's default as plain data, () if it has none. A model's default has only the keys that are needed,
+    so that a preset can fill in the others."""
     if slot is None or slot.field is None or slot.field.is_required():
         return ()
     default = slot.field.get_default(call_default_factory=True)
@@ -145,27 +145,27 @@ def default_at(slot: Slot | None) -> tuple[Any, ...]:
 
 
 def get(data: Any, path: KeyPath) -> Any:
-    """Return the value at a path, None where there is none."""
+    """Return the value at a path, or None if there is none."""
     for key in path:
         data = child(data, key)
     return data
 
 
 def child(data: Any, key: str | int) -> Any:
-    """Return the value under a key or index, None where there is none."""
+    """Return the value under a key or index, or None if there is none."""
     if isinstance(data, Mapping):
         return data.get(key)
     return data[key] if isinstance(data, list) and isinstance(key, int) and 0 <= key < len(data) else None
 
 
 def choices_of(slot: Slot | None) -> tuple[Any, ...]:
-    """Return the values of a Literal at this place, () where it is none."""
+    """Return the values of a Literal in this slot, or () if it is not a Literal."""
     branches = slot.branches if slot else ()
     return tuple(v for kind, _ in branches if get_origin(kind) is Literal for v in get_args(kind))
 
 
 def legal_at(slot: Slot | None) -> str | None:
-    """Describe in words what a place accepts: type, bounds, choices, and what the field's description says of it."""
+    """Describe in words what a slot accepts: type, bounds, choices, and the field's description."""
     if slot is None:
         return None
     words = " or ".join(filter(None, dict.fromkeys(_words(kind, limits) for kind, limits in slot.branches)))
@@ -198,7 +198,7 @@ def _words(kind: Any, limits: Mapping[str, Any]) -> str:
 
 
 def every_key(model: type[BaseModel], before: str = "") -> Iterator[tuple[str, Slot, type[BaseModel]]]:
-    """Yield the path of every key below a model (items as ``key[]``, kinds as ``key[kind=name]``), its slot, and the
+    """Yield every key below a model: its path (items as ``key[]``, kinds as ``key[kind=name]``), its slot, and the
     model that declares it."""
     for name, field in model.model_fields.items():
         path, slot = f"{before}{name}", slot_of(field.annotation, field)
@@ -216,5 +216,5 @@ def every_key(model: type[BaseModel], before: str = "") -> Iterator[tuple[str, S
 
 
 def plain(value: Any) -> str:
-    """Return a legal value as a user writes it."""
+    """Return a legal value as a user would write it."""
     return value if isinstance(value, str) else json.dumps(value)

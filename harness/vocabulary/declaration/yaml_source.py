@@ -1,7 +1,7 @@
-"""YAML 1.2 as plain data that remembers the place of every key and value; problems are shown there, all at once.
+"""Reads YAML 1.2 as plain data with the place of every key and value, so that all problems are shown at their places.
 
-Only ruamel.yaml's node tree is used, so that no tag can build an object and every duplicate key is seen. Not supported
-on purpose: merge keys (``<<``, not part of YAML 1.2), tags, several documents, keys that are not text."""
+Only ruamel.yaml's node tree is used, so that no tag can build an object and every duplicate key is seen. Deliberately
+unsupported: merge keys (``<<``, not part of YAML 1.2), tags, several documents, and keys that are not text."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from ruamel.yaml.reader import ReaderError
 from harness.vocabulary.errors import UserError
 
 SHOWN_COLUMNS = 110  # Characters of a source line that a message shows; longer lines are cut around the caret
-MAX_PROBLEMS = 100  # Most problems that a message lists, and that are looked for in a single mapping
+MAX_PROBLEMS = 100  # Most problems that a message lists, and most that are searched for in a single mapping
 
 
 @dataclass(frozen=True)
 class Place:
-    """Position of something written: ``line`` and ``column`` count from 1, in characters; ``width`` is the caret's.
-    ``line`` 0 means an argument of the command line, whose ``line_text`` is the whole argument."""
+    """A position in a text. ``line`` and ``column`` count from 1, in characters; ``width`` is that of the caret. A
+    ``line`` of 0 means an argument of the command line; ``line_text`` is then the whole argument."""
 
     origin: str
     line: int
@@ -44,7 +44,7 @@ class Place:
         return f"{self.origin}:{self.line}:{self.column}" if self.line else self.origin
 
     def excerpt(self) -> list[str]:
-        """Return the source line and a caret under the place, both indented."""
+        """Return the source line and a line with a caret under the place, both indented."""
         start = max(0, self.column - 1 - SHOWN_COLUMNS // 2) if len(self.line_text) > SHOWN_COLUMNS else 0
         cut = self.line_text[start : start + SHOWN_COLUMNS]
         shown = "".join(letter if letter.isprintable() else " " for letter in cut)
@@ -55,7 +55,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Problem:
-    """A mistake: message, place, legal values, the nearest legal word, and a second place that it concerns."""
+    """A mistake: message, place, legal values, the nearest legal word, and a second place that is involved."""
 
     message: str
     place: Place | None
@@ -90,7 +90,7 @@ class DeclarationError(UserError):
 
 
 def in_order(problems: Iterable[Problem]) -> tuple[Problem, ...]:
-    """Return problems by place, each (place, message) once; first those without a place, then the command line's."""
+    """Return the problems sorted by place, without duplicates: without place first, then the command line's."""
     unique = {(problem.place, problem.message): problem for problem in problems}.values()
 
     def position(problem: Problem) -> tuple[int, int]:
@@ -102,15 +102,15 @@ def in_order(problems: Iterable[Problem]) -> tuple[Problem, ...]:
 
 KeyPath = tuple[str | int, ...]  # Position of a value in the data: keys of mappings and indices of lists
 MAX_BYTES = 500_000  # An experiment written by hand has a few kB; the parser needs up to 20 s for a megabyte
-MAX_NODES = 50_000  # Values, aliases followed: what bounds an alias bomb
-MAX_DEPTH = 40  # Nesting; the schema needs 8
+MAX_NODES = 50_000  # Values after aliases are expanded; this stops an alias bomb
+MAX_DEPTH = 40  # Levels of nesting; the schema needs 8
 _TAG = "tag:yaml.org,2002:"
 _OTHER_VERSION = re.compile(r"^%YAML[ \t]+(?!1\.2\b).*", re.MULTILINE)
 
 
 @dataclass(frozen=True)
 class Source:
-    """Plain data with the places of all values and ``keys``, by `KeyPath`."""
+    """Plain data with the places of all its ``values`` and ``keys``, by `KeyPath`."""
 
     origin: str
     text: str
@@ -119,19 +119,19 @@ class Source:
     keys: Mapping[KeyPath, Place]
 
     def place_of(self, path: KeyPath) -> Place:
-        """Return the place of a value; of the innermost enclosing value where it is not written (a default)."""
+        """Return the place of a value, or of the innermost enclosing value if it is not in the text (a default)."""
         while path and path not in self.values:
             path = path[:-1]
         return self.values[path]
 
     def key_place_of(self, path: KeyPath) -> Place:
-        """Return the place of a key, else of the innermost enclosing key or value that has one."""
+        """Return the place of a key, or else of the innermost enclosing key or value that has a place."""
         while path and path not in self.keys and path not in self.values:
             path = path[:-1]
         return self.keys[path] if path in self.keys else self.values[path]
 
     def with_value(self, path: KeyPath, data: Any, donor: Source, donor_path: KeyPath = ()) -> Source:
-        """Return this source with ``data`` whose value at ``path`` came from ``donor`` at ``donor_path``."""
+        """Return this source with new ``data``, whose value at ``path`` came from ``donor`` at ``donor_path``."""
         depth, merged = len(donor_path), []
         for own, others in ((self.values, donor.values), (self.keys, donor.keys)):
             kept = {at: place for at, place in own.items() if at[: len(path)] != path}
@@ -141,7 +141,7 @@ class Source:
 
 
 def read_yaml(path: Path) -> Source:
-    """Read a file whose top level is a mapping. Raises DeclarationError with every problem of the text, and places."""
+    """Read a file whose top level is a mapping. Raises DeclarationError with every problem and its place."""
     path, place, legal, fix = Path(path), None, None, None
     try:
         with path.open("rb") as stream:
@@ -171,8 +171,8 @@ def read_yaml(path: Path) -> Source:
 
 
 def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = False) -> Source:
-    """Parse ``text[start:]``; places are those in the whole text. Raises DeclarationError. ``is_argument``: the text is
-    an argument of the command line, so that places have no line number."""
+    """Parse ``text[start:]``; places refer to the whole text. ``is_argument`` says that the text is an argument of the
+    command line, so that places have no line number. Raises DeclarationError."""
     starts, lines = [0, *(match.end() for match in re.finditer("\n", text))], text.split("\n")
 
     def place(index: int, end: int) -> Place:
@@ -202,7 +202,7 @@ def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = Fa
         where = place(mark.index, mark.index + 1) if mark else None
         begun = place(context.index, context.index + 1) if context and mark and context.index != mark.index else None
         what = " ".join(filter(None, [error.context, error.problem])).replace("\n", " ")
-        problem = Problem(f"not valid YAML: {what}", where, other=begun, other_says="begun at")
+        problem = Problem(f"not valid YAML: {what}", where, other=begun, other_says="which began at")
     except ReaderError as error:
         index = int(error.position)
         letter = f"U+{ord(text[start + index]):04X}"
@@ -213,7 +213,7 @@ def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = Fa
 
 
 def to_yaml(data: Any) -> str:
-    """Return plain data as YAML 1.2, in its own order of keys; `parse_yaml` inverts it."""
+    """Return plain data as YAML 1.2 with the order of keys kept; `parse_yaml` inverts it."""
     writer, stream = YAML(), StringIO()
     writer.default_flow_style, writer.width = False, 120
     writer.dump(data, stream)
@@ -221,26 +221,26 @@ def to_yaml(data: Any) -> str:
 
 
 class _TooMuch(Exception):
-    """A declaration exceeds a ``limit`` from the character ``index`` of its text on; ``message``: by what."""
+    """A declaration exceeds a limit. Its arguments are the message, the limit, and the character where that happens."""
 
 
 class _BoundedParser(Parser):
-    """Refuses a text before composing recurses too deep, scanning slows down with depth, or nodes fill memory."""
+    """Refuses a text before the composer recurses too deeply, the scanner becomes slow, or nodes fill the memory."""
 
     depth = nodes = 0
 
     def get_event(self) -> Any:
         event = super().get_event()
         self.depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
-        self.nodes += isinstance(event, NodeEvent)  # keys, too
+        self.nodes += isinstance(event, NodeEvent)  # keys count too
         if self.depth > MAX_DEPTH or self.nodes > 2 * MAX_NODES:
-            excess = ("nested too deep", MAX_DEPTH) if self.depth > MAX_DEPTH else ("too many values", MAX_NODES)
+            excess = ("nested too deeply", MAX_DEPTH) if self.depth > MAX_DEPTH else ("too many values", MAX_NODES)
             raise _TooMuch(*excess, event.start_mark.index)
         return event
 
 
 class _Builder:
-    """Turns nodes into plain data, noting places and problems on the way."""
+    """Converts nodes to plain data and collects places and problems."""
 
     def __init__(self, place: Callable[[int, int], Place]) -> None:
         self._place = place
@@ -250,7 +250,7 @@ class _Builder:
         self._nodes = 0
 
     def build(self, node: Node, path: KeyPath, within: tuple[Node, ...]) -> Any:
-        """Return the data of a node at a path; ``within``: the nodes around it."""
+        """Return the data of a node at a path; ``within`` are the nodes that enclose it."""
         self.values[path] = here = self._of(node)
         self._nodes += 1
         if len(self.problems) >= MAX_PROBLEMS or self._nodes > MAX_NODES + 1:
@@ -258,9 +258,9 @@ class _Builder:
         if self._nodes > MAX_NODES:
             return self._refuse("too many values", here, f"at most {MAX_NODES} values after aliases are expanded")
         if any(node is outer for outer in within):
-            return self._refuse("an alias within its own anchor", here)
+            return self._refuse("an alias refers to a value that contains it", here)
         if len(within) >= MAX_DEPTH:
-            return self._refuse("nested too deep", here, f"at most {MAX_DEPTH} levels")
+            return self._refuse("nested too deeply", here, f"at most {MAX_DEPTH} levels")
         if isinstance(node, MappingNode) and node.tag == _TAG + "map":
             return self._mapping(node, path, (*within, node))
         if isinstance(node, SequenceNode) and node.tag == _TAG + "seq":
