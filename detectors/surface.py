@@ -314,21 +314,21 @@ def _reweighted(basis: np.ndarray, z: np.ndarray, start: np.ndarray | None, step
 def _lts_start(basis: np.ndarray, z: np.ndarray) -> np.ndarray:
     """Return FAST-LTS's coefficients (p,) (Rousseeuw and Van Driessen 2006)."""
     few_basis, few_z = _thinned(basis, z, LTS_SMALL)
-    terms, points = few_basis.shape
-    ridge = 1e-12 * np.eye(terms)
+    (terms, points), ridge = few_basis.shape, 1e-12 * np.eye(len(few_basis))
 
     def concentrated(basis: np.ndarray, z: np.ndarray, c: np.ndarray, steps: int) -> np.ndarray:
         """Return coefficients (m, p) after this many steps, those with the least sum of the smallest squares first."""
         kept = min(len(z), max(int(LTS_COVERAGE * len(z)), (len(z) + terms + 1) // 2))
+        products = (basis[:, None] * basis).reshape(-1, len(z)).T
         for _ in range(steps):
             squares = (z - c @ basis) ** 2
-            chosen = squares <= np.partition(squares, kept - 1, axis=1)[:, kept - 1 : kept]
-            weighted = chosen[:, None, :] * basis
-            c = np.linalg.solve(weighted @ basis.T + len(z) * ridge, (weighted @ z)[..., None])[..., 0]
+            chosen = 1.0 * (squares <= np.partition(squares, kept - 1, axis=1)[:, kept - 1 : kept])
+            grams = (chosen @ products).reshape(-1, terms, terms)
+            c = np.linalg.solve(grams + len(z) * ridge, ((chosen * z) @ basis.T)[..., None])[..., 0]
         sums = np.partition((z - c @ basis) ** 2, kept - 1, axis=1)[:, :kept].sum(axis=1)
         return np.asarray(c[np.argsort(sums, kind="stable")])
 
-    picks = np.argsort(np.random.default_rng(LTS_SEED).random((LTS_STARTS, points)), axis=1)[:, :terms]
+    picks = np.argpartition(np.random.default_rng(LTS_SEED).random((LTS_STARTS, points)), terms - 1, axis=1)[:, :terms]
     starts = np.linalg.solve(few_basis.T[picks] + ridge, few_z[picks][..., None])[..., 0]
     best = concentrated(few_basis, few_z, starts, 2)[:LTS_KEPT]
     return np.asarray(concentrated(basis, z, best, LTS_STEPS)[0])

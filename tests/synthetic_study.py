@@ -6,7 +6,7 @@ the threshold exactly when it is found. False calls are Poisson on the face, wit
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -249,34 +249,38 @@ def _sites(study: Study, calls: pd.DataFrame) -> pd.DataFrame:
     sites = sites[sites["board"] < 100_000 + study.hole_free_boards]
     sites = sites.merge(pd.DataFrame({"repeat": np.arange(study.repeats)}), how="cross")
     noise = np.random.default_rng([study.seed, 8]).normal(2.5, 0.4, len(sites))
-    highest = np.full(len(sites), -np.inf)
+    highest, names = np.full(len(sites), -np.inf), ("board", "repeat", "x_mm", "y_mm", "score")
+    boards, repeats, x_mm, y_mm, scores = (calls[name].to_numpy() for name in names)
     for row, (board, repeat, x, y) in enumerate(sites[["board", "repeat", "true_x_mm", "true_y_mm"]].to_numpy()):
-        here = calls[(calls["board"] == board) & (calls["repeat"] == repeat)]
-        near = np.hypot(here["x_mm"] - x, here["y_mm"] - y) <= RADIUS_MM
-        highest[row] = here["score"][near].max() if near.any() else -np.inf
+        near = (boards == board) & (repeats == repeat) & (np.hypot(x_mm - x, y_mm - y) <= RADIUS_MM)
+        highest[row] = scores[near].max(initial=-np.inf)
     return sites.assign(signal=np.maximum(highest, noise), detected=highest > THRESHOLD)
+
+
+def _of_runs(study: Study, findings: pd.DataFrame) -> Iterator[tuple[str, int, int, np.ndarray, np.ndarray]]:
+    """Every run's role, board and repeat, and the scores and holes of its findings (as arrays, which is fast)."""
+    names = ("role", "board", "repeat", "score", "hole")
+    roles, boards, repeats, scores, holes = (findings[name].to_numpy() for name in names)
+    for role in ("hole_free", "damaged"):
+        for board, repeat in zip(*_runs(study, role), strict=True):
+            here = (roles == role) & (boards == board) & (repeats == repeat)
+            yield role, board, repeat, scores[here], holes[here]
 
 
 def _run_rows(study: Study, findings: pd.DataFrame) -> pd.DataFrame:
     rows = []
-    above = findings[findings["score"] > THRESHOLD]
-    for role in ("hole_free", "damaged"):
-        for board, repeat in zip(*_runs(study, role), strict=True):
-            here = above[(above["role"] == role) & (above["board"] == board) & (above["repeat"] == repeat)]
-            false_calls = int((here["hole"] == "").sum())
-            rows.append((role, board, repeat, THRESHOLD, AREA_M2, len(here), false_calls, 0.2, 0.3, 0.01, 0.05))
+    for role, board, repeat, score, hole in _of_runs(study, findings[findings["score"] > THRESHOLD]):
+        false_calls = int((hole == "").sum())
+        rows.append((role, board, repeat, THRESHOLD, AREA_M2, len(score), false_calls, 0.2, 0.3, 0.01, 0.05))
     names = "role board repeat threshold inspected_m2 detections false_calls scale_mm surface_noise_mm seconds_frames "
     return pd.DataFrame(rows, columns=[*names.split(), "seconds_detect"]).assign(quiet_threshold=4.5)
 
 
 def _operating(study: Study, findings: pd.DataFrame) -> pd.DataFrame:
     rows = []
-    for role in ("hole_free", "damaged"):
-        for board, repeat in zip(*_runs(study, role), strict=True):
-            of_run = (findings["role"] == role) & (findings["board"] == board) & (findings["repeat"] == repeat)
-            score, hole = findings["score"][of_run].to_numpy(), findings["hole"][of_run].to_numpy(str)
-            above = score > OPERATING[:, None]
-            rows.append((role, board, repeat, OPERATING, above.sum(axis=1), (above & (hole != "")).sum(axis=1)))
+    for role, board, repeat, score, hole in _of_runs(study, findings):
+        above = score > OPERATING[:, None]
+        rows.append((role, board, repeat, OPERATING, above.sum(axis=1), (above & (hole != "")).sum(axis=1)))
     return pd.DataFrame(rows, columns=["role", "board", "repeat", "threshold", "findings", "hits"])
 
 

@@ -111,6 +111,15 @@ def test_detectors_and_their_program_never_import_mitsuba():
     assert done.returncode == 0, done.stderr
 
 
+def test_drawing_is_imported_where_something_is_drawn():
+    """Matplotlib takes half a second, which no program needs that draws nothing."""
+    for path in sources():
+        for node in nodes(path)[0].body:  # type: ignore[attr-defined]
+            names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            assert not any(name.split(".")[0] == "matplotlib" for name in names), path
+
+
 def test_class_names_have_one_meaning():
     homes: dict[str, list[str]] = {}
     for path in sources():

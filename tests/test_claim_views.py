@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pandas as pd
@@ -18,9 +19,15 @@ UNIT_AXIS = pd.DataFrame([{"path": CAMERA_UNIT, "name": "unit", "unit": ""}])
 
 def verdict(claim, found):
     summary = summarise_holes(found.holes, list(found.axes["path"]))
-    verdicts = {one.claim: one for one in score_views(map_cases(found, summary))}
-    assert list(verdicts) == list(VIEW_CLAIMS)
-    return verdicts[claim]
+    with patch.dict(VIEW_CLAIMS, {claim: VIEW_CLAIMS[claim]}, clear=True):  # the others would take most of the time
+        (one,) = score_views(map_cases(found, summary))
+    return one
+
+
+def test_every_claim_is_judged_in_order():
+    found = worlds(MapWorld())
+    summary = summarise_holes(found.holes, list(found.axes["path"]))
+    assert [one.claim for one in score_views(map_cases(found, summary))] == list(VIEW_CLAIMS)
 
 
 def worlds(world, **settings):
@@ -64,8 +71,10 @@ def test_c7(world, expected):
     answer = verdict("C7", worlds(world, counts=(1, 9)))
     assert answer.verdict == expected
     assert "With 50 frames a view" in answer.evidence
-    # one pair of views says nothing of others, however often it is repeated
-    assert expected == "not borne out" or verdict("C7", worlds(world)).verdict == "undecided"
+
+
+def test_one_pair_of_views_says_nothing_of_others_however_often_it_is_repeated():
+    assert verdict("C7", worlds(registered((1.5, 0.1), (0.4, 0.1)))).verdict == "undecided"
 
 
 def test_c7_needs_both_methods():
@@ -102,10 +111,13 @@ def sized(large, small, threshold, first=4):
 )
 def test_c8(world, expected):
     assert verdict("C8", in_units(worlds(world))).verdict == expected
-    alone = verdict("C8", worlds(world))
+
+
+@pytest.mark.parametrize(("threshold", "there"), [(1.0, "borne out"), (-1.0, "not borne out")])
+def test_one_unit_says_nothing_of_others(threshold, there):
+    alone = verdict("C8", worlds(sized(-0.5, 0.5, threshold)))
     assert alone.verdict == "undecided"
-    told = f"Judged on only 1 unit of the camera, so nothing follows for others: {expected}"
-    assert expected == "undecided" or told in alone.evidence
+    assert f"Judged on only 1 unit of the camera, so nothing follows for others: {there}" in alone.evidence
 
 
 def test_c8_tells_the_crossing_and_what_is_lost():
@@ -138,9 +150,11 @@ def slam(noise_mm, size_mm, place_mm, first=6):
     ],
 )
 def test_c10(numbers, expected):
-    found = slam(*numbers)
-    assert verdict("C10", in_units(found)).verdict == expected
-    assert verdict("C10", in_units(found, 2)).verdict == "undecided"
+    assert verdict("C10", in_units(slam(*numbers))).verdict == expected
+
+
+def test_two_units_are_too_few():
+    assert verdict("C10", in_units(slam(1.0, 2.0, 5.0), 2)).verdict == "undecided"
 
 
 def test_c10_without_a_slam_map_is_not_judged():

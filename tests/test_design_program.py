@@ -97,6 +97,7 @@ def test_areas_bound_the_rate_exactly() -> None:
 # ---- the program -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_what_it_says(capsys: pytest.CaptureFixture[str]) -> None:
     said = answered(capsys, *TOLD, *FEW, "--goal", "11")
     expected = design(GUESS, (30, 60), (2.0, 12.0), studies=20, seed=1)
@@ -110,6 +111,7 @@ def test_what_it_says(capsys: pytest.CaptureFixture[str]) -> None:
     assert (said["guess"]["a50"], said["guess"]["a90"]) == pytest.approx((5.0, 7.0))
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_a_goal_out_of_reach_says_what_it_would_take(capsys: pytest.CaptureFixture[str]) -> None:
     """The 90 % quantile comes nearer to a90 = 7 as one over the root of the targets: by hand from the plan's."""
     said = answered(capsys, *TOLD, *FEW, "--goal", "7.2")
@@ -157,6 +159,7 @@ def test_no_limit_at_all_is_said_and_drawn(tmp_path: Path, capsys: pytest.Captur
     assert any("outside the range" in note for note in data["notes"])
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_the_guess_from_a_study(study: Path, capsys: pytest.CaptureFixture[str]) -> None:
     asked = ["--study", str(study), "--set-up", "50 frames", "--studies", "10", "--targets", "60"]
     more = ["--false-calls-per-m2", "1"]

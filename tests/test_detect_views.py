@@ -149,7 +149,7 @@ def test_poses_may_be_stated_and_nominal_takes_them_as_they_are(views: list[str]
     # to the board's frame: any common one will do
     poses.write_text(json.dumps([invert(pose).tolist() for pose in POSES[:2]]))
     arguments = [*views[:2], "--register", "nominal", "--poses", str(poses), "--out", str(tmp_path / "out")]
-    assert detect.main(arguments) == 0
+    assert detect.main([*arguments, *SHARP]) == 0
     told = json.loads((tmp_path / "out" / "registrations.json").read_text())["views"][1]
     np.testing.assert_allclose(told["T_reference_view"], T_FIRST_VIEW[1], atol=1e-12)
     assert told["predicted_in_plane_mm"] is None
@@ -172,7 +172,7 @@ def test_settings_reach_the_way_from_views_to_a_cloud(views: list[str], tmp_path
 @pytest.mark.usefixtures("unpictured")
 def test_the_same_views_give_the_same_files(views: list[str], tmp_path: Path) -> None:
     for name in ("a", "b"):
-        assert detect.main([*views[:2], "--register", "marks", "--out", str(tmp_path / name)]) == 0
+        assert detect.main([*views[:2], "--register", "marks", "--out", str(tmp_path / name), *SHARP]) == 0
     for name in ("findings.csv", "merged.ply"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
@@ -287,7 +287,7 @@ def test_a_full_disk_leaves_nothing(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("harness.report.view3d.write_text", full)
-    said = failed(capsys, *views[:2], "--register", "marks", "--out", tmp_path / "out")
+    said = failed(capsys, *views[:2], "--register", "marks", "--out", tmp_path / "out", *SHARP)
     assert "the disk is full" in said and not (tmp_path / "out").exists()
 
 

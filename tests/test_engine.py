@@ -113,6 +113,7 @@ def test_one_process_gives_the_same_numbers(finished, monkeypatch, tmp_path):
     pd.testing.assert_frame_equal(trials(finished), alone.holes, check_exact=True)
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_a_half_finished_sweep_resumes_to_the_same_numbers(finished, tmp_path):
     half = tmp_path / "half"
     shutil.copytree(finished, half)

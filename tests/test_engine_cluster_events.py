@@ -8,14 +8,12 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-
-pytest.importorskip("distributed")
-
 from cluster_processes import square
 
 from harness.engine import cluster as cluster_engine
@@ -24,6 +22,7 @@ from harness.engine.work import Ended, Job, Limits, code_of
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.provenance import source_digest
 
+pytestmark = pytest.mark.skipif(find_spec("distributed") is None, reason="needs dask.distributed")
 FIRST, SECOND = "tcp://first:1", "tcp://second:1"
 CODE = code_of(["thesis"])
 DIGESTS = {stage: source_digest(*which) for stage, which in CODE.items()}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from itertools import permutations
+from unittest.mock import patch
 
 import numpy as np
 import pandas as pd
@@ -20,7 +21,9 @@ from harness.thesis.claims import RULES, Verdict, decide, falling_rank, scatter_
 
 
 def verdict(claim: str, world: World | None = None, frames: tuple[int, ...] = (1, 10, 50)) -> Verdict:
-    return next(v for v in score_claims(tables(world, frames=frames)) if v.claim == claim)
+    with patch.dict(RULES, {claim: RULES[claim]}, clear=True):  # the others would take most of the time
+        (found,) = score_claims(tables(world, frames=frames))
+    return found
 
 
 def rate(many: float, few: float, of: int) -> World:

@@ -78,7 +78,9 @@ def test_the_limit_covers_the_truth_whatever_the_camera(curve: PodCurve):
     assert np.median([row.median / row.measured for row in rows]) < 1.0
 
 
-def test_the_program_corrects_a_study(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_program_corrects_a_study(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], request: pytest.FixtureRequest
+):
     record = study_record(Study((SetUp(a50_mm=5.0, width_mm=0.8),), boards=30))
     (tmp_path / "study.json").write_text(record_text(record))
     truth, size = curve_through(6.0, 7.6), even_sizes(24, (2.0, 12.0))
@@ -97,6 +99,7 @@ def test_the_program_corrects_a_study(tmp_path: Path, capsys: pytest.CaptureFixt
     assert said["a90_95"] > truth.size_at(0.9) > said["simulated"]["a90"]
     assert (tmp_path / "out" / "mapod.html").read_text().count("<svg") == 1
 
+    request.getfixturevalue("unsaved")
     for counted, word in (
         ("plane 1,5,15", ""),
         ("plane 1,5.4,15", "by plane 1 at a threshold of 5.4, within 15 mm; those of the study by plane 1 at"),

@@ -491,6 +491,7 @@ def test_a_height_map_is_a_cloud_in_parallel_projection(tmp_path: Path) -> None:
     np.testing.assert_allclose(next(down.frames()).z_m[30, 60], frame.z_m[30, 60], atol=1e-4)
 
 
+@pytest.mark.usefixtures("unpictured")
 def test_a_flat_height_map_has_no_findings_at_its_border_and_a_crater_is_one(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

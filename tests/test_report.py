@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-import subprocess
-import sys
 import xml.etree.ElementTree as ET
 from html.parser import HTMLParser
 from pathlib import Path
@@ -16,7 +14,6 @@ import pytest
 from synthetic_tables import Tables, World, example, joined, provenance, tables
 
 from harness.evaluation.summary import summarise_holes
-from harness.report.clouds import residual_figure
 from harness.report.page import answer_sentence, report_html, write_report
 from harness.report.sections import About, holes_grid
 from harness.tables.text import inches
@@ -177,7 +174,8 @@ def test_an_all_invalid_cloud_is_drawn() -> None:
     )
     page = report_html(tables(frames=(50,)), [blank], About(provenance(), YAML, "Averaging"))
     assert "0 of 11 holes marked" in page
-    ET.fromstring(residual_figure([blank]))
+    (figure,) = (each for each in re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL) if "0 of 11 holes marked" in each)
+    ET.fromstring(figure)
 
 
 @pytest.mark.usefixtures("unsaved")
@@ -218,8 +216,3 @@ def test_inches() -> None:
     assert inches(25.4 / 16) == "1/16 in"
     assert inches(25.4) == "1 in"
     assert inches(20.0) == ""
-
-
-def test_importing_the_report_does_not_import_matplotlib() -> None:
-    code = "import sys, harness.report.page, harness.report.sections; sys.exit('matplotlib' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -74,6 +74,7 @@ QUICK = ("before_wall", "pipe_outside")
 """A board before a wall, missing returns, a curved part."""
 
 
+@pytest.mark.usefixtures("unpictured")
 @pytest.mark.parametrize(
     ("kind", "seed"), [pytest.param(*each, marks=[] if each[0] in QUICK else [pytest.mark.slow]) for each in ANSWERED]
 )

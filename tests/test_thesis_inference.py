@@ -81,6 +81,7 @@ def test_no_posterior_of_few_set_ups_or_of_one_number_of_frames(found):
     assert posterior_of(summary[summary[PATHS[0]] == 2.0], PATHS) is None
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_the_page_begins_with_the_sentence(found):
     page = set_ups_html(found, [], About(provenance(), "", "Inference", True))
     answer = page.split('<p class="answer">')[1]

@@ -157,6 +157,7 @@ def test_a_file_of_poses(tmp_path, version, told):
     assert read_poses(path, 1)[0].tolist() == [[float(i == j) for j in range(4)] for i in range(4)]
 
 
+@pytest.mark.usefixtures("unsaved")
 def test_a_design_says_it(tmp_path):
     asked = ["--a50", "6", "--a90", "8", "--sizes", "4", "10", "--studies", "10", "--targets", "60"]
     assert design.main([*asked, "--out", str(tmp_path)]) == 0

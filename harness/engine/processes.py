@@ -43,7 +43,7 @@ CAN_FORK = "forkserver" in multiprocessing.get_all_start_methods()
 PROCESSES: Any = multiprocessing.get_context("forkserver" if CAN_FORK else "spawn")
 """Processes fork from a small server process that has imported what each of them would need a second to import."""
 if CAN_FORK:
-    PROCESSES.set_forkserver_preload(["harness.engine.trial"])
+    PROCESSES.set_forkserver_preload(["harness.engine.run", "scenes.render.view"])
 
 
 @dataclass(eq=False)

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.signal.windows import parzen
 
 from harness.evaluation.intervals import UNKNOWN
 from harness.own_camera.measure import Characteristics
@@ -155,8 +154,7 @@ def _curves(source: str, found: Characteristics) -> Iterator[dict[str, Any]]:
             yield from (point(spectrum, axis, *each) for each in zip(FREQUENCIES, density_of(along), strict=True))
     for capture in found.captures:
         yield from (point(FRAMES, capture.name, k, off / MM) for k, off in enumerate(capture.offsets_m.tolist()))
-    drops = found.dropouts
-    for level, share in zip(drops.amplitude.tolist(), drops.share.tolist(), strict=True):
+    for level, share in zip(found.dropouts.amplitude.tolist(), found.dropouts.share.tolist(), strict=True):
         if np.isfinite(level):
             yield point(DROPPED, "all", level, share)
 
@@ -164,6 +162,8 @@ def _curves(source: str, found: Characteristics) -> Iterator[dict[str, Any]]:
 def density_of(correlation: np.ndarray) -> np.ndarray:
     """Return the spectral density at `FREQUENCIES` along an axis, relative to white noise of the same variance, from
     the correlation (lags,) with Parzen's window (Blackman and Tukey)."""
+    from scipy.signal.windows import parzen  # whose package takes a third of a second to load
+
     faded = correlation * parzen(2 * len(correlation) - 1)[len(correlation) - 1 :]
     return np.asarray(2 * np.cos(2 * np.pi * np.outer(FREQUENCIES, np.arange(len(faded)))) @ faded - faded[0])
 

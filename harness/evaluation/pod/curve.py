@@ -41,7 +41,7 @@ def link_ppf(link: str, p: np.ndarray) -> np.ndarray:
 
 def logs_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return ln F, ln(1 - F) and ln f (the density), each of the predictor's shape and accurate in both tails."""
-    t = np.clip(predictor, -LARGEST_PREDICTOR, LARGEST_PREDICTOR)
+    t = np.minimum(np.maximum(predictor, -LARGEST_PREDICTOR), LARGEST_PREDICTOR)  # `np.clip` takes five times as long
     if link == "logit":
         tail = np.log1p(np.exp(-np.abs(t)))
         log_hit, log_miss = np.minimum(t, 0.0) - tail, np.minimum(-t, 0.0) - tail
@@ -56,7 +56,7 @@ def logs_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 def slopes_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return f / F, f / (1 - F) and d ln f / dt at t = predictor, each of the predictor's shape."""
-    t = np.clip(predictor, -LARGEST_PREDICTOR, LARGEST_PREDICTOR)
+    t = np.minimum(np.maximum(predictor, -LARGEST_PREDICTOR), LARGEST_PREDICTOR)
     if link == "logit":  # the most common link: the ratios are the probabilities themselves
         hit, miss = special.expit(t), special.expit(-t)
         return miss, hit, miss - hit
@@ -177,7 +177,7 @@ class HitsAndMisses:
 
     def climb(self, places: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return values and steps of the studies ``which``, for `ascend`."""
-        some = self.of(which)
+        some = self if self.penalty is None and len(which) == len(self.hits) else self.of(which)
         value = some.value(places)
         return np.where(np.isfinite(value), value, -np.inf), some.step(places)
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from itertools import product
 from typing import Any, Literal
 
@@ -319,21 +319,21 @@ def _likelihood_bound(fit: HitMissFit, pod: float, allowed: float) -> tuple[floa
     flat = 2.0 * (top - flat_maximum(data, level))
     if flat <= allowed:
         return float("inf"), f"a constant probability is not rejected (ratio {flat:.2f} <= {allowed:.2f})"
-
     slope = place[1]
 
+    @cache
     def excess(z: float) -> float:
         """Return the root of the ratio, which grows about linearly with z, minus the root of the criterion."""
         nonlocal slope
         value, slope = profile(data, z, level, slope)
         return float(np.sqrt(max(2.0 * (top - value), 0.0)) - np.sqrt(allowed))
 
-    reach = 0.25
+    low, reach = 0.0, 0.25
     while excess(z_best + reach) <= 0:
-        reach *= 2.0
+        low, reach = reach, 2.0 * reach
         if reach > FARTHEST:
             return float("inf"), "the likelihood ratio set is unbounded"
-    z = optimize.brentq(excess, z_best, z_best + reach, xtol=1e-10)
+    z = optimize.brentq(excess, z_best + low, z_best + reach, xtol=1e-10)
     return fit.centre + fit.spread * float(z), ""
 
 
