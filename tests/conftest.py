@@ -12,16 +12,16 @@ from pathlib import Path
 
 import pytest
 
-from detectors import BUILT_IN
-from detectors.open3d_library import MissingLibrary
-from scenes.render.scene import load_mitsuba
-
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Mitsuba starts before any test imports Open3D, whose C++ library LLVM cannot use (`scenes.render.scene`). Nothing
-    that imports and collection create is garbage: looking for some would take a fifth of their time."""
+    """Mitsuba starts before any test imports Open3D, whose C++ library LLVM cannot use (`scenes.render.scene`); not in
+    the process that only hands out tests, which should import nothing of tofpod. Nothing that imports and collection
+    create is garbage: looking for some would take a fifth of their time."""
     gc.disable()
-    load_mitsuba()
+    if "PYTEST_XDIST_WORKER" in os.environ or config.getoption("dist", "no") == "no":
+        from scenes.render.scene import load_mitsuba
+
+        load_mitsuba()
     worker = getattr(config, "workerinput", None)
     if worker and [Path(path).resolve() for path in config.args] == [Path(__file__).parent]:
         _share_compilation(int(worker["workerid"].removeprefix("gw")), worker["workercount"])
@@ -67,6 +67,8 @@ def pytest_collection_finish() -> None:
 @pytest.hookimpl(wrapper=True)
 def pytest_pyfunc_call() -> Generator[None, object, object]:
     """A test that needs Open3D skips, and says which package is missing, where the system lacks a library of it."""
+    from detectors.open3d_library import MissingLibrary
+
     try:
         return (yield)
     except MissingLibrary as missing:
@@ -98,6 +100,8 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
 @pytest.fixture
 def control_detectors(monkeypatch: pytest.MonkeyPatch) -> None:
     """The detectors ``oracle`` and ``blind``, which test the harness, by their names."""
+    from detectors import BUILT_IN
+
     monkeypatch.setitem(BUILT_IN, "oracle", "control_detectors:Oracle")
     monkeypatch.setitem(BUILT_IN, "blind", "control_detectors:BlindDetector")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -36,14 +37,20 @@ def smooth(rng: np.random.Generator, shape: tuple[int, int], length: float, rms_
     return rms_m * field / field.std()
 
 
+@cache
 def pattern() -> np.ndarray:
     """(h, w): as an imager's, filtered over pixels and smooth, 0.5 mm."""
     rng = np.random.default_rng(1)
     return smooth(rng, (LENS.height, LENS.width), 3.0, 0.4 * MM) + smooth(rng, (128, 160), 1.0, 0.3 * MM)
 
 
+@cache
+def relief() -> np.ndarray:
+    return smooth(np.random.default_rng(2), (1200, 1200), 6.0, 1.0)
+
+
 def wall(rms_m: float) -> np.ndarray:
-    return smooth(np.random.default_rng(2), (1200, 1200), 6.0, rms_m)
+    return rms_m * relief()
 
 
 def capture(

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from harness import detect, gauge, pod, sweep
+from harness.evaluation.pod import design as plan
 from harness.evaluation.study.limit import limit_of
 from harness.evaluation.study.record import read_record
 from harness.inspection.gauge import Gauge, read_gauge
@@ -252,7 +253,15 @@ def test_the_combined_limit_covers_the_truth_of_a_camera_that_the_study_has_wron
         (["--a50", "5", "--a90", "7", "--depths", "5:2"], "--depths 5:2"),
     ],
 )
-def test_mistakes_are_explained(wrong: list[str], word: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_mistakes_are_explained(
+    wrong: list[str],
+    word: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+):
+    planned = plan.design  # whose simulated studies are most of the time
+    monkeypatch.setattr(plan, "design", lambda *given, **how: planned(*given, **how | {"studies": 10}))
     base = [] if "--diameters" in wrong else ["--diameters", "2:12"]
     assert gauge.main([*base, *wrong, "--targets", "24", "--out", str(tmp_path / "none")]) == 2
     assert re.search(word, capsys.readouterr().err)
