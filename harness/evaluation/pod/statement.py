@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
 from scipy import stats
+from threadpoolctl import ThreadpoolController
 
 from harness.evaluation.pod import hit_miss
 from harness.evaluation.pod.ahat import LEVEL, AhatFit, ahat_band, ahat_bound, choose_axes, diagnose
@@ -27,6 +28,7 @@ LEAST_TARGETS = 60
 APART = 0.05
 """Largest relative difference between the a90/95 of models that fit about equally well without a warning."""
 DOUBTED = ": do not trust its limit"
+POOLS = cache(ThreadpoolController)  # finds the libraries that compute in threads, which takes 2 ms
 FEWEST_SITES = 5
 """Fewest unflawed sites whose signals can be fitted by a distribution."""
 TESTED: dict[Beyond, str] = {
@@ -150,10 +152,8 @@ def state_hits(
     """State the curve of hits and misses: the fit with the least deviance, over all links and over sizes or their
     logarithms, unless ``link`` or ``log_size`` restricts them. The bound is the largest over the `near_models` among
     these fits. ``tested``: whether to test for hits by chance and misses at any size, which takes most of the time."""
-    from threadpoolctl import threadpool_limits
-
     # L-BFGS-B solves tiny systems with LAPACK, whose threads wait for each other: 9 s instead of 0.6 s on busy cores
-    with threadpool_limits(1, user_api="blas"):
+    with POOLS().limit(limits=1, user_api="blas"):
         size, hit = read.size, read.response
         tried = hit_miss.choose_model(size, hit, inspections=read.target)
         left = [fit for fit in tried if link in (None, fit.curve.link) and log_size in (None, fit.curve.log_size)]
