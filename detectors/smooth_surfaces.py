@@ -77,9 +77,9 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
 
     size = (window, window)
     weight = cv2.blur(valid.astype(np.float64), size, borderType=cv2.BORDER_REFLECT)
-    smooth = points.copy()
-    smooth[~valid] = 0.0
-    smooth = cv2.blur(smooth, size, borderType=cv2.BORDER_REFLECT)
+    filled = points.copy()
+    filled[~valid] = 0.0
+    smooth = cv2.blur(filled, size, borderType=cv2.BORDER_REFLECT)
     smooth = np.asarray(smooth / np.maximum(weight, 1e-12)[..., None])
     # whether the grid samples rays through the origin, as a camera does
     central = cloud.projection == "central" and _before_lens(points)
