@@ -42,7 +42,7 @@ def nested_clusters(
         raise UserError(f"{what} {distance_m * 1e3:.3g} mm", fix=fix)
     # the margin makes a neighbour's key the sum of the cell's key and the key of the offset
     x, y, z = cells.astype(np.int64).T + NEAR_CELLS
-    falling = np.argsort(-scores, kind="stable")
+    falling = np.argsort(-scores)
     key = (((x << AXIS_BITS | y) << AXIS_BITS) | z)[falling]
     by_cell = np.argsort(key, kind="stable")
     starts = np.flatnonzero(np.diff(key[by_cell], prepend=-1))
@@ -89,7 +89,7 @@ def _nested(  # type: ignore[no-untyped-def]
                 near[count] = other
                 count += 1
         stops[c + 1] = count
-    done = 0
+    done, ends = 0, stops[1:].copy()
     for level in range(len(thresholds) - 1, -1, -1):
         while done < n and scores[falling[done]] > thresholds[level]:
             i = falling[done]
@@ -98,13 +98,20 @@ def _nested(  # type: ignore[no-untyped-def]
             root = root_of(parent, own)
             held[own] += 1
             sizes[root] += 1
-            for k in range(stops[own], stops[own + 1]):
+            k = stops[own]
+            while k < ends[own]:
                 c = near[k]
-                if held[c] and root_of(parent, c) != root and _touches(points, i, order, starts[c], held[c], limit):
-                    other = root_of(parent, c)
+                other = root_of(parent, c) if held[c] else -1
+                if other < 0 or (other != root and not _touches(points, i, order, starts[c], held[c], limit)):
+                    k += 1
+                    continue
+                if other != root:
                     parent[other] = root
                     sizes[root] += sizes[other]
                     completed[root] = max(completed[root], completed[other])
+                # what is joined stays so: the last one takes its place
+                ends[own] -= 1
+                near[k] = near[ends[own]]
             if sizes[root] >= least:
                 completed[root] = max(completed[root], scores[i])
         # clusters are counted from 1 here

@@ -77,7 +77,9 @@ def smooth_surfaces(cloud: Cloud, crease_deg: float, smooth_px: int) -> Surfaces
 
     size = (window, window)
     weight = cv2.blur(valid.astype(np.float64), size, borderType=cv2.BORDER_REFLECT)
-    smooth = cv2.blur(np.where(valid[..., None], points, 0.0), size, borderType=cv2.BORDER_REFLECT)
+    filled = points.copy()
+    filled[~valid] = 0.0
+    smooth = cv2.blur(filled, size, borderType=cv2.BORDER_REFLECT)
     smooth = np.asarray(smooth / np.maximum(weight, 1e-12)[..., None])
     # whether the grid samples rays through the origin, as a camera does
     central = cloud.projection == "central" and _before_lens(points)
@@ -144,9 +146,9 @@ def unit_normals(surface_m: np.ndarray) -> np.ndarray:
         above, below = max(v - 1, 0), min(v + 1, h - 1)
         for u in range(w):
             left, right = max(u - 1, 0), min(u + 1, w - 1)
-            for k in range(3):
-                along[k] = (surface_m[v, right, k] - surface_m[v, left, k]) / max(right - left, 1)
-                down[k] = (surface_m[below, u, k] - surface_m[above, u, k]) / max(below - above, 1)
+            for k in range(3):  # the length of either step does not matter
+                along[k] = surface_m[v, right, k] - surface_m[v, left, k]
+                down[k] = surface_m[below, u, k] - surface_m[above, u, k]
             x, y = along[1] * down[2] - along[2] * down[1], along[2] * down[0] - along[0] * down[2]
             z = along[0] * down[1] - along[1] * down[0]
             length = max(math.sqrt(x * x + y * y + z * z), 1e-15)

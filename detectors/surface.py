@@ -85,31 +85,19 @@ class Chebyshev:
         powers = np.array([(i, j) for i, j in orders if cross_terms or not (i and j)])
         return cls(powers, (low + high) / 2, np.maximum((high - low) / 2, TINY_M))
 
-    def _orders(self, xy_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return T_0, T_1, ... (d + 1, n) of u and of v at places (n, 2)."""
+    def basis(self, xy_m: np.ndarray) -> np.ndarray:
+        """Return the products (p, n) at places (n, 2)."""
+        # T_0, T_1, ... (d + 1, n) of u and of v
         found = np.ones((2, max(int(self.powers.max()), 1) + 1, len(xy_m)))
+        products = np.empty((len(self.powers), len(xy_m)))
         for orders, x, middle, half in zip(found, xy_m.T, self.middle_m, self.half_m, strict=True):
             orders[1] = (x - middle) / half
             twice = 2.0 * orders[1]
             for order in range(2, len(orders)):
                 orders[order] = twice * orders[order - 1] - orders[order - 2]
-        return found[0], found[1]
-
-    def basis(self, xy_m: np.ndarray) -> np.ndarray:
-        """Return the products (p, n) at places (n, 2)."""
-        (u, v), products = self._orders(xy_m), np.empty((len(self.powers), len(xy_m)))
         for product, (a, b) in zip(products, self.powers, strict=True):
-            np.multiply(u[a], v[b], out=product)
+            np.multiply(found[0, a], found[1, b], out=product)
         return products
-
-    def summed(self, coefficients: np.ndarray, xy_m: np.ndarray) -> np.ndarray:
-        """Return the products' sum (n,) by coefficients (p,)."""
-        u, v = self._orders(xy_m)
-        total = np.zeros(len(xy_m))
-        for order in range(len(u)):
-            of = np.flatnonzero(self.powers[:, 0] == order)
-            total += u[order] * sum(coefficients[k] * v[b] for k, b in zip(of, self.powers[of, 1], strict=True))
-        return total
 
 
 @dataclass(frozen=True)
@@ -123,7 +111,8 @@ class Surface:
     def evaluate(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
         """Return z in metres at x, y of one shape; NaN where they are NaN. Polynomials extrapolate badly."""
         x, y = np.broadcast_arrays(np.asarray(x_m, dtype=np.float64), np.asarray(y_m, dtype=np.float64))
-        return self.chebyshev.summed(self.coefficients, np.column_stack([x.ravel(), y.ravel()])).reshape(x.shape)
+        products = self.chebyshev.basis(np.column_stack([x.ravel(), y.ravel()]))
+        return np.asarray(self.coefficients @ products).reshape(x.shape)
 
     def gradients(self, x_m: np.ndarray, y_m: np.ndarray, step_m: float) -> np.ndarray:
         """Return (..., 3) gradients of z less the surface, (-dz/dx, -dz/dy, 1), at x, y by central differences."""
@@ -345,7 +334,7 @@ def polynomial(points: np.ndarray, weights: np.ndarray, degree: int) -> Fit:
     basis = chebyshev.basis(points[:, :2])
     coefficients = _ridged(basis.T, points[:, 2] - level, weights)
     coefficients[0] += level
-    return lambda p: chebyshev.summed(coefficients, p[:, :2])
+    return lambda p: np.asarray(coefficients @ chebyshev.basis(p[:, :2]))
 
 
 def _ridged(design: np.ndarray, z: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -184,8 +184,8 @@ def test_products_and_their_sum_are_numpys(degree: int) -> None:
     a, b = chebyshev.powers.T
     expected = chebvander2d(*scaled.T, [degree, degree]).reshape(50, degree + 1, degree + 1)[:, a, b]
     np.testing.assert_allclose(chebyshev.basis(xy).T, expected, atol=1e-13)
-    c = np.arange(1.0, 1.0 + len(chebyshev.powers))
-    np.testing.assert_allclose(chebyshev.summed(c, xy), expected @ c, atol=1e-11)
+    surface = Surface(chebyshev, np.arange(1.0, 1.0 + len(chebyshev.powers)), "")
+    np.testing.assert_allclose(surface.evaluate(*xy.T), expected @ surface.coefficients, atol=1e-11)
 
 
 def test_a_free_form_is_the_penalised_spline() -> None:

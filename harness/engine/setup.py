@@ -215,11 +215,11 @@ class KnownCloud:
         if not self.cloud.organised:
             board = self.target.board
             return board.width_mm * board.height_mm * MM**2 * float(there.sum()) / max(there.size, 1)
-        areas = pixel_areas(self.places_m)
-        known = np.isfinite(areas)
+        areas = pixel_areas(self.places_m)[there]
+        known = areas[np.isfinite(areas)]
         # at the outline a neighbour is off the board: such a pixel counts as an average one
-        usual = np.median(areas[known]) if known.any() else 0.0
-        return float(np.where(known, areas, usual)[there].sum())
+        usual = np.median(known) if 0 < len(known) < len(areas) else 0.0
+        return float(known.sum() + (len(areas) - len(known)) * usual)
 
 
 def known_view(set_up: SetUp, cloud: Cloud, *, hole_free: bool) -> KnownCloud:
@@ -290,25 +290,13 @@ def highest_within(
     """Return the highest (n,) of the finite scores (h, w) within a radius of each centre (2,) or line (k, 2); NaN if
     there is none. ``places_m`` (h, w, 2): the place of each pixel, NaN if it has none."""
     flat, scores, found = places_m.reshape(-1, 2), score.ravel(), []
+    x, y = np.ascontiguousarray(flat.T)
     for line in map(np.atleast_2d, lines_m):
-        near = _about(flat, scores, *(line.min(axis=0) - radius_m), *(line.max(axis=0) + radius_m))
-        near = near[from_line_m(line, flat[near]) <= radius_m]
+        (west, north), (east, south) = line.min(axis=0) - radius_m, line.max(axis=0) + radius_m
+        near = np.flatnonzero((x >= west) & (x <= east) & (y >= north) & (y <= south))
+        near = near[np.isfinite(scores[near]) & (from_line_m(line, flat[near]) <= radius_m)]
         found.append(scores[near].max() if near.size else np.nan)
     return np.array(found)
-
-
-@numba.njit(**PLAIN)
-def _about(  # type: ignore[no-untyped-def]
-    places: np.ndarray, scores: np.ndarray, west: float, north: float, east: float, south: float
-):
-    """Return the indices of the places (n, 2) in a rectangle that have a finite score."""
-    inside = np.empty(len(places), np.int64)
-    count = 0
-    for i in range(len(places)):
-        x, y = places[i]
-        inside[count] = i
-        count += (x >= west) & (x <= east) & (y >= north) & (y <= south) & np.isfinite(scores[i])
-    return inside[:count]
 
 
 @numba.njit(**PLAIN)

@@ -126,9 +126,11 @@ def _cloud(capture: SimulatedCapture, totals: FrameTotals, left_out: tuple[LeftO
         z_m = (totals.base + mean) * totals.step_m
         variance = (totals.squares - totals.total * mean) / (count - 1)
         amplitude = totals.amplitude / count
+    reason, lost = np.zeros(count.shape, np.uint8), count == 0
+    reason[lost] = totals.reasons[:, lost].argmax(axis=0)
     return Cloud(
         points_m=np.concatenate([capture.slopes * z_m[..., None], z_m[..., None]], axis=-1),
-        reason=np.where(count == 0, np.argmax(totals.reasons, axis=0), 0).astype(np.uint8),
+        reason=reason,
         count=count,
         variance_m2=np.where(count > 1, np.maximum(variance, 0.0) * totals.step_m**2, np.nan),
         region=capture.region,

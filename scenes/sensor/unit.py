@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -147,12 +148,12 @@ def frame_errors_m(
 ) -> Iterator[float]:
     """Yield range errors in metres for endless frames: jitter in all, a jump either way in a few, and the change of the
     drift on the axis since the first frame, ``minutes`` after power-on. An effect that is off adds 0."""
-    axis = np.zeros(1)
+    axis, per_minute = np.zeros(1), facts.frames_per_second.value * 60
     first = _drift_m(facts, effects, minutes, axis)[0]
     for frame in count():
-        now = minutes + frame / facts.frames_per_second.value / 60
-        drifted = float(_drift_m(facts, effects, now, axis)[0] - first)
-        jitter, sign, chance = rng.standard_normal(), rng.choice([-1.0, 1.0]), rng.random()
-        jump = sign * facts.jump_mm.value if chance < facts.jump_rate.value else 0.0
-        moved = float(jitter * facts.jitter_mm.value + jump) * MM if effects.frame_jumps else 0.0
+        drifted = float(_drift_m(facts, effects, minutes + frame / per_minute, axis)[0] - first)
+        # of the chances of a jump one half stands for either way
+        jitter, chance = rng.standard_normal(), rng.random() / max(facts.jump_rate.value, 1e-12)
+        jump = math.copysign(facts.jump_mm.value, chance - 0.5) if chance < 1 else 0.0
+        moved = (jitter * facts.jitter_mm.value + jump) * MM if effects.frame_jumps else 0.0
         yield moved + drifted

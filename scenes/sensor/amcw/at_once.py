@@ -315,13 +315,8 @@ class AtOnce:
         """Return the sums over the first of ``parts``, over the first two, and so on: each has numbers of frames (t,),
         no number twice. ``errors_m``: displacements by number. The noise of frames `LANES` k to `LANES` (k + 1) - 1
         comes from ``stream`` (k), whichever of them are requested."""
-        n, p, k, shape, step_m = (
-            self.linear.z.size,
-            len(self.listed),
-            len(parts),
-            self.shape,
-            self.imager.camera.z_step_m,
-        )
+        n, p, k = self.linear.z.size, len(self.listed), len(parts)
+        shape, step_m = self.shape, self.imager.camera.z_step_m
         total, squares, sway = np.zeros((k, n)), np.zeros((k, n)), np.zeros((k, n), f4)
         sums = (np.zeros((k, p), np.int32), *np.zeros((3, k, p)), np.zeros((k, N_REASONS, p), np.uint16))
         given_at = np.full(n, -1, np.int32)
@@ -353,9 +348,8 @@ class AtOnce:
         noise = sway.reshape(shape)
         for axis in (0, 1):
             noise = ndimage.correlate1d(noise, taps / np.sqrt((taps**2).sum()), axis=axis, mode="constant")
-        amplitude = np.where(
-            certain.always, frames * certain.amplitude + certain.amplitude_deviation * noise.ravel(), 0.0
-        )
+        swaying = frames * certain.amplitude + certain.amplitude_deviation * noise.ravel()
+        amplitude = np.where(certain.always, swaying, 0.0)
         count = np.where(certain.always, frames, 0).astype(np.int32)
         reasons = np.zeros((N_REASONS, len(count)), np.uint16)
         never, at = np.flatnonzero(certain.never), self.listed

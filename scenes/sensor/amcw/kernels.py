@@ -142,8 +142,7 @@ def _filter_window(planes, centre, starts, space, length, settings, total, filte
     for x in range(np.uint64(length)):
         total[x], total[p1 + x], total[p2 + x], total[p3 + x], total[p4 + x] = ZERO, ZERO, ZERO, ZERO, ZERO
     for q in range(0, starts.size, TOGETHER):
-        first, second, third = np.uint64(starts[q]), np.uint64(starts[q + 1]), np.uint64(starts[q + 2])
-        fourth, fifth = np.uint64(starts[q + 3]), np.uint64(starts[q + 4])
+        s1, s2, s3, s4, s5 = starts[q], starts[q + 1], starts[q + 2], starts[q + 3], starts[q + 4]
         w1, w2, w3, w4, w5 = space[q], space[q + 1], space[q + 2], space[q + 3], space[q + 4]
         for x in range(np.uint64(length)):
             bright = planes[middle + p2 + x] > dim
@@ -151,11 +150,11 @@ def _filter_window(planes, centre, starts, space, length, settings, total, filte
             re, im = scale * planes[middle + x], scale * planes[middle + p1 + x]
             own = (re, im, -scale, least, max(least, edge_of_any))
             sums = (total[x], total[p1 + x], total[p2 + x], total[p3 + x], total[p4 + x])
-            sums = _with_neighbour(planes, first + x, p1, p2, w1, own, by_amplitude, sums)
-            sums = _with_neighbour(planes, second + x, p1, p2, w2, own, by_amplitude, sums)
-            sums = _with_neighbour(planes, third + x, p1, p2, w3, own, by_amplitude, sums)
-            sums = _with_neighbour(planes, fourth + x, p1, p2, w4, own, by_amplitude, sums)
-            sums = _with_neighbour(planes, fifth + x, p1, p2, w5, own, by_amplitude, sums)
+            sums = _with_neighbour(planes, s1 + x, p1, p2, w1, own, by_amplitude, sums)
+            sums = _with_neighbour(planes, s2 + x, p1, p2, w2, own, by_amplitude, sums)
+            sums = _with_neighbour(planes, s3 + x, p1, p2, w3, own, by_amplitude, sums)
+            sums = _with_neighbour(planes, s4 + x, p1, p2, w4, own, by_amplitude, sums)
+            sums = _with_neighbour(planes, s5 + x, p1, p2, w5, own, by_amplitude, sums)
             total[x], total[p1 + x], total[p2 + x], total[p3 + x], total[p4 + x] = sums
     for x in range(np.uint64(length)):
         a, b = total[x], total[p1 + x]
@@ -185,7 +184,7 @@ def filter_image(unit, amplitude, settings, filtered, edge):  # type: ignore[no-
     half = side // 2
     # the last row stays outside, and so do the neighbours that fill up the list
     rows, space = np.zeros(3 * (side + 1) * STRIDE, np.float32), _padded(settings.space)
-    starts = np.full(space.size, 3 * side * STRIDE)
+    starts = np.full(space.size, np.uint64(3 * side * STRIDE))
     for dy in range(side + 1):
         rows[(3 * dy + 2) * STRIDE : (3 * dy + 3) * STRIDE] = OUTSIDE
         for dx in range(side if dy < side else 0):
@@ -216,7 +215,7 @@ def filter_listed(planes, window, settings, filtered, edge):  # type: ignore[no-
     planes[-1] = OUTSIDE
     flat, space, k = planes.reshape(planes.size), _padded(settings.space), window.shape[1]
     none, total = (len(planes) - 1) * n_frequencies * 3 * STRIDE, np.empty(5 * STRIDE, np.float32)
-    starts = np.full(space.size, none)
+    starts = np.full(space.size, np.uint64(none))
     for p in range(m):
         for f in range(n_frequencies):
             for q in range(k):
