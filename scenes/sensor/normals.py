@@ -1,4 +1,4 @@
-"""Standard normals and random words for the cameras' noise, vectorised, from a generator's own; single-threaded."""
+"""Standard normals for the cameras' noise, vectorised, from a generator's raw words; single-threaded, float32."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ EXACT_SUMS: Any = {**FAST, "fastmath": {"nsz", "reassoc"}}  # of whole numbers t
 IN_DOUBLE: Any = {**FAST, "fastmath": {"contract", "reassoc", "arcp", "nsz"}}
 """The same for float64 sums that are rounded to float32 afterwards; their order changes a range by 1e-13 m."""
 TWO_PI = np.float32(2.0 * math.pi)
-STREAMS = 32  # of random words, drawn side by side: several times as fast as one after another
 
 
 @numba.njit(**FAST)
@@ -87,32 +86,10 @@ fma: Any = intrinsic(_fused)
 """a b + c of float32, rounded once: the same bits on every processor, in one operation on most."""
 
 
-@numba.njit(**FAST)
-def _sfc64(state: np.ndarray, out: np.ndarray) -> None:
-    """Write words (n,) uint64, n a multiple of `STREAMS`, of NumPy's generator SFC64 in ``state`` (4 streams,)."""
-    p1, p2, p3 = np.uint64(STREAMS), np.uint64(2 * STREAMS), np.uint64(3 * STREAMS)
-    for start in range(0, out.size, STREAMS):
-        for k in range(np.uint64(STREAMS)):
-            b, c, counter = state[p1 + k], state[p2 + k], state[p3 + k]
-            word = state[k] + b + counter
-            state[k] = b ^ (b >> np.uint64(11))
-            state[p1 + k] = c + (c << np.uint64(3))
-            state[p2 + k] = word + (c << np.uint64(24) | c >> np.uint64(40))
-            state[p3 + k] = counter + np.uint64(1)
-            out[np.uint64(start) + k] = word
-
-
-def random_words(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Draw ``count`` uniform words, uint64, from parallel streams whose states are words of the generator's own."""
-    out = np.empty(-(-count // STREAMS) * STREAMS, np.uint64)
-    _sfc64(rng.bit_generator.random_raw(4 * STREAMS), out)
-    return out[:count]
-
-
 def standard_normals(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """Draw standard normals (shape) float32 from `random_words`; an odd count uses half a word more."""
+    """Draw standard normals (shape) float32 from the generator's raw words; an odd count uses half a word more."""
     count = math.prod(shape)
     even = count + count % 2
     out = np.empty(even, np.float32)
-    normals_from_bits(random_words(rng, even // 2).view(np.uint32), out)
+    normals_from_bits(rng.bit_generator.random_raw(even // 2).view(np.uint32), out)
     return out[:count].reshape(shape)

@@ -25,7 +25,7 @@ from scenes.sensor.amcw import kernels, ranging
 from scenes.sensor.amcw.certainty import Certainty, certainty, even_pixels, fill_even
 from scenes.sensor.amcw.kernels import LANES, FilterSettings
 from scenes.sensor.amcw.linear import DEVIATIONS, Light, light_of_samples, linearised, unknown_filtered
-from scenes.sensor.normals import EXACT_SUMS, FAST, random_words, standard_normals
+from scenes.sensor.normals import EXACT_SUMS, FAST, standard_normals
 from scenes.sensor.unit import N_REASONS, FrameTotals
 
 if TYPE_CHECKING:
@@ -329,7 +329,8 @@ class AtOnce:
             lanes = slice(block * LANES, (block + 1) * LANES)
             rng, counted = stream(block), (part_of[lanes] == np.arange(k)[:, None]).astype(f4)
             given = self._add_one_by_one(errors[lanes], part_of[lanes], rng, sums)
-            words, signs = random_words(rng, n * LANES // 8).view(np.int8), random_words(rng, n)
+            draw = rng.bit_generator.random_raw
+            words, signs = draw(n * LANES // 8).view(np.int8), draw(n)
             steps = errors[lanes] / f4(step_m)
             add_linear_frames(shape, self.linear, words, given, given_at, steps, counted, total, squares)
             for part, there in zip(sway, counted, strict=True):
