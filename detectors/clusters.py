@@ -42,7 +42,7 @@ def nested_clusters(
         raise UserError(f"{what} {distance_m * 1e3:.3g} mm", fix=fix)
     # the margin makes a neighbour's key the sum of the cell's key and the key of the offset
     x, y, z = cells.astype(np.int64).T + NEAR_CELLS
-    falling = np.argsort(-scores)
+    falling = np.argsort(-scores, kind="stable")
     key = (((x << AXIS_BITS | y) << AXIS_BITS) | z)[falling]
     by_cell = np.argsort(key, kind="stable")
     starts = np.flatnonzero(np.diff(key[by_cell], prepend=-1))

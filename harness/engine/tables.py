@@ -30,12 +30,12 @@ def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> t
     """Collect records into tables in a fixed order. Every axis but frames is a column, except in a study's tables."""
     parts: dict[str, list[dict[str, Any]]] = {name: [] for name in (*RECORDED, *OF_STUDY)}
     grids: dict[tuple[float, ...], np.ndarray] = {}
-    probes: list[dict[str, Any]] = []
+    probes: list[tuple[str, int, int, np.ndarray]] = []  # set-up, number of frames, repeat, errors by pixel
     waiting = iter(records)
     while chunk := list(islice(waiting, RECORDS_AT_ONCE)):
         for row in (row for record in chunk for row in record.get("probes", ())):
             errors = np.array([UNKNOWN if value is None else value for value in row["error_tenth_um"]], np.int32)
-            probes.append({**row, "error_tenth_um": errors})
+            probes.append((intern(row["variant"]), row["frames"], row["repeat"], errors))
         for name, made in parts.items():
             rows = [row for record in chunk for row in record.get(name, ())]
             if rows:
@@ -95,30 +95,32 @@ def columns_of(rows: Sequence[Mapping[str, Any]], grids: dict[tuple[float, ...],
     return found
 
 
-def _probes(rows: list[dict[str, Any]]) -> pd.DataFrame:
+def _in_mm(tenth_um: np.ndarray) -> np.ndarray:
+    return np.where(tenth_um == UNKNOWN, np.nan, tenth_um) * 1e-7 / MM
+
+
+def _probes(rows: list[tuple[str, int, int, np.ndarray]]) -> pd.DataFrame:
     """Return each probe's mean error and temporal deviation over hole-free repeats, without repeats' displacements."""
     grouped: dict[tuple[str, int], list[np.ndarray]] = {}
-    for row in sorted(rows, key=lambda row: (row["variant"], row["frames"], row["repeat"])):
-        grouped.setdefault((row["variant"], row["frames"]), []).append(row["error_tenth_um"])
+    for variant, frames, _, errors in sorted(rows, key=lambda row: row[:3]):
+        grouped.setdefault((variant, frames), []).append(errors)
     tables = []
-    for (variant, frames), errors in grouped.items():
-        tenth_um = np.array(errors)
-        mm = np.where(tenth_um == UNKNOWN, np.nan, tenth_um) * 1e-7 / MM
-        known = np.isfinite(mm).any(axis=1)
-        displacement = np.zeros(len(mm))
-        if known.any():
-            displacement[known] = np.nanmedian(mm[known], axis=1)
-            displacement[known] -= np.median(displacement[known])
-        mm -= displacement[:, None]
-        several = len(mm) > 1
+    for (variant, frames), repeats in grouped.items():
+        # repeat by repeat, as all in millimetres would take four times the memory of the rows
+        medians = np.array([np.nanmedian(mm) if np.isfinite(mm).any() else np.nan for mm in map(_in_mm, repeats)])
+        known = np.isfinite(medians)
+        displacement = np.where(known, medians - (np.median(medians[known]) if known.any() else 0.0), 0.0)
+        several, centred = len(repeats) > 1, [*zip(repeats, displacement, strict=True)]
+        mean = sum(_in_mm(each) - moved for each, moved in centred) / len(repeats)
+        squares = sum((_in_mm(each) - moved - mean) ** 2 for each, moved in centred)
         columns = {
             "variant": variant,
             "frames": frames,
-            "pixel": np.arange(mm.shape[1]),
-            "mean_error_mm": mm.mean(axis=0),
-            "temporal_std_mm": mm.std(axis=0, ddof=1) if several else np.nan,
+            "pixel": np.arange(len(mean)),
+            "mean_error_mm": mean,
+            "temporal_std_mm": np.sqrt(squares / (len(repeats) - 1)) if several else np.nan,
             "displacement_std_mm": displacement.std(ddof=1) if several else np.nan,
-            "repeats": len(mm),
+            "repeats": len(repeats),
         }
         tables.append(pd.DataFrame(columns))
     empty = pd.DataFrame(columns=[column.name for column in trials.PROBES.columns])

@@ -152,7 +152,7 @@ def frame_errors_m(
     first = _drift_m(facts, effects, minutes, axis)[0]
     for frame in count():
         drifted = float(_drift_m(facts, effects, minutes + frame / per_minute, axis)[0] - first)
-        # of the chances of a jump one half stands for either way
+        # each half of the chances of a jump stands for one direction
         jitter, chance = rng.standard_normal(), rng.random() / max(facts.jump_rate.value, 1e-12)
         jump = math.copysign(facts.jump_mm.value, chance - 0.5) if chance < 1 else 0.0
         moved = (jitter * facts.jitter_mm.value + jump) * MM if effects.frame_jumps else 0.0
