@@ -354,10 +354,14 @@ def main() -> None:
     peers = (peers_of_frames, peers_of_surfaces, peers_of_clusters, peers_of_curves, peers_of_registration)
     parts = (*peers, peers_of_renders, trials, growth)
     known = {part.__name__.removeprefix("peers_of_"): part for part in parts}
-    parser = argparse.ArgumentParser(description="Speed beside other libraries, and how the cost grows.")
+    parser = argparse.ArgumentParser(description="Compare speed with other libraries and show how cost grows.")
     parser.add_argument("parts", nargs="*", metavar="PART", choices=[*known, []], help=", ".join(known))
     parser.add_argument("--quick", action="store_true", help="fewer runs, less certain")
     options = parser.parse_args()
+    # Mitsuba cannot run if Open3D was imported before it.
+    from scenes.render.scene import load_mitsuba
+
+    load_mitsuba()
     print(f"{os.cpu_count()} cores, one thread used; load {os.getloadavg()[0]:.1f} at the start")
     for name in options.parts or known:
         known[name](3 if options.quick else 9)

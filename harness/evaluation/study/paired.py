@@ -8,11 +8,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.stats import betabinom, hypergeom, norm, t
+from scipy.stats import betabinom, hypergeom, t
 
 from harness.evaluation.intervals import Interval, percentiles
+from harness.evaluation.pod.hit_miss import fit_hit_miss
 from harness.evaluation.study.limit import SetUpLimit
 from harness.evaluation.study.record import Inspected, SetUpRecord, Unflawed
+from harness.vocabulary.errors import UserError
 
 Tails = tuple[float, float]
 
@@ -111,8 +113,8 @@ SAME = 1e-6
 @dataclass(frozen=True)
 class SignalChange:
     """Change of the signals of ``damages``, each divided by the least signal that is found (``found_from``: first,
-    second). ``ratio``: median, as a factor. ``error``: of its logarithm, over boards, calibrations. p: one-sided,
-    normal."""
+    second). ``ratio``: median, as a factor. ``error``: of its logarithm, over boards, calibrations. p: one-sided, by
+    Student's t, as these errors are estimates too (Satterthwaite, Biometrics Bulletin 2 (1946), 110)."""
 
     damages: int
     ratio: float
@@ -129,11 +131,11 @@ def signal_change(first: SetUpRecord, second: SetUpRecord) -> SignalChange | Non
     one, two = shared_rows(first.inspected, second.inspected)
     if first.detector != second.detector or not len(one):
         return None
-    needed = found_from(first.inspected), found_from(second.inspected)
+    needed = found_from(first), found_from(second)
     with np.errstate(divide="ignore", invalid="ignore"):
         before, now = (
-            np.log(of.signal[rows] / at)
-            for of, rows, at in zip((first.inspected, second.inspected), (one, two), needed, strict=True)
+            np.log(of.inspected.signal[rows] / at)
+            for of, rows, (at, _) in zip((first, second), (one, two), needed, strict=True)
         )
         clear = np.isfinite(before + now) & (before + now > 0)
     change, board = (now - before)[clear], first.inspected.board[one][clear]
@@ -141,39 +143,51 @@ def signal_change(first: SetUpRecord, second: SetUpRecord) -> SignalChange | Non
     if len(names) < 2:
         return None
     of_boards = np.bincount(which, change) / np.bincount(which)
-    luck = [0.0, 0.0]
+    parts = [(of_boards.var(ddof=1) / len(names), len(names) - 1.0)]
     if not np.isclose(first.threshold, second.threshold, rtol=SAME, atol=0.0):
-        luck = [_threshold_error(first), _threshold_error(second)]
-    error = float(np.sqrt(of_boards.var(ddof=1) / len(names) + luck[0] ** 2 + luck[1] ** 2))
-    median = float(np.median(change))
-    p = norm.cdf([median, -median], scale=error).tolist() if error > 0 else [float(median >= 0), float(median <= 0)]
-    return SignalChange(len(change), float(np.exp(median)), needed, error, *p)
+        parts += [_threshold_variance(first), _threshold_variance(second)]
+    variances, freedoms = np.array([*parts, *((unsure, np.inf) for _, unsure in needed)]).T
+    error, median = float(np.sqrt(variances.sum())), float(np.median(change))
+    p = [float(median >= 0), float(median <= 0)]
+    if error > 0:
+        p = t.cdf(np.array([median, -median]) / error, error**4 / (variances**2 / freedoms).sum()).tolist()
+    return SignalChange(len(change), float(np.exp(median)), (needed[0][0], needed[1][0]), error, *p)
 
 
-def found_from(seen: Inspected) -> float:
-    """Return the effective threshold: the signal that separates hits from misses with the fewest exceptions, midway
-    between its neighbours. Hits by missing returns alone do not count; NaN without any signal."""
-    hit = seen.hit if seen.by_depth is None else seen.by_depth
-    known = np.flatnonzero(seen.signal > 0)
-    if not len(known):
-        return np.nan
-    order = known[np.argsort(seen.signal[known], kind="stable")]
-    signal, hit = seen.signal[order], hit[order]
-    exceptions = np.append(0, np.cumsum(hit)) + np.append(np.cumsum(~hit[::-1])[::-1], 0)
-    at = int(np.argmin(exceptions))
-    return float(np.sqrt(signal[max(at - 1, 0)] * signal[min(at, len(signal) - 1)]))
+def found_from(record: SetUpRecord) -> tuple[float, float]:
+    """Return the effective threshold and the variance of its logarithm: the set-up's threshold (variance 0) if it
+    divides hits from misses without exception; else the middle between the strongest miss and the weakest hit, if they
+    do not overlap; else the signal at which half is found, by logistic regression. Hits by missing returns alone do
+    not count; NaN without signals, or if hits do not grow with them."""
+    seen = record.inspected
+    known = seen.signal > 0
+    signal, hit = seen.signal[known], (seen.hit if seen.by_depth is None else seen.by_depth)[known]
+    if not len(signal):
+        return np.nan, np.nan
+    if (hit == (signal > record.threshold)).all():
+        return record.threshold, 0.0
+    logs = np.log(signal)
+    strongest_miss, weakest_hit = logs[~hit].max(initial=logs.min()), logs[hit].min(initial=logs.max())
+    if strongest_miss <= weakest_hit:
+        return float(np.exp((strongest_miss + weakest_hit) / 2)), float((weakest_hit - strongest_miss) ** 2 / 12)
+    try:
+        curve = fit_hit_miss(signal, hit, log_size=True).curve
+    except UserError:
+        return np.nan, np.nan
+    return float(np.exp(curve.mu)), float(curve.covariance[0, 0])
 
 
-def _threshold_error(record: SetUpRecord) -> float:
-    """Return the standard error of a calibrated threshold's logarithm: half the distance between the scores one
-    standard deviation of its rank above and below (Woodruff, J. American Statistical Association 47 (1952), 635)."""
+def _threshold_variance(record: SetUpRecord) -> tuple[float, float]:
+    """Return the variance of a calibrated threshold's logarithm, and its degrees of freedom. Scores above the median
+    are taken to have an exponential tail on a logarithmic scale: the mean excess of so many determines it, where the
+    distance of neighbouring scores would scatter by 40 %."""
     if record.calibrated is None or len(record.calibrated.score) < 2:
-        return 0.0
-    falling = np.sort(np.maximum(record.calibrated.score, 1e-9))[::-1]
-    n, rank = len(falling), max(int((falling >= record.threshold).sum()), 1)
-    reach = np.sqrt(rank * max(1 - rank / n, 1 / n))
-    ends = np.interp([rank - reach, rank + reach], np.arange(1, n + 1), np.log(falling))
-    return float(0.5 * (ends[0] - ends[1]))
+        return 0.0, np.inf
+    falling = np.sort(np.log(np.maximum(record.calibrated.score, 1e-9)))[::-1]
+    n, rank = len(falling), max(int((falling >= np.log(record.threshold)).sum()), 1)
+    upper = n // 2
+    scale = (falling[:upper] - falling[upper]).mean()
+    return float(scale**2 * max(1 / rank - 1 / n, 1 / n**2)), upper / 2
 
 
 @dataclass(frozen=True)
