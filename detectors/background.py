@@ -373,8 +373,14 @@ def _misfit(cells: _Cells, fit: Fit, name: str) -> tuple[str, dict[str, Any]]:
     text = f"the surface does not fit here: {name} leaves {1e3 * rms_m:.2g} mm rms at scales above"
     text += f" {STRUCTURE_CELLS * cells.side_m / MM:.2g} mm, where the noise of a pixel is {1e3 * pixel:.2g} mm, on"
     text += f" {100 * share:.0f} % of the target; findings there may be due to its shape"
+    # connected cells that lie far off: damage is seldom so large
+    parts = cv2.connectedComponentsWithStats((valid & ~used).astype(np.uint8))[2]
+    off = float(parts[1:, cv2.CC_STAT_AREA].max(initial=0) / max(valid.sum(), 1))
+    if off >= MISFIT_FROM:
+        text = f"the surface does not fit here: {100 * off:.0f} % of the target lies off it ({name}), as beside a step"
+        text += " between two surfaces; findings there may be due to its shape (--crop can leave a surface out)"
     notes = {"misfit_share": share, "misfit_rms_m": rms_m, "local_noise_m": pixel}
-    return (text if share >= MISFIT_FROM else ""), notes
+    return (text if max(share, off) >= MISFIT_FROM else ""), notes
 
 
 def _incidence_deg(points: np.ndarray, fit: Fit, step: float) -> np.ndarray:

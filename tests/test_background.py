@@ -116,6 +116,14 @@ def test_a_stated_degree_that_does_not_fit_is_warned_of(z: np.ndarray, degree: i
     assert said.startswith("the surface does not fit here: it leaves")
 
 
+def test_a_board_on_a_floor_taken_for_one_surface_is_warned_of() -> None:
+    """Damage that covers less than a tenth of the target is no reason for doubt."""
+    board = (np.abs(X * 0.7 + 0.02) < 0.22) & (np.abs(Y * 0.7) < 0.2)
+    warning = found(measured(np.where(board, 0.986, 1.0) * plane())).warning
+    assert warning.startswith("the surface does not fit here: ") and "a step between two surfaces" in warning
+    assert found(measured(plane(), damage=((0.05, 0.0, 0.2, 0.03),))).warning == ""
+
+
 @pytest.mark.parametrize("correlated_px", [0.0, 1.2, 2.0])
 def test_flat_boards_stay_planes_and_without_warning(correlated_px: float) -> None:
     answers = [found(measured(plane(), seed, correlated_px)) for seed in range(5)]

@@ -104,7 +104,8 @@ def _match(row: dict[str, str], truths: tuple[Truth, ...]) -> Truth | None:
     best, least = None, math.inf
     for truth in truths:
         centre = 1e3 * np.array(truth.centre_m)
-        apart = float(np.hypot(*(place[:2] - centre[:2])))
+        # an error of the camera's range moves a place along its line of sight
+        apart = float(np.hypot(*(place[:2] * centre[2] / place[2] - centre[:2])))
         deep = 0.0 if not math.isfinite(truth.depth_m[1]) else 1e3 * truth.depth_m[1]
         if apart < max(NEAR_MM, 1e3 * truth.radius_m) and abs(place[2] - centre[2]) < 50 + deep and apart < least:
             best, least = truth, apart
