@@ -238,14 +238,16 @@ whole millimetres; everything except two plaster walls is masked out). {planes[0
 
 ![{_ALT}]({FIGURE})
 
-Each wall's plane is fitted robustly (it is exactly linear in 1/z over the rays' slopes), rendered in closed form and
-passed through the simulated camera for as many frames as were recorded. The same analysis is applied to both. Nothing
-is fitted to make them agree. The set has no intrinsics: the lens is the camera file's nominal one with its centre at
-({lens.cx:.0f}, {lens.cy:.0f}). The walls' albedo at 850 nm is not known: both have {albedo}, the albedo of the
-calibration point. Pixels within 3 px of a wall's edge are left out, as their filter window holds other light. "Lit
-cone" means pixels within 32.5 degrees of the axis, half the specification's smaller angle of view; beyond it the real
-light falls off to the edge of its field, and the closed-form plane has no such fall-off. The illuminated polygon of
-the camera file is opened for this check, so that every measured pixel has a simulated one.
+A plane is fitted robustly to each wall (1/z of a plane is a linear function of the rays' slopes x/z and y/z). The
+plane is rendered in closed form, and the simulated camera takes as many frames of it as were recorded. The same
+analysis is applied to the real and the simulated frames. Nothing is fitted to make them agree. The public set states
+no lens parameters, so the camera file's nominal lens is used, with its principal point at
+({lens.cx:.0f}, {lens.cy:.0f}). The walls' albedo at 850 nm is not known; both are assumed to have {albedo}, the albedo
+of the calibration point. Pixels within 3 px of a wall's edge are left out, because their filter window also receives
+light from other surfaces. "Lit cone" means the pixels within 32.5 degrees of the axis, half of the smaller angle of
+view in the specification. Beyond it, the real light decreases towards the edge of the lit field; the light on the
+closed-form plane does not. The camera file limits the lit field by a polygon; this check ignores it, so that every
+measured pixel has a simulated one.
 
 To repeat the comparison:
 
@@ -269,15 +271,15 @@ def _temporal(checks: Sequence[WallCheck]) -> str:
     spread = max(float(np.abs(r / r.mean() - 1).max()) for r in ratios)
     return f"""## Temporal deviation against range
 
-Standard deviation over frames, rms over pixels, in bins of 0.1 m (bins of fewer than 300 pixels left out).
+The table gives the standard deviation over frames, as rms over the pixels of each range bin of 0.1 m. Bins of fewer
+than 300 pixels are left out. The ratio is simulated to measured.
 
 {_markdown(SIGMA_HEAD, rows)}
 
-The ratio of simulated to measured deviation is {inner} in the lit cone and {whole} over whole walls. The growth with
-range is correct
-(each wall's ratios in the lit cone lie within {100 * spread:.0f} % of their mean), but the level is too low.
-An albedo of {needed} in place of the assumed one would make the levels in the lit cone equal; that
-number is reported, but not used."""
+The ratio of simulated to measured deviation is {inner} in the lit cone and {whole} over whole walls. The simulated
+deviation grows with range like the measured one (each wall's ratios in the lit cone lie within {100 * spread:.0f} % of
+their mean), but it is too small. With an albedo of {needed} instead of the assumed one, the deviations in the lit cone
+would be equal; these albedos are reported, but not used."""
 
 
 def _spatial(checks: Sequence[WallCheck]) -> str:
@@ -293,11 +295,12 @@ def _spatial(checks: Sequence[WallCheck]) -> str:
 
 {_markdown(CORRELATION_HEAD, rows)}
 
-The real frames jitter as a whole: a wall's mean over all its pixels varies from frame to frame by {real}; simulated
-{ours} (its size in the camera's file was set from these frames, so this agreement is not a test; independent pixels
-would give 0.03
-mm). The jitter lifts the correlation at all lags alike; with each frame's mean subtracted, measured and simulated
-correlations differ by at most {gaps[False]:.3f} at lags 1 to 5, with it by at most {gaps[True]:.3f}."""
+The table gives the correlation between the noise of pixels that are 1 to 5 px apart (the lag). Each real frame has a
+small range error that all its pixels share (jitter): the mean over all pixels of a wall varies from frame to frame by
+{real}. In the simulation it varies by {ours}. The size of the jitter in the camera's file was set from these frames, so
+this agreement is not a test. Independent pixels would give 0.03 mm. Jitter increases the correlation at all lags alike.
+"Jitter off" means that each frame's mean is subtracted: measured and simulated correlations then differ by at most
+{gaps[False]:.3f} at lags 1 to 5. With jitter they differ by at most {gaps[True]:.3f}."""
 
 
 def _pattern(checks: Sequence[WallCheck], camera: AmcwCamera) -> str:
@@ -310,18 +313,19 @@ def _pattern(checks: Sequence[WallCheck], camera: AmcwCamera) -> str:
     planted = facts.pixel_mm.value / camera.engine.window_px.value
     return f"""## Fixed pattern
 
-The fixed pattern is the average of the frames minus a robust surface of degree 5 in 1/z. The remaining temporal noise
-(its covariance divided by the number of frames) is subtracted from the covariance of the residual at every lag.
+The fixed pattern is the average of the frames minus a robustly fitted surface of degree 5 in 1/z. The average still
+contains temporal noise: its covariance, divided by the number of frames, is subtracted from the covariance of the
+residual at every lag.
 
 {_markdown(PATTERN_HEAD, rows)}
 
 The measured standard deviation is {real}, the Gaussian correlation length {length}; the simulated standard deviation
 is {ours} (rms of
-five units). The camera file's {facts.smooth_mm.value} mm and {facts.smooth_length_px.value} px are put in
-along the ray before the filter; the filter, the projection to z and the removed surface reduce them. The part that is
-white before the 5x5 window shows as a triangle in the covariance. The file's {facts.pixel_mm.value} mm leaves
-{planted:.2f} mm after the window, and the analysis finds this value in the simulated walls; in the real walls it
-finds {white}."""
+five units). The camera file's {facts.smooth_mm.value} mm and {facts.smooth_length_px.value} px apply along the ray
+before the filter; the filter, the projection to z and the subtraction of the surface reduce
+them. The part of the pattern that is uncorrelated between pixels (white) before the filter window of 5 x 5 pixels
+adds a triangle to the covariance. The file's {facts.pixel_mm.value} mm becomes {planted:.2f} mm after the window; the
+analysis finds a little less in the simulated walls, and {white} in the real walls."""
 
 
 def _why(checks: Sequence[WallCheck]) -> str:
@@ -329,28 +333,28 @@ def _why(checks: Sequence[WallCheck]) -> str:
     times = _listed(f"{c.pattern.std_m / _simulated(c, lambda p: p.std_m):.2f}" for c in checks)
     return f"""## Where the simulation deviates, and the likely reasons
 
-- **Less temporal noise than measured.** The walls are seen {angles.min():.0f} to {angles.max():.0f} degrees off the
-  axis. The model's light falls with incidence, distance and the lens' natural cos^4 law less what barrel distortion
-  gives back; mechanical vignetting and the emitter's profile are not published and not modelled. A darker wall
-  explains
-  the level as well (the albedos above), but not the remaining fall with angle. On the axis, where the gain is
-  calibrated, neither makes a difference.
-- **The edge of the lit field.** On the right wall the measured deviation doubles over the last 20 px before the field
-  ends. The renderer's emitter has a linear roll-off between two guessed angles; the closed-form plane has none.
-{_polygon(checks)}- **Correlation slightly low at lags 1 to 3.** Rounding to whole millimetres adds 0.29 mm
-  of white noise; where the simulated deviation is smaller than the real one, that share is larger and the correlation
-  lower.
-- **Correlation beyond the window.** Simulated noise within a frame is uncorrelated at 5 px; real noise is still
-  slightly correlated. Beside the frames' common jitter, which is modelled, real frames have an error that varies
+- **The simulated temporal noise is too low.** The walls lie {angles.min():.0f} to {angles.max():.0f} degrees off the
+  axis. In the model, light decreases with the angle of incidence, with distance and with the lens's cos^4 law, which
+  barrel distortion partly cancels. Mechanical vignetting and the emitter's angular profile are not published and not
+  modelled; on the axis, where the gain is calibrated, they have no effect. Darker walls (the albedos above) would
+  explain the level too, but not why the ratio decreases with the angle.
+- **The edge of the lit field.** On the right wall the measured deviation doubles within the last 20 px before the edge
+  of the lit field. The renderer's emitter has a linear roll-off between two angles, which are guesses; the closed-form
+  plane has no roll-off.
+{_polygon(checks)}- **The simulated correlation is slightly too low at lags 1 to 3.** Rounding to whole millimetres adds
+  0.29 mm of white noise. Where the simulated deviation is smaller than the real one, the share of this white noise is
+  larger and the correlation lower.
+- **Real noise is correlated beyond the filter window.** Simulated noise within a frame is uncorrelated at 5 px; real
+  noise is still slightly correlated. In addition to jitter, which is modelled, real frames have an error that varies
   smoothly within a frame and is not modelled.
-- **Fixed pattern: measured by simulated {times}.** The camera file's two sizes were set from these frames, so this
-  agreement is not a test. The white part was set from patches of 3 to 15 pixels, which need less than this analysis
-  finds. The measured pattern contains the plaster's own relief and texture and
-  light between walls and ceiling, so it is an upper bound of the camera's pattern. Its covariance falls faster than a
-  Gaussian
-  at the first lags, has a longer tail and differs between x and y; the model is one isotropic Gaussian and white
-  noise.
-- **One unit, one pair of walls, {len(checks[0].wall.z_m)} frames.** The spread between units is not known."""
+- **The fixed patterns agree: measured by simulated {times}.** The two sizes in the camera file were set from these
+  frames, so this agreement is not a test. The white part was set from patches of 3 to 15 pixels, which require a
+  smaller value than this analysis finds. The measured pattern contains the plaster's own relief and texture, and light
+  that walls and ceiling reflect to each other, so it is an upper bound of the camera's pattern. At the first lags its
+  covariance decreases faster than a Gaussian; it also has a longer tail and differs between x and y. The model is the
+  sum of one isotropic Gaussian field and white noise.
+- **The frames show one unit and one pair of walls.** There are {len(checks[0].wall.z_m)} frames. The spread between
+  units is not known."""
 
 
 def _polygon(checks: Sequence[WallCheck]) -> str:
