@@ -102,8 +102,8 @@ def _warnings(cameras: Iterable[str]) -> list[str]:
     for camera in map(load_camera, dict.fromkeys(cameras)):
         if text := guessed_precision(camera):
             alike.setdefault(text.replace(camera.title, "{}"), []).append(camera.title)
-    whose = {text: text if len(of) == 1 else text.replace("its noise", "their noise") for text, of in alike.items()}
-    return [whose[text].format("; ".join(of)) for text, of in alike.items()]
+    form = {text: text if len(who) == 1 else text.replace("its noise", "their noise") for text, who in alike.items()}
+    return [form[text].format("; ".join(who)) for text, who in alike.items()]
 
 
 def _answer(options: argparse.Namespace, surfaces: Sequence[LimitSurface], titles: dict[str, str], about: Any) -> None:
@@ -135,7 +135,7 @@ def _answer(options: argparse.Namespace, surfaces: Sequence[LimitSurface], title
         for reason, title in why:
             whose.setdefault(reason, set()).add(title)
     all_chosen = {titles[surface.camera] for surface in chosen}
-    refused = [reason if of == all_chosen else f"{', '.join(sorted(of))}: {reason}" for reason, of in whose.items()]
+    refused = [reason if who == all_chosen else f"{', '.join(sorted(who))}: {reason}" for reason, who in whose.items()]
     if not rows:
         fix = f"compute it: {_exactly(chosen[0], places[0], about)}"
         raise UserError("the atlas does not cover this: " + "; ".join(refused), fix=fix)
@@ -164,10 +164,10 @@ def _chosen(options: argparse.Namespace, surfaces: Sequence[LimitSurface], kind:
     detector = options.detector or (BEST if BEST in detectors else detectors[0])
     given = (("camera", options.camera or ()), ("kind", [kind]), ("detector", [detector]))
     for name, wanted in given:
-        there = dict.fromkeys(getattr(surface, name) for surface in surfaces)
-        if unknown := [one for one in wanted if one not in there]:
+        in_atlas = dict.fromkeys(getattr(surface, name) for surface in surfaces)
+        if unknown := [value for value in wanted if value not in in_atlas]:
             option = "--damage" if name == "kind" else f"--{name}"
-            legal = [*(word for word, kind in KINDS.items() if name == "kind" and kind in there), *there]
+            legal = [*(word for word, kind in KINDS.items() if name == "kind" and kind in in_atlas), *in_atlas]
             near = nearest(unknown[0], (*legal, *(KINDS if name == "kind" else ())))
             meant = f"; did you mean {near!r}?" if near and near != unknown[0] else ""
             what = f"{option} {options.damage if name == 'kind' else ', '.join(unknown)}: not in the atlas{meant}"

@@ -58,7 +58,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     if not options.dry_run:
         with _held(folders, of_results):  # report a running sweep before asking
             pass
-    wanted = [each for one in folders for each in (removable(one) if of_results else cache_removal(one, limit))]
+    wanted = [file for path in folders for file in (removable(path) if of_results else cache_removal(path, limit))]
     what = (
         f"{len(wanted)} files in {many(len(folders), 'folder')}" if of_results else many(len(wanted), "stored render")
     )

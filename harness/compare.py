@@ -43,7 +43,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     if not 1e-6 <= options.alpha <= 0.5:
         raise UserError(f"--alpha {options.alpha:g}", legal="1e-6 to 0.5")
     first, second = read_record(options.first), read_record(options.second)
-    if not any(one is not None and other is not None for one, other in paired_set_ups(first, second)):
+    if not any(old is not None and new is not None for old, new in paired_set_ups(first, second)):
         both = " / ".join("; ".join(set_up.label for set_up in study.set_ups) for study in (first, second))
         what = f"no set-ups can be paired, since none has the same name and frames in both studies: {both}"
         legal = "set-ups with the same frames and the same name or values on the axes; or a single set-up in each"

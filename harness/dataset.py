@@ -137,7 +137,7 @@ def _written(out: Path, samples: list[Sample], engine: JobEngine) -> list[str]:
         for sample in samples:
             by_category.setdefault(sample.category, []).append(regions[sample.render.path.stem])
         windows = {category: joined(seen) for category, seen in by_category.items()}
-        boards = [Job(one.name, "trials", write_board, (out, one, windows[one.category])) for one in missing]
+        boards = [Job(board.name, "trials", write_board, (out, board, windows[board.category])) for board in missing]
         carry_out(boards, outcome.trials)
     return failures
 

@@ -91,8 +91,8 @@ def _refuse_what_does_not_belong(options: argparse.Namespace) -> None:
         fix = "make a careful guess; a study that is planned for an optimistic guess demonstrates nothing"
         raise UserError(f"{', '.join(missing)}: not stated", legal=legal, fix=fix)
     for name, owner in (("set-up", "study"), ("board-m2", "false-calls-per-m2")):
-        given, of = (getattr(options, each.replace("-", "_")) for each in (name, owner))
-        if given is not None and of is None:
+        given, owner_value = (getattr(options, each.replace("-", "_")) for each in (name, owner))
+        if given is not None and owner_value is None:
             raise UserError(f"--{name} belongs to --{owner}", fix=f"add --{owner}, or leave it out")
 
 

@@ -307,7 +307,7 @@ def coco_data(pictures: Sequence[dict[str, Any]], kinds: Sequence[str], about: d
         for damage in picture["damages"]:
             mask = {"size": [picture["height"], picture["width"]], "counts": damage["run_lengths"]}
             facts = {"area": damage["pixels"], "bbox": damage["bbox"], "segmentation": mask, "iscrowd": 0}
-            of = {"image_id": number, "category_id": numbers[damage["kind"]]}
-            annotations.append({"id": len(annotations) + 1, **of, **facts})
+            ids = {"image_id": number, "category_id": numbers[damage["kind"]]}
+            annotations.append({"id": len(annotations) + 1, **ids, **facts})
     categories = [{"id": number, "name": kind} for kind, number in numbers.items()]
     return {"info": about, "images": images, "annotations": annotations, "categories": categories}

@@ -71,8 +71,8 @@ def main(arguments: argparse.Namespace, command: str) -> int:
         views = in_turn(captures, [each.pose.T_camera_board for each in targets], frames, rate)
         if arguments.format == "tum":
             write_tum(folder, views)
-        for each in () if arguments.format == "tum" else views:
-            write_bag(folder / each.name, each, arguments.format == "mcap")
+        for exported in () if arguments.format == "tum" else views:
+            write_bag(folder / exported.name, exported, arguments.format == "mcap")
         _write_beside(folder, arguments, experiment, targets, views, command)
     swept = [path for path in experiment.config.sweep if path.startswith("source.")]
     if swept:

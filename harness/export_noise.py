@@ -106,15 +106,15 @@ def _stack_m(camera: AnyCamera, level: float, nearest_m: float, farthest_m: floa
 def _before_plane(camera: AnyCamera, level: float, nearest_m: float, farthest_m: float) -> tuple[float, float]:
     """Return the deviation of a pixel's range (NaN if there are hardly any returns) and the share of returns."""
     range_m = _stack_m(camera, level, nearest_m, farthest_m, FRAMES)
-    there = np.isfinite(range_m)
-    often = there.sum(axis=0) > FRAMES // 4
+    valid = np.isfinite(range_m)
+    often = valid.sum(axis=0) > FRAMES // 4
     if not often.any():
-        return float("nan"), float(there.mean())
+        return float("nan"), float(valid.mean())
     # a robust deviation excludes ranges with a wrong period, which are rare and far off
     middle = np.nanmedian(range_m[:, often], axis=0)
     apart = np.abs(range_m[:, often] - middle)
     kept = apart < 8.0 * np.nanmedian(apart) / 0.6745
-    return float(np.sqrt(np.mean(apart[kept] ** 2) * FRAMES / (FRAMES - 1))), float(there.mean())
+    return float(np.sqrt(np.mean(apart[kept] ** 2) * FRAMES / (FRAMES - 1))), float(valid.mean())
 
 
 def _pattern_m(camera: AnyCamera) -> np.ndarray:

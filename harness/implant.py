@@ -114,7 +114,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     made = []
     for placement in placements(scans, family, options.camera, options.targets, options.seed, cache):
         made.append(placement)
-        print(f"damages rendered: {sum(len(one.implants) for one in made)}, wanted: {options.targets}", file=sys.stderr)
+        print(f"damages rendered: {sum(len(p.implants) for p in made)}, wanted: {options.targets}", file=sys.stderr)
     longest = max(len(scan.frames) for scan in scans)
     frames = sorted(set(options.frames or (1, longest)))
     tables, set_ups, warnings = judge_scans(scans, made, family, options.camera, judging, frames)
@@ -124,8 +124,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     recordings = f"{len(scans)} recording{'s' * (len(scans) > 1)} of {longest} frames, {area_m2:.3g} m² judged"
     facts = {
         "implanted": [
-            *_shares(options, recordings, [one.depth_mm for each in made for one in each.implants]),
-            *(f"Note: {note}." for note in dict.fromkeys(note for one in opened for note in one.notes)),
+            *_shares(options, recordings, [implant.depth_mm for implanted in made for implant in implanted.implants]),
+            *(f"Note: {note}." for note in dict.fromkeys(note for recording in opened for note in recording.notes)),
         ],
         "recordings": [str(path) for path in options.paths],
         "camera": options.camera,

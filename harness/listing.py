@@ -195,13 +195,13 @@ def result_folders(out: Path, experiment: str | None = None) -> list[dict[str, A
             continue
         runs = folders_in(parent, DIGEST_NAME)
         settings = {run: _settings(run) for run in runs} if len(runs) > 1 else {}
-        known = [some for some in settings.values() if some]
-        paths = dict.fromkeys(path for some in known for path in some)
-        apart = [path for path in paths if len({canonical_json(some.get(path)) for some in known}) > 1]
+        known = [own for own in settings.values() if own]
+        paths = dict.fromkeys(path for own in known for path in own)
+        apart = [path for path in paths if len({canonical_json(own.get(path)) for own in known}) > 1]
         newest = latest_run(parent)
         for run in runs:
-            some = settings.get(run)
-            differs = {path: some.get(path) for path in apart} if some else {}
+            own = settings.get(run)
+            differs = {path: own.get(path) for path in apart} if own else {}
             found.append(described(run) | {"limits": _limits(run), "differs": differs, "is_latest": run.name == newest})
     return found
 

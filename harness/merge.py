@@ -42,9 +42,9 @@ def main(options: argparse.Namespace, command: str) -> int:
     with locked(into):
         goal = Journal(into / "journal")
         for folder in folders:
-            before, other = counts["copied"], Journal(folder / "journal")
-            different += merge_into(goal, other, counts)
-            damaged += other.damaged
+            before, source = counts["copied"], Journal(folder / "journal")
+            different += merge_into(goal, source, counts)
+            damaged += source.damaged
             print(f"{folder}: {counts['copied'] - before} trials copied")
     print(f"{goal.folder}: {counts['copied']} trials copied, {counts['known']} were already there")
     if damaged:

@@ -122,10 +122,10 @@ def _stated(options: argparse.Namespace) -> PodStatement:
     if of_hits == (options.ahat is not None):
         what = "one of them, not both" if of_hits else "no column states what was found"
         raise UserError(f"--hit and --ahat: {what}", legal=legal, fix="name one column; the program does not guess")
-    other = "--ahat" if of_hits else "--hit"
+    owner = "--ahat" if of_hits else "--hit"
     for name in ("decision", "left", "right", "log_signal") if of_hits else ("link",):
         if getattr(options, name) is not None:
-            raise UserError(f"--{name.replace('_', '-')} belongs to {other}", fix="leave it out")
+            raise UserError(f"--{name.replace('_', '-')} belongs to {owner}", fix="leave it out")
     if not of_hits and options.decision is None:
         legal = "a signal, in the column's unit"
         fix = "add --decision Y; a value for a wanted rate of false calls comes from hole-free runs"

@@ -82,12 +82,12 @@ def main(options: argparse.Namespace, command: str) -> int:
         set_ups=tuple(limit.record for limit in limits),
     )
     write_text(options.out / "study.json", record_text(study))
-    for table, of in ((SCORES, rows), (LIMITS, limits)):
-        write_table(options.out, table, table.frame(of), origin)
+    for table, table_rows in ((SCORES, rows), (LIMITS, limits)):
+        write_table(options.out, table, table.frame(table_rows), origin)
     for limit in limits:
         if limit.statement is not None:
             write_text(options.out / f"{limit.record.variant}.html", pod_html(limit.statement, command))
-    single = [name for name, one in index["categories"].items() if one["units"] == 1]
+    single = [name for name, facts in index["categories"].items() if facts["units"] == 1]
     warned = [f"warning: the limit holds for one unit of the camera only: {', '.join(single)}"] * bool(single)
     show([*warned, LIMITS.grid(limits, terminal=True), "", SCORES.grid(rows, terminal=True)])
     print(f"wrote {options.out}: study.json, limits.csv, scores.csv, a page for each curve")
@@ -167,10 +167,10 @@ def _judged(
 
     def boards(split: str) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray, float]]:
         """Yield the boards of a split: name, scores (NaN if not inspected), places, damage, inspected area."""
-        for each in sorted(name for name in maps if name.startswith(f"{category}/{split}/")):
-            inspected, places, damage = read_arrays(options.dataset, each, *JUDGED_BY)
-            scores, places_m = np.where(inspected, _read(maps[each]), np.nan), places.astype(float)
-            yield each, scores, places_m, damage, float(np.nansum(pixel_areas(places_m)[inspected]))
+        for sample in sorted(name for name in maps if name.startswith(f"{category}/{split}/")):
+            inspected, places, damage = read_arrays(options.dataset, sample, *JUDGED_BY)
+            scores, places_m = np.where(inspected, _read(maps[sample]), np.nan), places.astype(float)
+            yield sample, scores, places_m, damage, float(np.nansum(pixel_areas(places_m)[inspected]))
 
     quiet = [(np.nanmax(scores), area_m2) for _, scores, _, _, area_m2 in boards("validation")]
     highest, areas_m2 = np.array(quiet, float).T
@@ -182,23 +182,23 @@ def _judged(
         truth = read_truth(options.dataset, name)
         damages, board = truth["damages"], truth["board"]
         truths.append([board, damages])
-        lines = [np.array(one["line_m"]) for one in damages]
+        lines = [np.array(flaw["line_m"]) for flaw in damages]
         found = _findings(places_m, scores > threshold)
-        outlines = [np.flatnonzero(damage == one["id"]) for one in damages]
+        outlines = [np.flatnonzero(damage == flaw["id"]) for flaw in damages]
         areas = [] if overlap is None else smeared(outlines, damage.shape)
         ((pairs, parts),) = matched_places(lines, areas, lambda centres_m: centres_m, [found], radius_m, overlap)
         signals = highest_within(places_m, scores, lines, radius_m)
         common: dict[str, Any] = {"board": board, "repeat": 0, "threshold": float(threshold), "scale_mm": np.nan}
         calls = {"false_calls": len(found.scores) - len(pairs) - parts, "no_return_calls": 0, "inspected_m2": area_m2}
         runs.append({**common, "role": "hole_free" if "/good/" in name else "damaged", **calls})
-        for number, one in enumerate(damages):
-            place = {"true_x_mm": one["x_board_mm"], "true_y_mm": one["y_board_mm"], "signal": float(signals[number])}
-            sizes = {f"true_{key}": one[key] for key in ("diameter_mm", "depth_mm")}
-            hit = {"detected": number in pairs, "no_return": False, "size_of": one.get("size_of", "diameter")}
-            holes.append({**common, "hole": str(one["id"]), **sizes, **place, **hit})
-        here = np.isfinite(scores)
-        pixels.append(scores[here])
-        regions.append(np.where(damage[here] > 0, damage[here].astype(int) + (len(truths) << 16), 0))
+        for number, flaw in enumerate(damages):
+            place = {"true_x_mm": flaw["x_board_mm"], "true_y_mm": flaw["y_board_mm"], "signal": float(signals[number])}
+            sizes = {f"true_{key}": flaw[key] for key in ("diameter_mm", "depth_mm")}
+            hit = {"detected": number in pairs, "no_return": False, "size_of": flaw.get("size_of", "diameter")}
+            holes.append({**common, "hole": str(flaw["id"]), **sizes, **place, **hit})
+        scored = np.isfinite(scores)
+        pixels.append(scores[scored])
+        regions.append(np.where(damage[scored] > 0, damage[scored].astype(int) + (len(truths) << 16), 0))
         tops.append((float(np.nanmax(scores)), bool(damages)))
 
     if not holes:
@@ -213,11 +213,11 @@ def _judged(
         targets_digest=digest(truths),
         frames_digest=digest([index["content"], category]),
     )
-    scores, of = np.concatenate(pixels), np.unique(np.concatenate(regions), return_inverse=True)[1]
-    damaged, (top, is_flawed) = (of > 0) * 1.0, np.array(tops, float).T
+    scores, region = np.concatenate(pixels), np.unique(np.concatenate(regions), return_inverse=True)[1]
+    damaged, (top, is_flawed) = (region > 0) * 1.0, np.array(tops, float).T
     return limit_of(record), {
         "category": category,
-        "au_pro": area_under(scores, damaged / np.bincount(of)[of], 1 - damaged, PRO_LIMIT),
+        "au_pro": area_under(scores, damaged / np.bincount(region)[region], 1 - damaged, PRO_LIMIT),
         "pixel_auroc": area_under(scores, damaged, 1 - damaged),
         "board_auroc": area_under(top, is_flawed, 1 - is_flawed),
     }

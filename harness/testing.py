@@ -178,10 +178,9 @@ def orders_findings_by_score(make: Make, cloud: Cloud) -> None:
         require(low > threshold, f"a finding scores {low:g}, no more than the threshold of {threshold:g}")
         require((np.diff(scores) <= 0).all(), f"at a threshold of {threshold:g} the strongest finding is not first")
         for finding in found[:STRONGEST]:
-            gone, there = (look.find(at) for at in (finding.score, float(np.nextafter(finding.score, 0.0))))
+            gone, kept = (look.find(at) for at in (finding.score, float(np.nextafter(finding.score, 0.0))))
             require(
-                not np.isin(finding.pixels, _pixels_of(gone)).any()
-                and np.isin(finding.pixels, _pixels_of(there)).any(),
+                not np.isin(finding.pixels, _pixels_of(gone)).any() and np.isin(finding.pixels, _pixels_of(kept)).any(),
                 f"a finding scores {finding.score:g}, but that is not the threshold at which it vanishes",
             )
 
@@ -264,7 +263,7 @@ def learns_plain_arrays(make: Make, cloud: Cloud) -> None:
     if not isinstance(detector, Calibratable):
         return
     before, clouds = Look.at(make(), cloud).everything(), [plane(seed=seed, damage=()) for seed in range(8)]
-    learned, again = (dict(detector.calibrate([_with_arrays(one, _read_only) for one in clouds])) for _ in range(2))
+    learned, again = (dict(detector.calibrate([_with_arrays(clean, _read_only) for clean in clouds])) for _ in range(2))
     require(_same(learned, again), "the same clouds gave another learned state the second time")
     file = io.BytesIO()
     np.savez(file, **learned)  # type: ignore[arg-type]

@@ -64,9 +64,9 @@ def between_views(
     ``other`` (lens, registration) explain; and the direction ``looks_px`` (k, h, w, 2), in pixels, in which each view
     sees each cell. ``repeated``: the sensor's variances come from repeated frames. All zero with too little overlap."""
     several = np.flatnonzero(np.isfinite(heights).sum(axis=0).ravel() >= 2)
-    some = several[:: max(1, len(several) // CELLS)]
+    chosen = several[:: max(1, len(several) // CELLS)]
     values = (heights, sensor, other, looks_px)
-    flat, sensor, other, looks = (v.reshape(len(v), -1, *v.shape[3:])[:, some] for v in values)
+    flat, sensor, other, looks = (v.reshape(len(v), -1, *v.shape[3:])[:, chosen] for v in values)
     i, j = np.triu_indices(len(heights), 1)
     both = np.isfinite(flat[i] - flat[j])
     if both.sum() < PER_CLASS:
@@ -143,8 +143,8 @@ def combine(
             apart = np.linalg.norm(looks_px[i] - looks_px[j], axis=-1) / between.length_px
             shared += 2.0 * between.pattern_m2 * shares[i] * shares[j] * np.exp(-(apart**between.exponent))
     height, alone, by_frames = (
-        np.where(known, np.where(used, each, 0.0).sum(axis=0), np.nan)
-        for each in (shares * heights, squares * own, squares * temporal)
+        np.where(known, np.where(used, values, 0.0).sum(axis=0), np.nan)
+        for values in (shares * heights, squares * own, squares * temporal)
     )
     return SurfaceMap(cell_m, height, alone + shared, by_frames, used, shares, int(rejected.sum()), between)
 
@@ -326,10 +326,10 @@ def depth_noise(cloud: Cloud, inside: np.ndarray, deviation_m: np.ndarray) -> tu
         samples, freedom = deviation_m[used] ** 2 * cloud.count[used], np.ones(int(used.sum()))
     slope, constant, typical = 0.0, LEAST_M2, 1.0
     if used.any():
-        some = slice(None, None, max(1, len(samples) // SAMPLED))
-        numbers, where = np.unique(freedom[some], return_inverse=True)
-        samples = samples[some] / (2.0 * gammaincinv(numbers / 2.0, 0.5) / numbers)[where]
-        x = q[used][some]
+        thinned = slice(None, None, max(1, len(samples) // SAMPLED))
+        numbers, where = np.unique(freedom[thinned], return_inverse=True)
+        samples = samples[thinned] / (2.0 * gammaincinv(numbers / 2.0, 0.5) / numbers)[where]
+        x = q[used][thinned]
         # medians of classes of q make the fit robust against damage in the view
         parts = np.array_split(np.argsort(x, kind="stable"), max(1, min(BINS, len(x) // PER_BIN)))
         typical = float(np.median(x))

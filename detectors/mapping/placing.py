@@ -90,7 +90,7 @@ def _of_grid(valid: np.ndarray) -> np.ndarray:
     has_a, has_b, has_c, has_d = (valid.ravel()[corner] for corner in (a, b, c, d))
     inner, outer = has_b & has_c, has_a & has_d & ~(has_b & has_c)
     kinds = [(inner & has_a, a, b, c), (inner & has_d, b, c, d), (outer & has_b, a, b, d), (outer & has_c, a, c, d)]
-    return np.concatenate([np.stack(corners, axis=1)[some] for some, *corners in kinds])
+    return np.concatenate([np.stack(corners, axis=1)[used] for used, *corners in kinds])
 
 
 def _of_points(places: np.ndarray, valid: np.ndarray) -> np.ndarray:

@@ -276,8 +276,8 @@ def _is_deep(array: np.ndarray) -> bool:
 def _apart(first: np.ndarray, second: np.ndarray) -> float:
     """Return the median relative difference where both have a number; infinity if there is none."""
     both = (first > 0) & (second > 0)
-    one, other = (plane[both].astype(np.float64) for plane in (first, second))
-    return float(np.median(np.abs(one - other) / one)) if both.any() else float("inf")
+    before, after = (plane[both].astype(np.float64) for plane in (first, second))
+    return float(np.median(np.abs(before - after) / before)) if both.any() else float("inf")
 
 
 def _named_array(name: str, arrays: Arrays, usual: Sequence[str], given: str | None) -> tuple[str, np.ndarray]:

@@ -240,11 +240,11 @@ def _chosen_topic(bag: Bag, given: Given) -> tuple[str, str]:
     usual = [topic for topic in clouds if topic.removeprefix("/") == USUAL_TOPIC] or clouds
     has_lens = bool(given.intrinsics or given.lens)
     if len(images) == 1 and (not clouds or has_lens or _infos_of(bag, images[0])):
-        others = f", with their lens, not the clouds on {', '.join(clouds)}; --topic chooses"
-        return images[0], f"the depth images on {images[0]} are read{others}" if clouds else ""
+        also = f", with their lens, not the clouds on {', '.join(clouds)}; --topic chooses"
+        return images[0], f"the depth images on {images[0]} are read{also}" if clouds else ""
     if len(usual) == 1:
-        others = f"; depth images: {', '.join(images)}; --topic chooses"
-        return usual[0], f"the clouds on {usual[0]} are read{others}" if images else ""
+        also = f"; depth images: {', '.join(images)}; --topic chooses"
+        return usual[0], f"the clouds on {usual[0]} are read{also}" if images else ""
     if not both:
         fix = "record the camera's depth with its lens: ros2 bag record /depth/image_raw /depth/camera_info"
         raise UserError(f"{path}: no topic with {CLOUD_TYPE} or depth images; its topics: {held}", legal=kinds, fix=fix)

@@ -223,8 +223,8 @@ def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int,
             return Unit(scale_m, usual)
     else:
         usual = f"the data: with {usual}, {1e3 * usual_m:g} mm, the median distance would be {median * usual_m:.4g} m"
-    others = f"; others are possible: {', '.join(shown[1:])}" if len(shown) > 1 else ""
-    taken = f"{1e3 * scale_m:.4g} mm is taken, which puts the median at {median * scale_m:.3g} m{others}"
+    also = f"; others are possible: {', '.join(shown[1:])}" if len(shown) > 1 else ""
+    taken = f"{1e3 * scale_m:.4g} mm is taken, which puts the median at {median * scale_m:.3g} m{also}"
     warning = f"nothing states the depth unit; {taken}; state it with --unit {best}"
     return Unit(scale_m, usual, warning)
 
@@ -279,5 +279,5 @@ def ray_lengths_doubt(z_m: np.ndarray, slopes: np.ndarray) -> str:
 def _bend(image: np.ndarray) -> float:
     far = [(each, max(len(each) // 8, 1)) for each in (image, image.T)]
     bends = [each[2 * n :] - 2 * each[n:-n] + each[: -2 * n] for each, n in far]
-    some = np.abs(np.concatenate([each[np.isfinite(each)] for each in bends]))
-    return float(np.median(some)) if some.size else math.nan
+    sizes = np.abs(np.concatenate([each[np.isfinite(each)] for each in bends]))
+    return float(np.median(sizes)) if sizes.size else math.nan

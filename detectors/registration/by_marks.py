@@ -41,18 +41,18 @@ def register_by_marks(reference: PreparedView, view: PreparedView) -> registered
     ``failure`` reports too few marks, marks on a line, and marks that fit nowhere, badly or in several ways; the
     transform is then the best known, or else the guess, or else the identity."""
     guess = registered.guess_of(reference, view)
-    ours, theirs, problem, notes = _matched(reference, view)
-    if len(ours) < 3:
+    fixed, moved, problem, notes = _matched(reference, view)
+    if len(fixed) < 3:
         return registered.failed(view, "marks", guess, problem, *notes)
-    problem = problem or off_line_problem(ours) or off_line_problem(theirs)
+    problem = problem or off_line_problem(fixed) or off_line_problem(moved)
     try:
-        placement = _placed(ours, theirs, 0.0)
+        placement = _placed(fixed, moved, 0.0)
     except np.linalg.LinAlgError:
         return registered.failed(view, "marks", guess, problem or "the matched marks do not determine the rotation")
-    freedom = 3 * len(ours) - 6
+    freedom = 3 * len(fixed) - 6
     residual = float(np.sqrt((placement.residuals_m**2).sum(axis=1).mean()))
-    if not problem and gammaincc(freedom / 2, _placed(ours, theirs, SHARED_M).chi2 / 2) < REFUSE_BELOW:
-        problem = f"the marks do not fit: {residual / MM:.1f} mm remain over {len(ours)} marks, more than noise and"
+    if not problem and gammaincc(freedom / 2, _placed(fixed, moved, SHARED_M).chi2 / 2) < REFUSE_BELOW:
+        problem = f"the marks do not fit: {residual / MM:.1f} mm remain over {len(fixed)} marks, more than noise and"
         problem += f" {SHARED_M / MM:.0f} mm of each view's own error explain; the targets differ, or a mark moved"
     covariance = placement.covariance
     if gammaincc(freedom / 2, placement.chi2 / 2) < WIDEN_BELOW:
@@ -61,22 +61,22 @@ def register_by_marks(reference: PreparedView, view: PreparedView) -> registered
         notes += (f"the marks disagree by {ratio:.1f} times their noise; the covariance is widened to match",)
     where = placement.T_to_from, covariance, placement.centre_m
     found = registered.Registration(view.view.name, "marks", *where, residual, failure=problem, notes=notes)
-    return replace(found, pairs=len(ours), iterations=placement.iterations, converged=placement.converged)
+    return replace(found, pairs=len(fixed), iterations=placement.iterations, converged=placement.converged)
 
 
 def held_out_error_m(reference: PreparedView, view: PreparedView) -> float | None:
     """Return the root mean square distance (m) of each matched mark from its place by a registration with the others;
     None if fewer than four marks match, or if leaving one out leaves the rest on a line."""
-    ours, theirs, problem, _ = _matched(reference, view)
-    if problem or len(ours) < 4:
+    fixed, moved, problem, _ = _matched(reference, view)
+    if problem or len(fixed) < 4:
         return None
     squares = []
-    for i, (our, their) in enumerate(zip(ours, theirs, strict=True)):
-        rest = ours[:i] + ours[i + 1 :]
+    for i, (fixed_mark, moved_mark) in enumerate(zip(fixed, moved, strict=True)):
+        rest = fixed[:i] + fixed[i + 1 :]
         if off_line_problem(rest):
             return None
-        T_reference_view = _placed(rest, theirs[:i] + theirs[i + 1 :], 0.0).T_to_from
-        squares.append(np.sum((transform_points(T_reference_view, their.centre_m) - our.centre_m) ** 2))
+        T_reference_view = _placed(rest, moved[:i] + moved[i + 1 :], 0.0).T_to_from
+        squares.append(np.sum((transform_points(T_reference_view, moved_mark.centre_m) - fixed_mark.centre_m) ** 2))
     return float(np.sqrt(np.mean(squares)))
 
 
@@ -87,18 +87,18 @@ def _matched(
     problem = "; ".join(f"{each.view.name}: {each.marks.problem}" for each in (reference, view) if each.marks.problem)
     if problem:
         return (), (), problem, ()
-    ours, theirs = reference.marks.trusted, view.marks.trusted
-    pairing = pair_marks(ours, theirs, registered.guess_of(reference, view))
+    fixed, moved = reference.marks.trusted, view.marks.trusted
+    pairing = pair_marks(fixed, moved, registered.guess_of(reference, view))
     i, j = pairing.pairs.T
-    return tuple(ours[k] for k in i), tuple(theirs[k] for k in j), pairing.problem, pairing.notes
+    return tuple(fixed[k] for k in i), tuple(moved[k] for k in j), pairing.problem, pairing.notes
 
 
-def _placed(ours: Sequence[Mark], theirs: Sequence[Mark], shared_m: float) -> Placement:
+def _placed(fixed: Sequence[Mark], moved: Sequence[Mark], shared_m: float) -> Placement:
     """Place the view's marks on the reference's, with ``shared_m`` added to the error of each axis of each mark."""
     extra = shared_m**2 * np.eye(3)
-    our_places, their_places = (np.stack([mark.centre_m for mark in marks]) for marks in (ours, theirs))
-    our_spread, their_spread = (np.stack([mark.covariance_m2 for mark in marks]) for marks in (ours, theirs))
-    return place(their_places, their_spread + extra, our_places, our_spread + extra)
+    fixed_m, moved_m = (np.stack([mark.centre_m for mark in marks]) for marks in (fixed, moved))
+    fixed_spread, moved_spread = (np.stack([mark.covariance_m2 for mark in marks]) for marks in (fixed, moved))
+    return place(moved_m, moved_spread + extra, fixed_m, fixed_spread + extra)
 
 
 MAX_STEPS = 40
@@ -181,14 +181,14 @@ class JointState:
             matrix[np.ix_(columns, columns)] += rows.T @ weighted
             right[columns] -= weighted.T @ residual
 
-        for v, each in enumerate(data):
+        for v, view in enumerate(data):
             # the first view's pose is not an unknown
             pose, moves = (poses[v - 1], 6) if v else (np.empty(0, dtype=int), 0)
-            residual, basis, by_pose, weight = self.across(each, v)
+            residual, basis, by_pose, weight = self.across(view, v)
             rows = np.concatenate([-basis, -basis, by_pose[:, :moves]], axis=1)
             add(np.concatenate([surface, own[v], pose]), rows, residual, weight)
             turn = self.T[v][:2, :3]
-            for mark, label in each.marks:
+            for mark, label in view.marks:
                 place = transform_points(self.T[v], mark.centre_m)
                 within = registered.displacement_jacobian(place[None], np.zeros(3))[0, :2, :moves]
                 rows = np.concatenate([-np.eye(2), within], axis=1)
@@ -205,8 +205,8 @@ def register_jointly(views: Sequence[PreparedView]) -> list[registered.Registrat
     usable = [i for i, each in enumerate(found) if not each.failure]
     if usable:
         adjusted = _adjust([views[0], *(views[i + 1] for i in usable)], [found[i] for i in usable])
-        for i, each in zip(usable, adjusted, strict=True):
-            found[i] = each
+        for i, registration in zip(usable, adjusted, strict=True):
+            found[i] = registration
     return [replace(each, method="joint") for each in found]
 
 
@@ -252,8 +252,8 @@ def _adjust(views: Sequence[PreparedView], marked: Sequence[registered.Registrat
         pose = slice(6 * (v - 1), 6 * v)
         spread = both @ covariance[pose, pose] @ both.T
         where = T_reference_surface @ state.T[v], spread, T_reference_surface[:3, 3]
-        each = registered.Registration(found.view, found.method, *where, residual_m, pairs=len(data[v].marks))
-        adjusted.append(replace(each, iterations=steps, converged=converged, failure=lost, notes=(*found.notes, note)))
+        joint = registered.Registration(found.view, found.method, *where, residual_m, pairs=len(data[v].marks))
+        adjusted.append(replace(joint, iterations=steps, converged=converged, failure=lost, notes=(*found.notes, note)))
     return adjusted
 
 
@@ -261,7 +261,7 @@ def _view_data(view: PreparedView, reference: PreparedView) -> ViewData:
     points = registered.thinned(view.points_m)
     noise = max(registered.sampling_of(view).noise_m, 1e-9)
     inflation = max(len(points) / registered.independent(int(view.inside.sum())), 1.0)
-    ours, theirs = (reference.marks.trusted,) * 2 if view is reference else _matched(reference, view)[:2]
+    fixed, moved = (reference.marks.trusted,) * 2 if view is reference else _matched(reference, view)[:2]
     label = {id(mark): number for number, mark in enumerate(reference.marks.trusted)}
-    marks = tuple((their, label[id(our)]) for our, their in zip(ours, theirs, strict=True))
+    marks = tuple((moved_mark, label[id(fixed_mark)]) for fixed_mark, moved_mark in zip(fixed, moved, strict=True))
     return ViewData(points, marks, noise, noise * float(np.sqrt(inflation)))

@@ -60,11 +60,11 @@ class Agreement:
 
 
 def _agreement(
-    reference: PreparedView, ours: registered.Sampling, view: PreparedView, T_reference_view: np.ndarray
+    reference: PreparedView, sampling: registered.Sampling, view: PreparedView, T_reference_view: np.ndarray
 ) -> Agreement:
     """Return the agreement of a view placed by ``T_reference_view`` with the reference's target, sampled as ours."""
-    theirs, points, marks = registered.sampling_of(view), reference.points_m, reference.mark_points_m
-    pitch, noise = max(ours.pitch_m, theirs.pitch_m), float(np.hypot(ours.noise_m, theirs.noise_m))
+    of_view, points, marks = registered.sampling_of(view), reference.points_m, reference.mark_points_m
+    pitch, noise = max(sampling.pitch_m, of_view.pitch_m), float(np.hypot(sampling.noise_m, of_view.noise_m))
     beside, together, apart, marks_m = np.zeros(1, bool), np.zeros(1, bool), float("nan"), float("nan")
     fiducial = transform_points(T_reference_view, view.mark_points_m)
     if len(points) >= 3 and view.inside.any():
@@ -96,8 +96,8 @@ def judge(
     if not is_rigid or np.linalg.det(T[:3, :3]) < 0:
         broken = "mirrored: the transform is a reflection, not a rotation" if is_rigid else "no transform was found"
         return replace(registration, overlap=0.0, failure=registration.failure or broken)
-    ours, points = registered.sampling_of(reference), registered.thinned(reference.points_m, 200)
-    agreement = _agreement(reference, ours, view, T)
+    sampling, points = registered.sampling_of(reference), registered.thinned(reference.points_m, 200)
+    agreement = _agreement(reference, sampling, view, T)
     judged = replace(registration, overlap=agreement.overlap)
     if judged.failure:
         return judged
@@ -108,8 +108,8 @@ def judge(
         elsewhere = _jump(judged, reference, view)
     if elsewhere:
         return replace(judged, failure=elsewhere)
-    within, across = registered.predicted_error_m(judged, points, ours.normal)
-    error_m, limit_m = float(np.hypot(within, across)), max(UNDETERMINED_PITCHES * ours.pitch_m, BLUR_M)
+    within, across = registered.predicted_error_m(judged, points, sampling.normal)
+    error_m, limit_m = float(np.hypot(within, across)), max(UNDETERMINED_PITCHES * sampling.pitch_m, BLUR_M)
     undetermined, apart = "", _apart(agreement)
     if error_m > limit_m:
         undetermined = "not determined: the points let the target slide or rotate (they lie on a line, or the surface"
@@ -120,7 +120,7 @@ def judge(
     if judged.method in UNJUDGED_AGREEMENT:
         return replace(judged, failure=undetermined, notes=(*judged.notes, *([apart] if apart else [])))
     failure = "; ".join(reason for reason in (undetermined, apart) if reason)
-    return replace(judged, failure=failure) if failure else _widened(judged, ours.normal, within, across, agreement)
+    return replace(judged, failure=failure) if failure else _widened(judged, sampling.normal, within, across, agreement)
 
 
 def _jump(registration: registered.Registration, reference: PreparedView, view: PreparedView) -> str:

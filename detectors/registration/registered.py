@@ -57,8 +57,8 @@ def failed(view: PreparedView, method: str, T_guess: np.ndarray | None, failure:
 
 def guess_of(reference: PreparedView, view: PreparedView) -> np.ndarray | None:
     """Return ``T_reference_view`` (4, 4) from both guesses; the reference need not be the first view."""
-    ours, theirs = reference.view.T_reference_view_guess, view.view.T_reference_view_guess
-    return None if ours is None or theirs is None else invert(ours) @ theirs
+    reference_guess, view_guess = reference.view.T_reference_view_guess, view.view.T_reference_view_guess
+    return None if reference_guess is None or view_guess is None else invert(reference_guess) @ view_guess
 
 
 def displacement_jacobian(points_m: np.ndarray, centre_m: np.ndarray) -> np.ndarray:

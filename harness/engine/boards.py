@@ -68,9 +68,9 @@ class Sample:
 def categories_of(experiment: Experiment) -> dict[str, Point]:
     """Return the points whose clouds differ, by names formed from the axes of source and capture."""
     points: dict[str, Point] = {}
-    for each in experiment.points:
-        if not each.is_variation:
-            points.setdefault(canonical_json([each.frames_key, each.config.capture.to_data()]), each)
+    for point in experiment.points:
+        if not point.is_variation:
+            points.setdefault(canonical_json([point.frames_key, point.config.capture.to_data()]), point)
     axes = [path for path in experiment.config.sweep if path.startswith(("source.", "capture."))]
     values = {path: [point.values[path] for point in points.values()] for path in axes}
     axes = [path for path in axes if any(value != values[path][0] for value in values[path])]
@@ -132,8 +132,8 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
         return on_window(values, cloud.region, window, outside)
 
     damage = np.zeros(cloud.region.shape, np.uint16)
-    for each in truth:
-        damage.ravel()[known.outlines[each.id]] = each.id
+    for flaw in truth:
+        damage.ravel()[known.outlines[flaw.id]] = flaw.id
     intensity = np.zeros(damage.shape) if cloud.amplitude is None else np.nan_to_num(cloud.amplitude)
     arrays = {
         "points_m": put(cloud.points_m.astype(np.float32), np.nan),
@@ -167,13 +167,13 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
     for path, content in files.items():
         write_bytes(path, content, durable=False)
     camera, damages = sample.task.set_ups[0].camera, []
-    for each in truth:
+    for flaw in truth:
         own = np.zeros(damage.shape, bool)
-        own.ravel()[known.outlines[each.id]] = True
+        own.ravel()[known.outlines[flaw.id]] = True
         rows, columns = np.nonzero(own := put(own, False))
         box = [int(n) for n in (columns.min(), rows.min(), np.ptp(columns) + 1, np.ptp(rows) + 1)]
-        facts = {"pixels": len(rows), "bbox": box, "run_lengths": run_lengths(own), "line_m": each.line_m.tolist()}
-        damages.append({**each.to_row(), "seen_depth_mm": known.seen_depth_m[each.id] / MM, **facts})
+        facts = {"pixels": len(rows), "bbox": box, "run_lengths": run_lengths(own), "line_m": flaw.line_m.tolist()}
+        damages.append({**flaw.to_row(), "seen_depth_mm": known.seen_depth_m[flaw.id] / MM, **facts})
     facts_of_board = {
         "file_name": f"{sample.category}/{sample.split}/{sample.label}/rgb/{file}.png",
         "height": window.shape[0],

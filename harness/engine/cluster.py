@@ -128,8 +128,8 @@ class ClusterEngine:
 
     def room(self, stage: Stage) -> int:
         """Return the room for enough jobs to keep all nodes busy, with the next bundles ready."""
-        each = 1 if stage == "renders" else WITH_NODE * self._bundle_size() + 1
-        return max(1, each * sum(node.facts.processes for node in self._nodes.values())) + 1 - self._out[stage]
+        per_process = 1 if stage == "renders" else WITH_NODE * self._bundle_size() + 1
+        return max(1, per_process * sum(node.facts.processes for node in self._nodes.values())) + 1 - self._out[stage]
 
     def submit(self, job: Job) -> None:
         """Take a job."""
@@ -205,17 +205,17 @@ class ClusterEngine:
 
     def _look_for_nodes(self) -> None:
         """Ask new nodes to describe themselves, give up those that are gone. Raises UserError without a scheduler."""
-        there = None
+        present = None
         if self._client.status == "running":
             with contextlib.suppress(OSError):
-                there = set(self._client.scheduler_info(n_workers=-1)["workers"])
-        if there is None:
+                present = set(self._client.scheduler_info(n_workers=-1)["workers"])
+        if present is None:
             fix = "start it again; finished trials are kept, and the same command continues"
             raise UserError(f"the scheduler at {self._scheduler} is gone", fix=fix)
-        for address in there - self._asked:
+        for address in present - self._asked:
             self._asked.add(address)
             self._call(address, None, examine, self._code, str(self._probe))
-        for address in self._asked - there:
+        for address in self._asked - present:
             self._asked.discard(address)
             self._refused.pop(address, None)
             self._gone(address)

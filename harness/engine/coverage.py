@@ -82,8 +82,8 @@ def survey(experiment: Experiment, poses: Sequence[Pose], cache: Path, folder: P
                 raise UserError(f"{point.label or point.variant} has no threshold: {why}")
             task = point_task(point, outcome.thresholds[point.digest], group.learned.get(point.digest))
             boards = _each(_board_seen, zip(group.then, wholes, strict=True), (task, group.seed), engine)
-            some = _inspections([each for each in boards if each is not None], point, scores)
-            found = findable(some, outcome.thresholds[point.digest])
+            inspections = _inspections([each for each in boards if each is not None], point, scores)
+            found = findable(inspections, outcome.thresholds[point.digest])
             blind = np.full(len(patches.areas_m2), np.inf)
             seen = _each(_part_seen, ((view,) for view in views), (task, group.seed, patches), engine)
             seen = [Seen(blind, np.ones(len(blind)), np.ones(len(blind))) if each is None else each for each in seen]
@@ -152,7 +152,7 @@ def _each(
     act: Callable[..., Any], asked: Iterable[tuple[Batch, ...]], further: tuple[Any, ...], engine: JobEngine
 ) -> list[Any]:
     """Return the values of a function of batches, None if the detector cannot judge any board. A bug is raised."""
-    jobs = [Job(str(n), "trials", act, (*some, *further)) for n, some in enumerate(asked)]
+    jobs = [Job(str(n), "trials", act, (*batches, *further)) for n, batches in enumerate(asked)]
     ends = {job.name: ended for job, ended in carried_out(jobs, engine)}
     if bug := next((end.why for end in ends.values() if end.is_bug), None):
         raise RuntimeError(bug)
@@ -171,10 +171,10 @@ def _inspections(
             facts += [(own, *sizes_mm, *seen, score) for score in scores.get(place, ())]
     if not facts:
         raise UserError(f"{point.label or point.variant}: no damaged board was judged", fix="check the detector's crop")
-    of, plan_mm, depth_mm, *seen, score = np.array(facts).T
+    numbers, plan_mm, depth_mm, *seen, score = np.array(facts).T
     size_of = boards[0][1][0][0].size_of
     word, size_mm = ("depth", depth_mm) if np.ptp(plan_mm) < SAME_MM < np.ptp(depth_mm) else (size_of, plan_mm)
-    return ScoredDamage(word, of, size_mm, Seen(*seen), score)
+    return ScoredDamage(word, numbers, size_mm, Seen(*seen), score)
 
 
 def _unit_m(batch: Batch, point: PointTask, seed: int) -> np.ndarray:
@@ -210,16 +210,16 @@ def _part_seen(view: Batch, point: PointTask, seed: int, patches: Patches) -> Se
     """Return the view and the noise of the patches of an undamaged part."""
     set_up = load_set_up(view.set_ups[0])
     deviation_m = _unit_m(view, point, seed)
-    there = transform_points(set_up.T_camera_board, patches.points_m)
-    range_m = np.linalg.norm(there, axis=1)
-    cosine = -(rotate_vectors(set_up.T_camera_board, patches.normals) * there).sum(axis=1) / range_m
+    points_m = transform_points(set_up.T_camera_board, patches.points_m)
+    range_m = np.linalg.norm(points_m, axis=1)
+    cosine = -(rotate_vectors(set_up.T_camera_board, patches.normals) * points_m).sum(axis=1) / range_m
     region, camera = set_up.unit.region, set_up.unit.camera
     lens = camera.nominal_lens
-    u, v = np.rint(lens.project(there)).astype(int).T - [[region.col0], [region.row0]]
-    seen = camera.images(there) & (cosine > 0) & (u >= 0) & (v >= 0) & (u < region.shape[1]) & (v < region.shape[0])
+    u, v = np.rint(lens.project(points_m)).astype(int).T - [[region.col0], [region.row0]]
+    seen = camera.images(points_m) & (cosine > 0) & (u >= 0) & (v >= 0) & (u < region.shape[1]) & (v < region.shape[0])
     u, v = np.where(seen, u, 0), np.where(seen, v, 0)
     # an object in front of a patch has another z
     slope = np.sqrt(1 / np.clip(cosine, 0.05, 1) ** 2 - 1)
     reach_m = np.maximum(ON_FACE_M, 2 * slope * range_m / min(lens.fx, lens.fy))
-    seen &= np.abs(set_up.seen_z_m[v, u] - there[:, 2]) < reach_m
+    seen &= np.abs(set_up.seen_z_m[v, u] - points_m[:, 2]) < reach_m
     return Seen(np.where(seen, deviation_m[v, u], np.inf), np.clip(cosine, 1e-3, 1.0), range_m)

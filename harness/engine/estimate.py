@@ -83,7 +83,7 @@ def dry_run(experiment: Experiment, out: Path, options: EngineOptions) -> int:
         return 0
     plan = plan_of(experiment, Path(out) / ".cache" / "renders")
     first, then = parts_of(plan, options.shard)
-    parts = [part for some in (*first, *then) for part in some]
+    parts = [part for group in (*first, *then) for part in group]
     renders = {path for part in parts for path in part.batch.paths}
     trials, held = sum(len(part.repeats) for part in parts), len(Journal(folder / "journal"))
     print(f"{name}: valid" + ("" if options.shard.is_whole else f"; shard {options.shard}"))

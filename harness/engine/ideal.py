@@ -118,8 +118,8 @@ def _noise_m(
 def _deviation_m(noise_m: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Return the root mean square (h, w) of the noise over units and a square around each pixel, or the nearest one."""
     square, count = (ndimage.uniform_filter(image.sum(axis=0), SMOOTHED_PX) for image in (noise_m**2, known * 1.0))
-    there = count > 0.5 * len(noise_m) / SMOOTHED_PX
-    nearest = ndimage.distance_transform_edt(~there, return_distances=False, return_indices=True)
+    enough = count > 0.5 * len(noise_m) / SMOOTHED_PX
+    nearest = ndimage.distance_transform_edt(~enough, return_distances=False, return_indices=True)
     return np.asarray(np.sqrt(square[tuple(nearest)] / count[tuple(nearest)]))
 
 

@@ -263,14 +263,14 @@ def judge_scans(
             _add(rows, judging, known, threshold, {"frames": count, "board": placement.number, "role": "damaged"})
             print(f"frames averaged {count}: placement {at + 1} of {len(made)}", file=sys.stderr)
     tables = ResultTables(
-        **{name: pd.DataFrame(columns_of(some, {}) if some else {}) for name, some in rows.items()},
+        **{name: pd.DataFrame(columns_of(lines, {}) if lines else {}) for name, lines in rows.items()},
         probes=pd.DataFrame(), variants=pd.DataFrame(), noise=pd.DataFrame(), axes=pd.DataFrame(),
     )  # fmt: skip
     detector = detector_of(judging.detector, judging.settings_json)
     camera_data = camera_of(unit_config(camera, scans[0].lens)[0]).to_data()
     set_ups, files = [], [str(path) for scan in scans for path in scan.recording.files]
     for count in frames:
-        holes, runs = (of[of["frames"] == count] for of in (tables.holes, tables.runs))
+        holes, runs = (table[table["frames"] == count] for table in (tables.holes, tables.runs))
         set_ups.append(
             set_up_of(
                 holes,
@@ -294,5 +294,5 @@ def _add(rows: Rows, judging: Judging, known: KnownCloud, threshold: float, name
     found = study_rows(known, judged, radius_m, hole_free=hole_free)
     for run in found["runs"]:
         run["seconds_detect"] = time.perf_counter() - began
-    for name, some in found.items():
-        rows[name] += [{"variant": VARIANT, "repeat": 0, **named, **row} for row in some]
+    for name, added in found.items():
+        rows[name] += [{"variant": VARIANT, "repeat": 0, **named, **row} for row in added]

@@ -88,7 +88,7 @@ def judge(
     wanted = {*pairs.values(), largest} - {-1}
     measured = {number: detector.measure(cloud, evidence, detections[number]) for number in wanted}
     found = [measured.get(pairs.get(i, -1)) for i in range(len(known.truth))]
-    holes = [_hole_row(known, evidence, *of, measured.get(largest)) for of in zip(known.truth, found, strict=True)]
+    holes = [_hole_row(known, evidence, *pair, measured.get(largest)) for pair in zip(known.truth, found, strict=True)]
     holes = [{**row, "threshold": threshold} for row in holes]
     return JudgedCloud(run, holes, detector, evidence, detections, places_m, pairs, overlap)
 
@@ -254,8 +254,8 @@ def study_rows(known: KnownCloud, judged: JudgedCloud, radius_m: float, *, hole_
     tables: Rows = {"runs": [run], "holes": [], "sites": [], "findings": [], "operating": [operating], "pixels": []}
     for number, (detection, place) in enumerate(zip(judged.detections, judged.places_m, strict=True)):
         x_mm, y_mm = float(place[0]) / MM, float(place[1]) / MM
-        of = {"score": float(detection.score), "hole": counts_for.get(number, "")}
-        tables["findings"].append({"x_mm": x_mm, "y_mm": y_mm, **of})
+        facts = {"score": float(detection.score), "hole": counts_for.get(number, "")}
+        tables["findings"].append({"x_mm": x_mm, "y_mm": y_mm, **facts})
     if hole_free:  # the places where the damage was left out
         for i, (damage, signal) in enumerate(zip(known.truth, signals, strict=True)):
             tables["sites"].append(_place(damage) | {"detected": i in judged.pairs, "signal": signal})
@@ -266,9 +266,9 @@ def study_rows(known: KnownCloud, judged: JudgedCloud, radius_m: float, *, hole_
     thresholds, flat = grid(threshold, PIXEL_OCTAVES), score.ravel()
     parts = [(str(damage.id), known.outlines[damage.id]) for damage in known.truth]
     for name, pixels in (*parts, ("", np.flatnonzero(known.undamaged.ravel()))):
-        there = np.sort(flat[pixels][np.isfinite(flat[pixels])])
-        above = (len(there) - np.searchsorted(there, thresholds, side="right")).tolist()
-        tables["pixels"].append({"hole": name, "pixels": len(there), "threshold": thresholds.tolist(), "above": above})
+        valid = np.sort(flat[pixels][np.isfinite(flat[pixels])])
+        above = (len(valid) - np.searchsorted(valid, thresholds, side="right")).tolist()
+        tables["pixels"].append({"hole": name, "pixels": len(valid), "threshold": thresholds.tolist(), "above": above})
     return tables
 
 

@@ -187,13 +187,13 @@ class _Worker(threading.Thread):
     def _start(self) -> None:
         """Start a process that can take jobs. Raises UserError if it runs other sources or no process can start."""
         engine = self._engine
-        self._pipe, theirs = PROCESSES.Pipe()
-        arguments = (theirs, self._label, self.stage, str(self._trace), engine.code.get(self.stage), dict(os.environ))
+        self._pipe, child = PROCESSES.Pipe()
+        arguments = (child, self._label, self.stage, str(self._trace), engine.code.get(self.stage), dict(os.environ))
         process = PROCESSES.Process(target=serve, args=arguments, daemon=True)
         with _starting(), contextlib.suppress(OSError, EOFError):  # the server process has died
             process.start()
             self._process = process
-        theirs.close()
+        child.close()
         if engine.is_over:
             self.strike()
         digest = self._answer(START_S)
@@ -278,8 +278,8 @@ def _starting() -> Iterator[None]:
     """Start processes that ignore Ctrl-C, even from a dask worker, which is a daemon. The server process finds modules
     where this process does, not first in the folder in which it starts."""
     config: dict[str, Any] = multiprocessing.current_process()._config  # type: ignore[attr-defined]
-    here = multiprocessing.process.ORIGINAL_DIR  # type: ignore[attr-defined]
-    own = os.pathsep.join(path or here for path in sys.path)
+    started_in = multiprocessing.process.ORIGINAL_DIR  # type: ignore[attr-defined]
+    own = os.pathsep.join(path or started_in for path in sys.path)
     paths = {"PYTHONPATH": own, "PYTHONSAFEPATH": "1"}
     with _STARTING, _environment(ONE_THREAD | paths):
         daemon, config["daemon"] = config.get("daemon"), False

@@ -82,7 +82,7 @@ class Calibration:
             if all(isclose(thresholds[name], own[name], rel_tol=AGREES) for name in own):
                 stored.append({name: float(value) for name, value in thresholds.items()})
         mine = [dict(own)] if dict(own) in stored or not stored else []
-        return mine + [other for other in stored if other not in mine]
+        return mine + [known for known in stored if known not in mine]
 
     def store(self, thresholds: Mapping[str, float], journal: Journal) -> None:
         """Store the thresholds at which this process judges, if trials set them."""
@@ -182,11 +182,11 @@ def run_plan(
     return outcome
 
 
-def _draw(plan: SweepPlan, outcome: Outcome, engine: JobEngine, there: set[Path]) -> None:
+def _draw(plan: SweepPlan, outcome: Outcome, engine: JobEngine, stored: set[Path]) -> None:
     """Add the pictures of all judged groups, except in studies, whose limits determine which boards are shown."""
     groups = [group for group in plan.groups if group.damaged.board is None]
     groups = [group for group in groups if any(point.digest in outcome.thresholds for point in group.points)]
-    missing = (job for group in groups for job in group.damaged.renders if job.path not in there)
+    missing = (job for group in groups for job in group.damaged.renders if job.path not in stored)
     failures = render_missing(missing, engine)
     outcome.failures += failures
     lost = {failure.what for failure in failures}

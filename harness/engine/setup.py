@@ -170,7 +170,7 @@ def load_set_up(ref: SetUpRef) -> SetUp:
             raise UserError(what, fix="run the same command again")
         unit, truth = SimulatedUnit(camera_of(ref.camera), ref.camera, view), truth_of(ref.target, T_camera_board)
         in_view = unit.camera.images(np.array([damage.centre_camera_m for damage in truth]).reshape(-1, 3))
-        seen = tuple(damage for damage, there in zip(truth, in_view, strict=True) if there)
+        seen = tuple(damage for damage, is_seen in zip(truth, in_view, strict=True) if is_seen)
         _kept[ref] = SetUp(unit, ref.damaged, seen, ref.target, T_camera_board)
     _kept.move_to_end(ref)
     while len(_kept) > 1 and (
@@ -211,11 +211,11 @@ class KnownCloud:
 
     def area_m2(self, pixels: np.ndarray) -> float:
         """Return the area in plan of the face under pixels (h, w) bool; without a grid, by their share of points."""
-        there = pixels & np.isfinite(self.places_m[..., 0])
+        valid = pixels & np.isfinite(self.places_m[..., 0])
         if not self.cloud.organised:
             board = self.target.board
-            return board.width_mm * board.height_mm * MM**2 * float(there.sum()) / max(there.size, 1)
-        areas = pixel_areas(self.places_m)[there]
+            return board.width_mm * board.height_mm * MM**2 * float(valid.sum()) / max(valid.size, 1)
+        areas = pixel_areas(self.places_m)[valid]
         known = areas[np.isfinite(areas)]
         # at the outline a neighbour is off the board: such a pixel counts as an average one
         usual = np.median(known) if 0 < len(known) < len(areas) else 0.0

@@ -57,8 +57,8 @@ def tables_of(records: Iterable[Mapping[str, Any]], experiment: Experiment) -> t
         names = dict.fromkeys(column for part in own for column in part)
 
         def joined(column: str) -> pd.DataFrame:
-            there = ({column: part.pop(column)} if column in part else {} for part in own)
-            return pd.concat(pd.DataFrame(column, range(size)) for column, size in zip(there, sizes, strict=True))
+            present = ({column: part.pop(column)} if column in part else {} for part in own)
+            return pd.concat(pd.DataFrame(column, range(size)) for column, size in zip(present, sizes, strict=True))
 
         if not own:
             return pd.DataFrame()

@@ -430,12 +430,12 @@ def pair_noise(first_z_m: np.ndarray, second_z_m: np.ndarray, where: np.ndarray)
     """Return the standard deviation of one frame's temporal noise and its correlations, from two frames' z (h, w) in
     metres without their median difference. Only valid pixels in ``where`` (h, w) count; NaN if there are too few."""
     difference = (first_z_m.astype(float) - second_z_m.astype(float)) / np.sqrt(2)
-    there = where & np.isfinite(difference)
-    if there.sum() < FEWEST_PAIRS:
+    valid = where & np.isfinite(difference)
+    if valid.sum() < FEWEST_PAIRS:
         return {"single_frame_mm": np.nan} | {f"correlation_{way}{lag}": np.nan for way in "uv" for lag in LAGS}
-    noise = np.where(there, difference - np.median(difference[there]), 0.0)
-    found = {"single_frame_mm": float(np.sqrt((noise[there] ** 2).mean())) / MM}
-    for way, turned, mask in (("u", noise, there), ("v", noise.T, there.T)):
+    noise = np.where(valid, difference - np.median(difference[valid]), 0.0)
+    found = {"single_frame_mm": float(np.sqrt((noise[valid] ** 2).mean())) / MM}
+    for way, turned, mask in (("u", noise, valid), ("v", noise.T, valid.T)):
         for lag in LAGS:
             both = mask[:, :-lag] & mask[:, lag:]
             a, b = turned[:, :-lag][both], turned[:, lag:][both]

@@ -112,9 +112,9 @@ class Findable:
         """Return a90 (n,) of places: at least the smallest size inspected, infinite above the largest; NaN where
         nothing is judged or the angle is steeper than all inspected angles."""
         cosine = np.maximum(seen.cosine, self.steepest)
-        others = _design(np.ones(len(cosine)), cosine, seen.range_m) @ self.coefficients
+        without_size = _design(np.ones(len(cosine)), cosine, seen.range_m) @ self.coefficients
         needed = np.log(self.threshold * seen.deviation_m) + special.ndtri(POD) * self.scatter / cosine**self.growth
-        limits_mm = np.maximum(np.exp((needed - others) / self.coefficients[1]), self.sizes_mm[0])
+        limits_mm = np.maximum(np.exp((needed - without_size) / self.coefficients[1]), self.sizes_mm[0])
         limits_mm = np.where(limits_mm > self.sizes_mm[1], np.inf, limits_mm)
         beyond = np.cos(min(np.arccos(self.steepest) + np.deg2rad(BEYOND_DEG), np.pi / 2))
         return np.where(np.isfinite(seen.deviation_m) & (seen.cosine >= beyond), limits_mm, np.nan)

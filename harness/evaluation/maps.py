@@ -118,9 +118,9 @@ class SizeErrors:
     def change(self, of: np.ndarray | None = None) -> Change:
         """Return the mean over repeats of the mean difference over the holes ``of`` (h,) bool."""
         chosen = self.differences_mm if of is None else self.differences_mm[:, of]
-        there = np.isfinite(chosen)
+        valid = np.isfinite(chosen)
         with np.errstate(invalid="ignore"):
-            return change_of(np.where(there, chosen, 0.0).sum(axis=1) / there.sum(axis=1))
+            return change_of(np.where(valid, chosen, 0.0).sum(axis=1) / valid.sum(axis=1))
 
 
 def size_errors(first: pd.DataFrame, second: pd.DataFrame, measure: Measure = "extent") -> SizeErrors:
@@ -263,8 +263,8 @@ def against_one(case: MapCase, registration: str, merge: str) -> AgainstOne | No
     large = sizes.diameters_mm >= LARGE_MM - 1e-9
     states, runs = (case.status(single), case.status(several)), (case.runs(single), case.runs(several))
     lost, gained = (
-        tuple(hole for hole, state in here.items() if state == "found" and there.get(hole) == "missed")
-        for here, there in (states, states[::-1])
+        tuple(hole for hole, state in before.items() if state == "found" and after.get(hole) == "missed")
+        for before, after in (states, states[::-1])
     )
     before_mm, now_mm = (rows["threshold"] * rows["scale_mm"] for rows in map(_by_repeat, runs))
     threshold, noise = change_of((now_mm - before_mm).to_numpy(float)), run_ratio(*runs, "surface_noise_mm")

@@ -77,8 +77,8 @@ def true_residual_mm(cloud: ExampleCloud, hole: HoleInView) -> np.ndarray:
     v, u = np.indices(cloud.residual_mm.shape)
     outer = max(3 * hole.radius_px, 1.2 * hole.radius_px + 4)
     face = cloud.inside & np.isfinite(cloud.z_truth_mm) & (np.hypot(u - hole.u_px, v - hole.v_px) <= outer)
-    for other in cloud.truth:
-        face &= relative_radius(cloud, other) > 1.2
+    for known in cloud.truth:
+        face &= relative_radius(cloud, known) > 1.2
     if face.sum() < 12:
         return np.full(cloud.residual_mm.shape, np.nan)
     x, y = (u - hole.u_px) / outer, (v - hole.v_px) / outer

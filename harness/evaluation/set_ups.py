@@ -65,7 +65,7 @@ class Ladder:
         """Return 50 % sizes (n,), with repeats (n, repeats) and holes (n, h) weighted by how often they were drawn."""
         by_hole = of_repeats @ self.detected / of_repeats.sum(axis=1, keepdims=True) * of_holes
         sizes, starts = np.unique(self.diameters_mm, return_index=True)
-        hits, drawn = (np.add.reduceat(of, starts, axis=1) for of in (by_hole, of_holes))
+        hits, drawn = (np.add.reduceat(counts, starts, axis=1) for counts in (by_hole, of_holes))
         return half_size(sizes, hits / drawn)
 
 
@@ -172,7 +172,7 @@ def effect_costs(tables: ResultTables) -> pd.DataFrame:
     for values, part in set_ups.groupby(others, sort=False, dropna=False) if others else [((), set_ups)]:
         place = ", ".join(f"{names[path]}={value}" for path, value in zip(others, values, strict=True))
         switches = {str(row["variant"]): json.loads(row["switches"]) for _, row in part.iterrows()}
-        by_switches = {frozenset(name for name, is_on in of.items() if is_on): name for name, of in switches.items()}
+        by_switches = {frozenset(name for name, is_on in row.items() if is_on): name for name, row in switches.items()}
         everything = max(by_switches, key=len)
         effects = [(name.replace("_", " "), frozenset([name])) for name in switches[by_switches[everything]]]
         wanted = [(effect, "nothing", nothing, alone) for effect, alone in effects]
@@ -180,8 +180,8 @@ def effect_costs(tables: ResultTables) -> pd.DataFrame:
         wanted.append(("all", "nothing", nothing, everything))
         holes = tables.holes[tables.holes["variant"].isin(by_switches.values())]
         for frames, rows in holes.groupby("frames"):
-            there = {str(name): ladder_of(part) for name, part in rows.groupby("variant")}
-            ladders = {on: there[variant] for on, variant in by_switches.items() if variant in there}
+            by_variant = {str(name): ladder_of(part) for name, part in rows.groupby("variant")}
+            ladders = {on: by_variant[variant] for on, variant in by_switches.items() if variant in by_variant}
             for effect, against, off, on in wanted:
                 if cost := _cost(ladders, off, on):
                     found.append({"place": place, "frames": frames, "effect": effect, "against": against, **cost})

@@ -181,9 +181,9 @@ def _mapping_problems(config: ExperimentConfig, simulated: SimulatedSource, sour
     elif views is not None and mapping is None:
         fix = "declare mapping, for instance {registration: {method: marks}, merge: {kind: fusion}}"
         yield Problem("several views need a mapping into one cloud", source.place_of(VIEWS), fix=fix)
-    elif views is not None and mapping is not None and (mapping.views or 0) > (there := view_count(views)):
+    elif views is not None and mapping is not None and (mapping.views or 0) > (count := view_count(views)):
         place = source.place_of(("mapping", "views"))
-        yield Problem(f"{mapping.views} views, but source.views has {there}", place, legal=f"1 to {there}")
+        yield Problem(f"{mapping.views} views, but source.views has {count}", place, legal=f"1 to {count}")
 
 
 def _flat_field_problems(config: ExperimentConfig, simulated: SimulatedSource, source: Source) -> Iterator[Problem]:

@@ -42,14 +42,14 @@ def set_path(data: Any, path: KeyPath, value: Any, declared: shape.Declared | No
     if not path:
         return value
     key, rest = _index(data, path[0], above), path[1:]
-    here = (*above, key)
+    full_path = (*above, key)
     if isinstance(data, list):
         if key >= len(data):
             raise PathError(f"the list has no item {key}; it has {len(data)}, counted from 0")
-        return [*data[:key], set_path(data[key], rest, value, declared, here), *data[key + 1 :]]
+        return [*data[:key], set_path(data[key], rest, value, declared, full_path), *data[key + 1 :]]
     inner = data.get(key)
     if key not in data and rest:
-        default = shape.default_at(declared.at(here)) if declared else ()
+        default = shape.default_at(declared.at(full_path)) if declared else ()
         if not default:
             raise PathError(f"there is no `{key}`")
         inner = default[0]
@@ -59,7 +59,7 @@ def set_path(data: Any, path: KeyPath, value: Any, declared: shape.Declared | No
         old, new = (shape.model_for(around, kind) for kind in (data, {**data, key: value}))
         gone = {*(old.model_fields if old else ())} - {*(new.model_fields if new else ())}
         data = {name: held for name, held in data.items() if name not in gone}
-    return {**data, key: set_path(inner, rest, value, declared, here)}
+    return {**data, key: set_path(inner, rest, value, declared, full_path)}
 
 
 def _index(data: Any, key: str | int, above: KeyPath) -> Any:
@@ -163,10 +163,10 @@ def unfolded(source: Source, config: ExperimentConfig | None) -> tuple[tuple[Poi
 def _written_variations(data: Any) -> Iterator[Draft]:
     """Yield the variations as the file states them, without the numbers of frames of the sensitivity study."""
     vary = shape.get(data, ("sensitivity", "vary"))
-    for index, each in enumerate(vary if isinstance(vary, list) else ()):
+    for index, variation in enumerate(vary if isinstance(vary, list) else ()):
         at: KeyPath = ("sensitivity", "vary", index)
-        path, values, label, together = (shape.child(each, key) for key in ("path", "values", "label", "set"))
-        frames = _frame_settings(shape.child(each, "frames"), (*at, "frames"))
+        path, values, label, together = (shape.child(variation, key) for key in ("path", "values", "label", "set"))
+        frames = _frame_settings(shape.child(variation, "frames"), (*at, "frames"))
         if isinstance(path, str) and isinstance(values, list):
             for number, value in enumerate(values):
                 setting = Setting(path, value, (*at, "values", number))
@@ -190,7 +190,7 @@ def _axis_problems(axes: list[list[Setting]], source: Source) -> Iterator[Proble
     for path in paths:
         at = source.key_place_of(("sweep", path))
         yield from _path_problems(path, at, source, FIXED)
-        outer = next((other for other in paths if path.startswith(other + ".")), None)
+        outer = next((prefix for prefix in paths if path.startswith(prefix + ".")), None)
         if outer:
             message = f"the axes `{outer}` and `{path}` set the same key"
             yield Problem(message, at, fix=f"sweep only `{outer}`, or only keys within it")
@@ -217,7 +217,7 @@ def _switch_axis(config: ExperimentConfig, source: Source) -> tuple[list[Setting
         few = {0: "none", len(whole): "all", 1: f"{''.join(on)} alone"}
         return few.get(len(on), f"all but {''.join(whole - on)}").replace("_", " ")
 
-    chosen = dict.fromkeys([frozenset[str](), *alone, *(whole - one for one in alone), whole])
+    chosen = dict.fromkeys([frozenset[str](), *alone, *(whole - switch for switch in alone), whole])
     return [Setting(path, {name: name in on for name in names}, (SWITCHES,), label(on)) for on in chosen], problems
 
 
@@ -259,12 +259,12 @@ def _resolved(draft: Draft, source: Source, keep_all: bool) -> tuple[ExperimentC
     config, found = checks.resolved(located)
     starts = [setting.written_at for setting in draft.settings]
     written = (item for places in (source.values, source.keys) for item in places.items()) if found else ()
-    own = {here for at, here in written if any(at[: len(start)] == start for start in starts)}
+    own = {spot for at, spot in written if any(at[: len(start)] == start for start in starts)}
     elsewhere = f"with {draft.label}: " if draft.settings else ""
     return config, [
-        each if each.place in own else replace(each, message=elsewhere + each.message, place=place)
-        for each in found
-        if each.place in own or keep_all
+        problem if problem.place in own else replace(problem, message=elsewhere + problem.message, place=place)
+        for problem in found
+        if problem.place in own or keep_all
     ]
 
 
@@ -274,16 +274,16 @@ def _drafts(
     """Yield the product of the axes (the last varies fastest), then all variations with all numbers of frames."""
     names, texts = names_of(telling), dict[int, str]()
     for axis in axes:
-        for one in axis if axis[0].path in telling else ():
-            value = value_text(one.path, differing(one.value, (other.value for other in axis)))
-            texts[id(one)] = one.name or f"{names[one.path]}={value}"
+        for setting in axis if axis[0].path in telling else ():
+            value = value_text(setting.path, differing(setting.value, (other.value for other in axis)))
+            texts[id(setting)] = setting.name or f"{names[setting.path]}={value}"
     chosen = list(product(*axes))
     if config.draws is not None:
         groups: dict[str, list[tuple[Setting, ...]]] = {}
-        for each in chosen:
-            groups.setdefault(_label(one for one in each if one.path != FRAMES), []).append(each)
+        for settings in chosen:
+            groups.setdefault(_label(s for s in settings if s.path != FRAMES), []).append(settings)
         order = random_stream(config.seed, "draws").permutation(len(groups))[: config.draws]
-        chosen = [each for number in sorted(order) for each in [*groups.values()][number]]
+        chosen = [settings for number in sorted(order) for settings in [*groups.values()][number]]
     for settings in chosen:
         # a set-up has a name such as ``camera=kinect_v2, distance=0.75 m``
         parts = [texts[id(setting)] for setting in settings if setting.path in telling]

@@ -58,10 +58,10 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
     searched = detector.find(cloud, evidence, threshold)
     found = one_damage_once(cloud.valid.shape, each_object_once(cloud, evidence, searched), unseen)
 
-    def measure(each: Detection) -> Measurement:
-        if each.kind == "object":
-            return measure_extents(cloud, each, "an object that lies on the target: no model of a hole fits it")
-        return (measure_missing if each.kind == "no return" else detector.measure)(cloud, evidence, each)
+    def measure(detection: Detection) -> Measurement:
+        if detection.kind == "object":
+            return measure_extents(cloud, detection, "an object that lies on the target: no model of a hole fits it")
+        return (measure_missing if detection.kind == "no return" else detector.measure)(cloud, evidence, detection)
 
     return Judged(cloud, evidence, found, tuple(map(measure, found)), missing)
 
@@ -295,15 +295,15 @@ def _merged(
         prepared.append(ready)
     reference, has_poses = prepared[0], arguments.poses is not None
     if config.registration.method in START_FROM_MARKS and not has_poses:
-        for number, each in enumerate(prepared):
+        for number, ready in enumerate(prepared):
             guess = np.eye(4)
             if number:
-                by_marks = register_by_marks(reference, each)
+                by_marks = register_by_marks(reference, ready)
                 if by_marks.failure:
-                    print(f"note: {each.view.name} starts from the pose of {reference.view.name}: {by_marks.failure}")
+                    print(f"note: {ready.view.name} starts from the pose of {reference.view.name}: {by_marks.failure}")
                 else:
                     guess = by_marks.T_reference_view
-            prepared[number] = replace(each, view=replace(each.view, T_reference_view_guess=guess))
+            prepared[number] = replace(ready, view=replace(ready.view, T_reference_view_guess=guess))
     registrations = register(tuple(prepared), config.registration)
     failed = [each for each in registrations if each.failure]
     if failed:
@@ -325,24 +325,24 @@ def _registration_data(mapped: Mapped) -> dict[str, Any]:
     points_m = thinned(reference.points_m)
     _, normal = plane_through(points_m)
 
-    def row(view: PreparedView, each: Registration) -> dict[str, Any]:
-        in_plane_m, across_m = predicted_error_m(each, points_m, normal)
+    def row(view: PreparedView, registration: Registration) -> dict[str, Any]:
+        in_plane_m, across_m = predicted_error_m(registration, points_m, normal)
         held_out_m = None if view is reference else held_out_error_m(reference, view)
         return {
-            "view": each.view,
-            "method": each.method,
-            "T_reference_view": each.T_reference_view.tolist(),
-            "covariance": each.covariance.tolist(),
-            "covariance_about_mm": (each.centre_m / MM).tolist(),
-            "residual_mm": each.residual_m / MM,
-            "overlap": each.overlap,
+            "view": registration.view,
+            "method": registration.method,
+            "T_reference_view": registration.T_reference_view.tolist(),
+            "covariance": registration.covariance.tolist(),
+            "covariance_about_mm": (registration.centre_m / MM).tolist(),
+            "residual_mm": registration.residual_m / MM,
+            "overlap": registration.overlap,
             "predicted_in_plane_mm": in_plane_m / MM,
             "predicted_across_mm": across_m / MM,
             "held_out_mark_mm": None if held_out_m is None else held_out_m / MM,
             "marks": len(view.marks.trusted),
             "marks_doubtful": len(view.marks.marks) - len(view.marks.trusted),
-            "pairs": each.pairs,
-            "notes": each.notes,
+            "pairs": registration.pairs,
+            "notes": registration.notes,
         }
 
     return {

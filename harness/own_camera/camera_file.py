@@ -226,12 +226,12 @@ def _field(camera: AmcwCamera, found: Characteristics) -> Iterator[tuple[str, An
 
 def _gain(camera: Any, found: Characteristics, albedo: float) -> tuple[Any, float]:
     """Return the camera that reproduces the captures' temporal noise, and its gain, by secants on the logarithms."""
-    wanted, tried = {(surface.capture, surface.number): surface.temporal.value for surface in found.surfaces}, []
+    wanted, tried = {(face.capture, face.number): face.temporal.value for face in found.surfaces}, []
     gain = start = camera.photons.signal_electrons.value
     for _ in range(STEPS):
         camera = with_number(camera, "photons", "signal_electrons", gain)
-        own = [one for stack in simulated(camera, found, albedo, FEW_FRAMES) for one in measure.surfaces_of(stack)]
-        ratios = [np.log(one.temporal.value / wanted[one.capture, one.number]) for one in own]
+        own = [face for stack in simulated(camera, found, albedo, FEW_FRAMES) for face in measure.surfaces_of(stack)]
+        ratios = [np.log(face.temporal.value / wanted[face.capture, face.number]) for face in own]
         tried.append((np.log(gain), float(np.mean(ratios)) if ratios else 1.0))  # too dim counts as too noisy
         if abs(tried[-1][1]) < CLOSE:
             break
@@ -247,7 +247,7 @@ def simulated(
     """Return the captures as a unit of the camera would have recorded them: the same surfaces (by smooth fits) with the
     recorded brightness and the same number of frames, or ``frames``. Not simulated: relief finer than the fits, light
     between surfaces, the emitter's shadow behind an edge, and the scene beside the surfaces."""
-    return [_again(camera, one, albedo, frames or len(one.z_m), number) for number, one in enumerate(found.captures)]
+    return [_again(camera, still, albedo, frames or len(still.z_m), n) for n, still in enumerate(found.captures)]
 
 
 def _again(camera: AnyCamera, capture: StillCapture, albedo: float, frames: int, number: int) -> StillCapture:

@@ -174,7 +174,7 @@ def read_still(recording: Recording, used: np.ndarray | None = None) -> StillCap
     z_m = np.stack([frame.z_m for frame in frames]).astype(np.float32)
     used = np.ones(z_m.shape[1:], bool) if used is None else used
     if used.shape != z_m.shape[1:]:
-        sizes = (f"{one.shape[-1]} x {one.shape[-2]}" for one in (used, z_m))
+        sizes = (f"{image.shape[-1]} x {image.shape[-2]}" for image in (used, z_m))
         raise UserError("--mask: {} pixels, but the frames have {}".format(*sizes))
     z_m[:, ~used] = np.nan
     if all(np.array_equal(z_m[0], z_m[k], equal_nan=True) for k in (len(z_m) // 2, -1)):
@@ -276,7 +276,7 @@ def noise_law(cells: Sequence[NoiseCell]) -> RangeLaw:
         worst = int(np.argmax(np.where(doubtful, errors, -1.0)))
         varied[worst], law[worst] = False, ASSUMED[worst] if errors[worst] > UNSURE else 0.0
     facing, number = y - law[2] * columns[:, 2], np.floor(log_r / np.log(RANGE_CELLS) + 1e-9)
-    groups = [number == one for one in np.unique(number)]
+    groups = [number == cell for cell in np.unique(number)]
     at, level = (np.exp([np.average(v[g], weights=weight[g]) for g in groups]) for v in (log_r, facing))
     return RangeLaw(at, level, law[1:] * signs[1:], errors[1:], float(np.exp(light_at_1m)))
 
@@ -307,11 +307,11 @@ def dropouts_of(captures: Sequence[StillCapture]) -> Dropouts:
         level = np.full(share.shape, np.nan) if capture.amplitude is None else capture.amplitude
         parts += [np.stack([level[whole], share[whole]]) for whole in (capture.whole(m) for _, m in capture.planes)]
     level, share = np.concatenate(parts, axis=1)
-    number = np.nan_to_num(np.floor(np.log(level) / np.log(LIGHT_CELLS)), nan=-1e9)
-    groups = [number == one for one in np.unique(number[np.isfinite(level)]) if (number == one).sum() >= LEAST_BIN_PX]
+    cells = np.nan_to_num(np.floor(np.log(level) / np.log(LIGHT_CELLS)), nan=-1e9)
+    groups = [cells == cell for cell in np.unique(cells[np.isfinite(level)]) if (cells == cell).sum() >= LEAST_BIN_PX]
     if not groups:
         return Dropouts(np.array([np.nan]), np.array([share.mean() if len(share) else 0.0]), np.array([len(share)]))
-    means = [np.array([of[group].mean() for group in groups]) for of in (level, share)]
+    means = [np.array([values[group].mean() for group in groups]) for values in (level, share)]
     return Dropouts._make((*means, np.array([group.sum() for group in groups])))
 
 
@@ -481,13 +481,13 @@ def characteristics(
     """Measure captures of a camera in order of time. ``poses`` (4 x 4, each camera in the first camera's frame)
     separate shape from fixed pattern. Raises UserError for different cameras, and if too few pixels are steady."""
     first = captures[0]
-    if other := next((one for one in captures if one.lens != first.lens), None):
-        raise UserError(f"{other.name}: has another lens than {first.name}", legal="captures of the same camera")
+    if differing := next((capture for capture in captures if capture.lens != first.lens), None):
+        raise UserError(f"{differing.name}: has another lens than {first.name}", legal="captures of the same camera")
     cells = tuple(cell for capture in captures for cell in cells_of(capture))
     if not cells:
         what = f"{first.name}: has no {LEAST_BIN_PX} steady pixels with similar range, angle and brightness"
         raise UserError(what, legal="a static scene", fix="record a matte wall that fills the view")
-    correlation, flat = correlations(max(captures, key=lambda one: int(one.steady.sum()))), []
+    correlation, flat = correlations(max(captures, key=lambda capture: int(capture.steady.sum()))), []
     for capture, pose in zip(captures, poses or [None] * len(captures), strict=True):
         use = inner(capture.planes[0][1]) & capture.steady if capture.planes else np.zeros(1, bool)
         if use.sum() >= LEAST_BIN_PX:

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 MEASURED, SIMULATED, KNOWN = "measured", "simulated", "known camera"
 LOOKS = {MEASURED: (BLUE, "o"), SIMULATED: (ORANGE, "x"), KNOWN: (GREY, "+")}
 RANGE, ANGLE, AMPLITUDE = (f"noise, mm against {x}" for x in ("range, m", "angle, deg", "amplitude"))
-NEIGHBOURS, PATTERN = (f"correlation of {of} against pixels apart" for of in ("noise", "fixed pattern"))
-SPECTRUM, OF_PATTERN = (f"spectrum of {of} against cycles per pixel" for of in ("noise", "fixed pattern"))
+NEIGHBOURS, PATTERN = (f"correlation of {quantity} against pixels apart" for quantity in ("noise", "fixed pattern"))
+SPECTRUM, OF_PATTERN = (f"spectrum of {quantity} against cycles per pixel" for quantity in ("noise", "fixed pattern"))
 FRAMES, DROPPED = "displacement, mm against frame", "share without return against amplitude"
 SHOWN = (RANGE, ANGLE, AMPLITUDE, NEIGHBOURS, PATTERN, SPECTRUM, OF_PATTERN, FRAMES, DROPPED)
 FREQUENCIES = np.linspace(0, 0.5, 41)
@@ -88,7 +88,7 @@ def shared_figures(found: Characteristics) -> Iterator[FigureRow]:
 def beside(found: Characteristics, twin: Characteristics, known: Characteristics | None) -> list[OwnFigure]:
     """Return each figure of the captures with those of the simulations; surfaces are matched by their numbers."""
     every = (found, twin, known)
-    places = [{one.where: (one.capture, one.number) for one in each.surfaces} if each else {} for each in every]
+    places = [{plane.where: (plane.capture, plane.number) for plane in each.surfaces} if each else {} for each in every]
     values = [
         {(row[0], place.get(row[1], row[1])): row[3] for row in own_figures(each)} if each else {}
         for each, place in zip(every, places, strict=True)
@@ -122,7 +122,7 @@ def write_page(
     show([OWN_FIGURES.grid(rows, terminal=True, heads=heads)])
     print(answer)
     write_table(folder, OWN_FIGURES, OWN_FIGURES.frame(rows))
-    curves = [row for source, one in sources.items() for row in _curves(source, one)]
+    curves = [row for source, figures in sources.items() for row in _curves(source, figures)]
     write_table(folder, OWN_CURVES, OWN_CURVES.frame(curves))
     drawn = svg("captures", (8.6, 15.5), title, lambda canvas: _draw(canvas, found, curves))
     notes = (

@@ -30,9 +30,9 @@ def atlas_html(rows: Sequence[Row], warnings: Sequence[str], about: Mapping[str,
         place = {axis: value for axis, value in row.place.items() if axis != "distance_m"}
         named = {"camera": row.title, "damage": row.damage, "detector": row.surface.detector, **place}
         curve = curves.setdefault(tuple(named.values()), named)
-        one = row.answer
-        for name, value in (("distance_m", row.place["distance_m"]), ("a90", one.a90_mm), ("low", one.low_mm),
-                            ("high", one.high_mm), ("largest", one.largest_mm)):  # fmt: skip
+        answer = row.answer
+        for name, value in (("distance_m", row.place["distance_m"]), ("a90", answer.a90_mm), ("low", answer.low_mm),
+                            ("high", answer.high_mm), ("largest", answer.largest_mm)):  # fmt: skip
             curve.setdefault(name, []).append(float(f"{value:.4g}") if np.isfinite(value) else None)
     lines = {"curves": list(curves.values()), "colours": PALETTE, "dashes": list(DASHES.values())}
     data = json.dumps(lines, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
@@ -70,12 +70,12 @@ def save_atlas_png(path: Path, rows: Sequence[Row]) -> None:
         for panel, damage in zip(axes.ravel(), damages, strict=False):
             for frames, style in shown.items():
                 for title, colour in zip(titles, PALETTE, strict=False):
-                    of = (damage, title, detector)
-                    line = [row for row in rows if (row.damage, row.title, row.surface.detector) == of]
-                    line = [one for one in line if one.place["frames"] == frames]
-                    x = [one.place["distance_m"] for one in line]
+                    wanted = (damage, title, detector)
+                    line = [row for row in rows if (row.damage, row.title, row.surface.detector) == wanted]
+                    line = [row for row in line if row.place["frames"] == frames]
+                    x = [row.place["distance_m"] for row in line]
                     names = ("low_mm", "a90_mm", "high_mm")
-                    low, middle, high = ([getattr(one.answer, name) for one in line] for name in names)
+                    low, middle, high = ([getattr(row.answer, name) for row in line] for name in names)
                     label = title if frames == counts[-1] else None
                     panel.plot(x, middle, style, color=colour, label=label)
                     if frames == counts[-1]:

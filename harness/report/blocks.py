@@ -194,7 +194,7 @@ def _values(figure: Figure) -> list[dict[str, Any]]:
     drawing and on the axes for at most `MOST_VALUES` points. Lengths are in points from the upper left."""
     panels, scale, height = [], 72 / figure.dpi, figure.bbox.height
     for axes in figure.axes:
-        names = {id(one[0]): one.get_label() for one in axes.containers if hasattr(one, "has_yerr")}
+        names = {id(bars[0]): bars.get_label() for bars in axes.containers if hasattr(bars, "has_yerr")}
         lines = []
         for line in axes.get_lines():
             name, xy = str(names.get(id(line), line.get_label())), np.asarray(line.get_xydata(), float)

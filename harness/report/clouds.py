@@ -125,13 +125,13 @@ def examples_figure(name: str, examples: Sequence[StudyExample], title: str, *, 
     titles = TITLES if by_limit else SIZES
     columns = []
     for where in get_args(Where):
-        some = [example for example in examples if example.where == where]
-        columns.append(sorted(some, key=lambda item: (item.diameter_mm, item.board))[:MOST_DOWN])
+        alike = [example for example in examples if example.where == where]
+        columns.append(sorted(alike, key=lambda item: (item.diameter_mm, item.board))[:MOST_DOWN])
     rows = [
         [None if down >= len(line) else _example_cut(line[down], titles) for line in columns]
         for down in range(max(map(len, columns)))
     ]
-    every = [one for line in columns for one in line]
+    every = [example for line in columns for example in line]
     captions = "; ".join(f"{each.diameter_mm:.1f} mm, {titles[each.where].lower()}, {_outcome(each)}" for each in every)
     return _cuts(name, rows, f"{title}: {captions}.")
 
@@ -143,12 +143,12 @@ def _outcome(example: StudyExample) -> str:
     return f"{word}: score {example.score:.3g}, threshold {example.threshold:.3g}"
 
 
-def _example_cut(one: StudyExample, titles: Mapping[Where, str]) -> Cut:
-    pod = f", POD {one.pod:.2f}" if np.isfinite(one.pod) else ""
-    title = f"{titles[one.where]}\n{one.diameter_mm:.1f} × {one.depth_mm:.3g} mm{pod}"
-    below = _outcome(one).replace(", threshold", "\nthreshold")
-    colour = "#005b96" if one.hit else "#b34700"
-    return Cut(one.residual_mm, one.detected, one.outline_px, one.pitch_mm, title, below, colour)
+def _example_cut(example: StudyExample, titles: Mapping[Where, str]) -> Cut:
+    pod = f", POD {example.pod:.2f}" if np.isfinite(example.pod) else ""
+    title = f"{titles[example.where]}\n{example.diameter_mm:.1f} × {example.depth_mm:.3g} mm{pod}"
+    below = _outcome(example).replace(", threshold", "\nthreshold")
+    colour = "#005b96" if example.hit else "#b34700"
+    return Cut(example.residual_mm, example.detected, example.outline_px, example.pitch_mm, title, below, colour)
 
 
 def _cuts(name: str, rows: Sequence[Sequence[Cut | None]], alt: str) -> str:

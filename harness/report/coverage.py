@@ -29,18 +29,18 @@ def scene_of(patches: Patches, limits_mm: np.ndarray, found: Findable) -> Scene3
     known = np.isfinite(limits_mm)
     low, high = (limits_mm[known].min(), limits_mm[known].max()) if known.any() else found.sizes_mm
     ends = np.geomspace(low, high * 1.0001, len(COLOURS) - 1)
-    of = np.where(known, np.searchsorted(ends, limits_mm, side="right") - 1, len(COLOURS) - 2 + np.isnan(limits_mm))
-    words = [f"{one:.2g} to {other:.2g} mm" for one, other in pairwise(ends)]
+    step = np.where(known, np.searchsorted(ends, limits_mm, side="right") - 1, len(COLOURS) - 2 + np.isnan(limits_mm))
+    words = [f"{low:.2g} to {high:.2g} mm" for low, high in pairwise(ends)]
     key = list(zip([*words, f"none up to {found.sizes_mm[1]:.3g} mm", "not judged"], COLOURS, strict=True))
-    palette = np.array([[int(one[k : k + 2], 16) for k in (1, 3, 5)] for one in COLOURS], np.uint8)
-    shown, there = f"{found.size_of} found 9 times in 10", np.unique(of).tolist()
-    return Scene3d(1e3 * patches.points_m, "board", rgb=palette[of], shown=shown, key=tuple(key[n] for n in there))
+    palette = np.array([[int(colour[k : k + 2], 16) for k in (1, 3, 5)] for colour in COLOURS], np.uint8)
+    shown, used = f"{found.size_of} found 9 times in 10", np.unique(step).tolist()
+    return Scene3d(1e3 * patches.points_m, "board", rgb=palette[step], shown=shown, key=tuple(key[n] for n in used))
 
 
 def answer(found: Findable, patches: Patches, limits_mm: np.ndarray, size_mm: float, poses: int) -> str:
     """State the shares of the face on which damage of a size is found, on which no size is, and that is not judged."""
-    some = limits_mm <= size_mm, np.isinf(limits_mm), np.isnan(limits_mm)
-    share, blind, unknown = (f"{percent(patches.share(each))} %" for each in some)
+    groups = limits_mm <= size_mm, np.isinf(limits_mm), np.isnan(limits_mm)
+    share, blind, unknown = (f"{percent(patches.share(each))} %" for each in groups)
     return (
         f"Damage with a {found.size_of} of {size_mm:.3g} mm is found nine times in ten on {share} of the face in "
         f"{many(poses, 'pose')}. On {blind} nothing up to {found.sizes_mm[1]:.3g} mm is found so often; {unknown} is "

@@ -209,7 +209,7 @@ def _draw(canvas: Figure, design: StudyDesign) -> None:
     (left, right), (low, high), plan = canvas.subplots(1, 2), design.range_of_sizes, design.recommended
     places, true_size = np.arange(len(design.plans)), plan.true_size
     # a bound that is not demonstrated is infinite
-    lows, bounds, ends = np.array([(one.low, one.bound, one.high) for one in design.plans]).T
+    lows, bounds, ends = np.array([(plan.low, plan.bound, plan.high) for plan in design.plans]).T
     top = max([1.5 * high, *(1.1 * bounds[np.isfinite(bounds)])])
     left.vlines(places, np.minimum(lows, top), np.minimum(ends, top), color=blocks.BLUE, lw=2.2)
     left.plot(places, np.minimum(bounds, 9 * top), "o", color=blocks.BLUE, ms=7, mec="white", label="median, 10–90 %")
@@ -222,7 +222,7 @@ def _draw(canvas: Figure, design: StudyDesign) -> None:
         label = plain(f"wanted: {design.text(design.goal)}")
         left.axhline(design.goal, color=blocks.GREEN, lw=1.2, ls="--", label=label)
     left.set(xlim=(-0.6, len(places) - 0.4), ylim=(0.95 * min(true_size, *lows), max(top, 1.02 * (design.goal or 0))))
-    left.set_xticks(places, [str(one.targets) for one in design.plans])
+    left.set_xticks(places, [str(plan.targets) for plan in design.plans])
     left.set(xlabel="targets", ylabel=axis_text("expected a90/95", design.unit))
     left.set_title(f"{plan.studies} simulated studies each")
     sizes = np.linspace(low, high, 241)[1:]

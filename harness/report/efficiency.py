@@ -49,7 +49,7 @@ def answer(rows: Sequence[Efficiency]) -> str:
 def efficiency_figure(rows: Sequence[Efficiency]) -> str:
     """Draw each set-up's curve against d' with the shares of hits in classes of d', and the ideal observer's POD."""
     detectors = list(dict.fromkeys(row.limit.record.detector for row in rows))
-    others = list(dict.fromkeys((row.limit.record.frames, row.limit.largest_mm) for row in rows))
+    conditions = list(dict.fromkeys((row.limit.record.frames, row.limit.largest_mm) for row in rows))
     index, pod = (np.concatenate([getattr(row, name) for row in rows]) for name in ("index", "pod"))
     order = np.argsort(index)
 
@@ -58,17 +58,17 @@ def efficiency_figure(rows: Sequence[Efficiency]) -> str:
         axes.plot(index[order], pod[order], color=INK, lw=2.2, label="ideal observer")
         for row in rows:
             colour = COLOURS[detectors.index(row.limit.record.detector) % len(COLOURS)]
-            other = others.index((row.limit.record.frames, row.limit.largest_mm))
+            style = conditions.index((row.limit.record.frames, row.limit.largest_mm))
             seen = np.sort(row.index[row.index > 0])
             if row.curve is not None and len(seen):
                 x = np.geomspace(LEFT, max(seen[-1], 2 * LEFT), 200)
                 name = plain(fill(f"{row.limit.record.detector}: {name_of(row.limit)}", 100))
-                axes.plot(x, row.curve.pod(x), color=colour, ls=STYLES[other % len(STYLES)], lw=1.4, label=name)
+                axes.plot(x, row.curve.pod(x), color=colour, ls=STYLES[style % len(STYLES)], lw=1.4, label=name)
             for members in np.array_split(np.argsort(row.index), CLASSES):
                 if len(members):
                     share = row.hits[members].sum() / row.inspections[members].sum()
                     middle = max(float(np.median(row.index[members])), LEFT)
-                    axes.plot(middle, share, MARKERS[other % len(MARKERS)], color=colour, ms=4, alpha=0.6)
+                    axes.plot(middle, share, MARKERS[style % len(MARKERS)], color=colour, ms=4, alpha=0.6)
         for share in SHARES:
             axes.axhline(share, color=GREY, lw=0.8, ls=":")
         hits_in_view(axes, 0.03)

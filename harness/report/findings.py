@@ -211,7 +211,7 @@ def save_blind_map(path: Path, cloud: Cloud, missing: MissingReturns, detections
             columns, rows = np.arange(width) + cloud.region.col0, np.arange(height) + cloud.region.row0
             axes.contour(columns, rows, missing.outline, levels=[0.5], colors="#0070c0", linewidths=0.8)
         _frame(axes, cloud, box)
-        _circle(axes, cloud, ((n, one) for n, one in enumerate(detections, start=1) if one.kind == "no return"))
+        _circle(axes, cloud, ((n, found) for n, found in enumerate(detections, start=1) if found.kind == "no return"))
 
     _save(path, _figure(f"{100 * missing.blind:.2g} % of the target's pixels returned nothing", _height_in(box), draw))
 

@@ -57,7 +57,7 @@ def sizes_grid(found: Mapod) -> Grid:
         else:
             rows.append((name, "-", "-", "not demonstrated", found.why))
     both = f"{found.set_up}, corrected by {last.targets} real targets"
-    rows.append(("combined", *(sized(one, "") for one in (last.a50, last.a90, last.a90_95)), both))
+    rows.append(("combined", *(sized(size, "") for size in (last.a50, last.a90, last.a90_95)), both))
     return Grid.of(("", "a50 (mm)", "a90 (mm)", "a90/95 (mm)", "from"), rows, left=1)
 
 
@@ -86,8 +86,8 @@ def doubts(found: Mapod) -> list[str]:
 
 def mapod_parts(found: Mapod) -> list[str | Grid]:
     """Return the parts for a terminal; reasons to doubt the limit come first."""
-    shown: list[str | Grid] = [f"warning: {one}" for one in doubts(found)]
-    shown += [sizes_grid(found), "", BOARDS.grid(found.steps), "", *(f"note: {one}" for one in notes(found))]
+    shown: list[str | Grid] = [f"warning: {text}" for text in doubts(found)]
+    shown += [sizes_grid(found), "", BOARDS.grid(found.steps), "", *(f"note: {text}" for text in notes(found))]
     return [*shown, "", answer(found)]
 
 

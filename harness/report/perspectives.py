@@ -79,8 +79,8 @@ def found_figure(rows: Sequence[sections.Row]) -> str:
         axes = figure.subplots()
         ways = dict.fromkeys((row["registration"], row["merge"]) for row in rows)
         for number, way in enumerate(ways):
-            there = [row for row in rows if (row["registration"], row["merge"]) == way]
-            own = sorted((row["views"], len(row["found"])) for row in there)
+            of_way = [row for row in rows if (row["registration"], row["merge"]) == way]
+            own = sorted((row["views"], len(row["found"])) for row in of_way)
             colour, marker = (each[number % len(each)] for each in (blocks.COLOURS, blocks.MARKERS))
             shift = 0.04 * (number - len(ways) / 2)  # separates equal counts
             views, counts = np.array(sorted(own), float).T
@@ -101,13 +101,13 @@ def answer_sentence(cases: Sequence[maps.MapCase], verdicts: Sequence[Verdict] =
         alone = case.single()
         if alone is None:
             continue
-        others = [(one, case.named(one.views, one.registration, one.merge, alone.frames)) for one in case.set_ups]
-        ways = [(one, list(case.status(found).values())) for one, found in others if found and one.views > 1]
+        others = [(map_, case.named(map_.views, map_.registration, map_.merge, alone.frames)) for map_ in case.set_ups]
+        ways = [(map_, list(case.status(found).values())) for map_, found in others if found and map_.views > 1]
         ways.sort(key=lambda way: (-way[0].views, -way[1].count("found")))
         counts: list[str] = []
         for way, states in [("one view finds", list(case.status(alone).values()))] + [
-            (f"{one.views} views ({maps.label_of(method_text(one.registration), one.merge)})", states)
-            for one, states in ways[:1]
+            (f"{map_.views} views ({maps.label_of(method_text(map_.registration), map_.merge)})", states)
+            for map_, states in ways[:1]
         ]:
             open_ = f" ({states.count('undecided')} undecided)" if "undecided" in states else ""
             counts.append(f"{way} {states.count('found')}{'' if counts else f' of {len(states)} holes'}{open_}")

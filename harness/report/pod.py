@@ -76,10 +76,10 @@ def pod_parts(statement: PodStatement) -> list[str | Grid]:
 
 def sizes_grid(statement: PodStatement) -> Grid:
     """Return the table of a50, a90 and a90/95 with the method of each."""
-    of = f", the largest of {len(statement.fits)} models" if len(statement.fits) > 1 else ""
+    of_models = f", the largest of {len(statement.fits)} models" if len(statement.fits) > 1 else ""
     digits, unit = _digits(statement), statement.unit
     rows = [(name, sized(getattr(statement, name), unit, digits), "estimate") for name in ("a50", "a90")]
-    how = f"{statement.bound.method}{of}: the limit to quote"
+    how = f"{statement.bound.method}{of_models}: the limit to quote"
     rows.append(("a90/95", _bound_text(statement.bound, unit, digits), how))
     return Grid.of(("", "size", "how"), rows, left=3)
 

@@ -24,7 +24,7 @@ def scene_svg(facts: Mapping[str, Any]) -> Markup:
     named = names[0] if len(names) == 1 else f"{len(names)} cameras"
     distance = value_text("distance_m", [distances[0], distances[-1]]) if len(distances) > 1 else f"{distances[0]:g} m"
     gaps = [gap for path in BEHIND for gap in _values(facts, path)]
-    gap = " or ".join(f"{one:g} mm" for one in gaps) if len(gaps) < 3 else f"{min(gaps):g} to {max(gaps):g} mm"
+    gap = " or ".join(f"{gap_mm:g} mm" for gap_mm in gaps) if len(gaps) < 3 else f"{min(gaps):g} to {max(gaps):g} mm"
     behind = f", {gap} in front of another surface" if gaps else ""
     target = facts["source"]["target"].get("name", "target")
     target = {"drawn": "target with damage drawn at random", "thesis": "board with eleven holes"}.get(target, target)

@@ -81,7 +81,7 @@ def _why(varied: Varied) -> str:
 
 def _side(label: str, side: str) -> Column:
     """Return the column ``label`` of `SET_UPS` for one side of a variation."""
-    (column,) = (one for one in SET_UPS.columns if one.label == label)
+    (column,) = (column for column in SET_UPS.columns if column.label == label)
 
     def cell(varied: Varied) -> Cell:
         row = getattr(varied, side)
@@ -114,18 +114,18 @@ VARIED = Table(
 def varied_section(tables: ResultTables, compared: pd.DataFrame, frames: Sequence[int] = (), of: str = "") -> Markup:
     """Return the sensitivity study: each variation beside the set-up that it changes (or else ``of``) with as many
     frames (or else the most). ``compared`` comes from `compare_set_ups`; empty ``frames`` show all."""
-    there: dict[str, list[Row]] = {}
+    by_variant: dict[str, list[Row]] = {}
     for row in records(compared):
         if not frames or row["frames"] in frames:
-            there.setdefault(str(row["variant"]), []).append(row)
+            by_variant.setdefault(str(row["variant"]), []).append(row)
     rows = []
     for variant in records(tables.variants[tables.variants["is_variation"].astype(bool)]):
         variant["reference"] = variant["reference"] or of
-        others = there.get(variant["reference"], [])
-        for number, one in enumerate(there.get(str(variant["variant"]), [None])):
-            alike = [other for other in others if one is not None and other["frames"] == one["frames"]]
+        originals = by_variant.get(variant["reference"], [])
+        for number, own in enumerate(by_variant.get(str(variant["variant"]), [None])):
+            alike = [original for original in originals if own is not None and original["frames"] == own["frames"]]
             again = {"reason": "", "settings": ""} if number else {}  # the reason appears once
-            rows.append(Varied({**variant, **again}, one, next(iter([*alike, *others[-1:]]), None)))
+            rows.append(Varied({**variant, **again}, own, next(iter([*alike, *originals[-1:]]), None)))
     if not rows:
         return Markup("")
     text = (
@@ -209,13 +209,13 @@ def holes_grid(summary: pd.DataFrame, *, terminal: bool = False) -> Grid:
 
     rows = []
     for hole, part in summary.groupby("hole", sort=False):
-        there = {row["frames"]: row for row in records(part)}
-        last = there[max(there)]
+        by_frames = {row["frames"]: row for row in records(part)}
+        last = by_frames[max(by_frames)]
         true = float(last["true_diameter_mm"])
         cells: list[str | Cell] = [str(hole), inches(true).replace(" in", '"') or "–", f"{true:.2f}"]
-        cells += [detected(there[n]) if n in there else "–" for n in frames]
-        for of in ("extent", "model") if terminal else ():
-            cells.append(plus_minus(*(last[f"{of}_diameter_{what}_mm"] for what in ("mean", "std"))))
+        cells += [detected(by_frames[n]) if n in by_frames else "–" for n in frames]
+        for kind in ("extent", "model") if terminal else ():
+            cells.append(plus_minus(*(last[f"{kind}_diameter_{what}_mm"] for what in ("mean", "std"))))
         rows.append(cells)
     counted = [f"N={n}" if terminal else many(n, "frame") for n in frames]
     heads = ["hole", "drill", "mm", *counted, *(("extent mm", "model mm") if terminal else ())]
@@ -235,17 +235,17 @@ def ways_grid(compared: pd.DataFrame) -> Grid:
     rows = [row for row in records(compared) if not row["is_variation"]]
     frames, views = shown_frames(compared), sorted({row["views"] for row in rows})
     several = len({row["place"] for row in rows}) > 1
-    there: dict[str, dict[tuple[int, int], Row]] = {}
+    by_way: dict[str, dict[tuple[int, int], Row]] = {}
     for row in rows:
         way = label_of(row["registration"], row["merge"], row["place"] if several else "")
-        there.setdefault(way, {})[row["views"], row["frames"]] = row
+        by_way.setdefault(way, {})[row["views"], row["frames"]] = row
 
     def count(row: Row | None) -> str:
         undecided = f"+{len(row['undecided'])}" if row and row["undecided"] else ""
         return "–" if row is None else f"{len(row['found'])}{undecided}"
 
     cells = [
-        [way, *(" / ".join(count(found.get((n, at))) for at in frames) for n in views)] for way, found in there.items()
+        [way, *(" / ".join(count(found.get((n, at))) for at in frames) for n in views)] for way, found in by_way.items()
     ]
     heads = ("registration, merge", *(many(n, "view") for n in views))
     of_holes = f" of {max(row['holes'] for row in rows)}" if rows else ""

@@ -151,7 +151,7 @@ def operating_figure(results: Sequence[SetUpResult]) -> str:
                 axes.legend(loc="lower right", fontsize=8, title="area under the curve" if axes is left else None)
         figure.legend(*middle.get_legend_handles_labels(), loc="outside lower center", ncols=2)
 
-    lines = sum(-(-len(name_of(one.limit)) // LONGEST_NAME) for one in results)
+    lines = sum(-(-len(name_of(result.limit)) // LONGEST_NAME) for result in results)
     return svg("operating", (10.6, 4.3 + 0.13 * lines), "Operating curves, a colour for each set-up.", draw)
 
 
@@ -237,24 +237,24 @@ def study_html(
     inspections = [limit.record.inspected for limit in limits]
     groups = {f"axis-{number}": group for number, group in enumerate(study.axis_groups(result.axes), 1)}
     shown = with_room(result.set_ups)
-    inspected = [one.limit for one in shown if one.limit.inspections]
-    curved = [one for one in shown if one.roc or one.free_response or one.pixels]
+    inspected = [set_up.limit for set_up in shown if set_up.limit.inspections]
+    curved = [set_up for set_up in shown if set_up.roc or set_up.free_response or set_up.pixels]
     figures = {name: axis_figure(group, name) for name, group in groups.items()}
-    if len({one.record.inspected.limit_of for one in inspected}) == 1:  # depths and diameters need separate axes
+    if len({set_up.record.inspected.limit_of for set_up in inspected}) == 1:  # depths and diameters need separate axes
         figures["overlay"] = overlay_figure(inspected)
-    figures |= {"depth-limits": depth_limits_figure(shown)} if any(one.surface for one in shown) else {}
+    figures |= {"depth-limits": depth_limits_figure(shown)} if any(set_up.surface for set_up in shown) else {}
     figures |= {"operating": operating_figure(curved)} if curved else {}
     named: list[tuple[str, str]] = []
-    for limit in (one.limit for one in shown):
+    for limit in (set_up.limit for set_up in shown):
         record = limit.record
-        some = [example for example in examples if (example.variant, example.frames) == (record.variant, record.frames)]
-        if some:
+        own = [example for example in examples if (example.variant, example.frames) == (record.variant, record.frames)]
+        if own:
             title_of, name = name_of(limit), f"examples-{len(named) + 1}"
             named.append((title_of, name))
-            figures[name] = examples_figure(name, some, title_of, by_limit=is_within_sizes(limit))
+            figures[name] = examples_figure(name, own, title_of, by_limit=is_within_sizes(limit))
 
-    def table(of: Table) -> Any:
-        return of.grid(rows[of]).html() if rows[of] else None
+    def table(declared: Table) -> Any:
+        return declared.grid(rows[declared]).html() if rows[declared] else None
 
     return template("study.html").render(
         title=title,

@@ -37,7 +37,7 @@ def summaries(tables: trials.ResultTables, examples: Sequence[Any] = (), *, with
     if not tables.registrations.empty:
         own = tables.registrations[tables.registrations["variant"].isin(set_ups)]
         found[trials.SET_UPS] = compare_maps(tables, summary)
-        found[trials.REGISTRATION_ERRORS] = by_views(own, sorted({one.views for one in maps_of(tables)}))
+        found[trials.REGISTRATION_ERRORS] = by_views(own, sorted({set_up.views for set_up in maps_of(tables)}))
         verdicts = score_views(map_cases(tables, summary)) if with_claims else ()
     else:
         several = len(set_ups) > 1

@@ -159,7 +159,7 @@ def measured(
     for name, settings in detectors.items():
         detector = load_detector(name, settings)
         findings = detector.find(cloud, detector.analyse(cloud), config.threshold.k or 0.0)
-        at_mm = np.array([image.plan_mm.reshape(-1, 2)[one.pixels].mean(axis=0) for one in findings]).reshape(-1, 2)
+        at_mm = np.array([image.plan_mm.reshape(-1, 2)[spot.pixels].mean(axis=0) for spot in findings]).reshape(-1, 2)
         hits = len(match(centres[seen], at_mm, config.matching.radius_mm))
         readings["share of holes found", name, ""] = Reading(hits / int(seen.sum())), int(seen.sum())
     return readings, peaks

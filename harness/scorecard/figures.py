@@ -143,8 +143,8 @@ def read_figures(path: Path = FIGURES_FILE) -> tuple[Figure, ...]:
         if isinstance(quantity, str) and quantity in QUANTITIES and isinstance(child(data, "conditions"), dict):
             splices["figures", number, "conditions"] = QUANTITIES[quantity].conditions
         if isinstance(name, str) and first.setdefault(name, number) != number:
-            here, there = (source.place_of(("figures", n, "name")) for n in (number, first[name]))
-            problems.append(Problem(f"two figures have the name {name}", here, other=there, other_says="first used at"))
+            place, used = (source.place_of(("figures", n, "name")) for n in (number, first[name]))
+            problems.append(Problem(f"two figures have the name {name}", place, other=used, other_says="first used at"))
     file, found = validated(FiguresFile, source, splices)
     if problems or file is None:
         raise DeclarationError(str(path), [*problems, *found])

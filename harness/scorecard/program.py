@@ -102,7 +102,7 @@ def _page(
     code = [score for score in scores if score.figure.kind == "code"]
     if code:
         body += [heading("Checks of the code"), note(CHECKS), scoring.SCORES.grid(code).html()]
-    meanings = [(f"{one.title} ({one.unit})" if one.unit else one.title, one.says) for one in QUANTITIES.values()]
+    meanings = [(f"{q.title} ({q.unit})" if q.unit else q.title, q.says) for q in QUANTITIES.values()]
     for title, rows in (("Quantities", meanings), ("Provenance", provenance.items())):
         lines = [tag("tr", tag("th", key, scope="row"), tag("td", plain(value))) for key, value in rows]
         body += [heading(title), tag("table", tag("tbody", *lines), kind="prov")]
@@ -143,11 +143,11 @@ def _answer(scores: Sequence[scoring.Score]) -> str:
     for score in blind:
         first = score.figure.camera.partition("_")[0]
         families.setdefault(FAMILIES.get(first, "other cameras"), []).append(score)
-    each = ", ".join(f"{name} {share(own)}" for name, own in families.items())
+    by_family = ", ".join(f"{name} {share(own)}" for name, own in families.items())
     values = [score for score in blind if score.figure.published.value is not None]
     bounds = [score for score in blind if score.figure.published.value is None]
     wide = sum(score.passes_by_tolerance for score in blind)
-    text = f"{share(blind)} blind figures pass{f' ({each})' if len(families) > 1 else ''}: {share(values)} values "
+    text = f"{share(blind)} blind figures pass{f' ({by_family})' if len(families) > 1 else ''}: {share(values)} values "
     text += f"within 25 %{f' ({wide} by a wider tolerance of the source)' if wide else ''}, {share(bounds)} bounds; "
     text += f"{share(by_use['calibration'])} figures that calibrated a camera pass; "
     text += f"{share(by_use['code'])} checks of the code pass."

@@ -257,8 +257,8 @@ def patch_pattern_mm(bench: Bench, c: PatchConditions) -> Reading:
     found = []
     for unit in range(1, min(bench.effort.units, 5) + 1):
         z_m = plane_stack(bench, _plane(c), PATTERNED, bench.effort.noise_frames // 4, unit, PATTERN_PATCH).z_m
-        one, other = (_left_of_patches(half.mean(axis=0), c.patch_px) for half in (z_m[::2], z_m[1::2]))
-        found.append(float(np.sqrt(max((one * other).mean(), 0.0))))
+        even, odd = (_left_of_patches(half.mean(axis=0), c.patch_px) for half in (z_m[::2], z_m[1::2]))
+        found.append(float(np.sqrt(max((even * odd).mean(), 0.0))))
     return mean_of(found)
 
 

@@ -40,9 +40,9 @@ def damage_words(kind: str) -> str:
 
 
 def _a90(row: Row) -> Estimate:
-    one = row.answer
-    a90_mm = one.largest_mm * 1.001 if np.isnan(one.a90_mm) else one.a90_mm
-    return Estimate(a90_mm, one.low_mm, one.high_mm, np.nan_to_num(one.largest_mm, nan=np.inf))
+    answer = row.answer
+    a90_mm = answer.largest_mm * 1.001 if np.isnan(answer.a90_mm) else answer.a90_mm
+    return Estimate(a90_mm, answer.low_mm, answer.high_mm, np.nan_to_num(answer.largest_mm, nan=np.inf))
 
 
 ATLAS = Table(

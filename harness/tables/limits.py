@@ -82,7 +82,7 @@ def quoted(limit: SetUpLimit) -> Bound:
 def _one_unit(limit: SetUpLimit) -> Estimate:
     """Return the a90/95 of the single unit, or the median, lowest and highest a90/95 of several units."""
     bounds = limit.a90_95.value if limit.over_units is None else limit.over_units.a90_95_mm
-    middle, low, high = (float(of(bounds)) for of in (np.median, np.min, np.max))
+    middle, low, high = (float(statistic(bounds)) for statistic in (np.median, np.min, np.max))
     ends = (low, high) if limit.over_units is not None else (np.nan, np.nan)
     return Estimate(middle if np.isfinite(middle) else np.nan, *ends, limit.largest_mm)
 
@@ -234,17 +234,17 @@ def study_answer(limits: Sequence[SetUpLimit]) -> str:
 def _answer(limits: Sequence[SetUpLimit]) -> str:
     if len(limits) <= MOST_ANSWERS:
         return " ".join(limit_sentence(limit, again=number > 0) for number, limit in enumerate(limits))
-    shown = sorted((one for one in limits if is_within_sizes(one, quoted(one))), key=lambda one: quoted(one).value)
+    shown = sorted((lim for lim in limits if is_within_sizes(lim, quoted(lim))), key=lambda lim: quoted(lim).value)
     if not shown:
         sentence = f"None of {len(limits)} set-ups demonstrates a limit (a90/95) within the sizes inspected"
         return f"{sentence}{_sizes(*limits)}."
-    kinds = sorted({one.record.inspected.limit_of for one in shown}, reverse=True)
+    kinds = sorted({limit.record.inspected.limit_of for limit in shown}, reverse=True)
     spans = []
     for kind in kinds:  # a depth is not compared with a diameter
-        some = [one for one in shown if one.record.inspected.limit_of == kind]
-        best, worst = ((text.size(quoted(one).value), one.record.label) for one in (some[0], some[-1]))
-        of = f" of {kind}" if len(kinds) > 1 else ""
-        spans.append("the smallest limit{} (a90/95) is {} mm ({}), the largest {} mm ({})".format(of, *best, *worst))
+        own = [limit for limit in shown if limit.record.inspected.limit_of == kind]
+        best, worst = ((text.size(quoted(limit).value), limit.record.label) for limit in (own[0], own[-1]))
+        which = f" of {kind}" if len(kinds) > 1 else ""
+        spans.append("the smallest limit{} (a90/95) is {} mm ({}), the largest {} mm ({})".format(which, *best, *worst))
     span = f"Of {len(limits)} set-ups, {'; '.join(spans)}"
     without = len(limits) - len(shown)
     few = f"; {without} of {len(limits)} set-ups demonstrate{'s' if without == 1 else ''}"
@@ -309,7 +309,7 @@ def limit_notes(limits: Sequence[SetUpLimit]) -> list[str]:
     """Return notes on the limits: first those that all set-ups share, then a line for each set-up."""
     notes = [(limit.record.label, notes_of(limit)) for limit in limits]
     shared = [note for note in notes[0][1] if all(note in these for _, these in notes)] if len(notes) > 1 else []
-    own = [("every set-up", shared), *((name, [one for one in these if one not in shared]) for name, these in notes)]
+    own = [("every set-up", shared), *((name, [note for note in these if note not in shared]) for name, these in notes)]
     return [f"{name}: {'; '.join(these)}" for name, these in own if these]
 
 

@@ -60,7 +60,7 @@ def outputs() -> Iterator[Output]:
     from harness.tables.trials import STORED, STUDY_ONLY, SUMMARISED
 
     yield from FILES
-    for tables, of in (
+    for tables, group in (
         (STORED, ""),
         (SUMMARISED, "other"),
         (STUDY_TABLES, "study"),
@@ -70,9 +70,9 @@ def outputs() -> Iterator[Output]:
     ):
         for table in tables:
             for name in table.files:
-                yield Output(name, table.note, of="study" if table in STUDY_ONLY else of)
+                yield Output(name, table.note, of="study" if table in STUDY_ONLY else group)
 
 
 def is_output(name: str, place: FolderKind) -> bool:
     """Return whether a program writes a file with this name to this place."""
-    return any(one.place == place and fnmatchcase(name, one.name) for one in outputs())
+    return any(output.place == place and fnmatchcase(name, output.name) for output in outputs())

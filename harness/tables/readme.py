@@ -43,9 +43,9 @@ GROUPS = {
 def results_readme() -> Iterator[str]:
     """Yield the lines of the text."""
     yield HEAD
-    for of, title in GROUPS.items():
+    for group, title in GROUPS.items():
         yield from ("", f"## {title}", "", "| file | content |", "|---|---|")
-        yield from (f"| `{output.name}` | {output.note} |" for output in FILES if output.of == of)
+        yield from (f"| `{output.name}` | {output.note} |" for output in FILES if output.of == group)
     yield TABLES
     of_trials = [table for table in STORED if table not in STUDY_ONLY]
     yield from _tables("Trials", of_trials)

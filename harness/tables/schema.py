@@ -57,10 +57,10 @@ class Estimate:
 
 def _share(share: float | Estimate) -> str:
     """Return a share as text, such as ``0.12 % (0.05 to 0.2 %)``."""
-    one = share if isinstance(share, Estimate) else Estimate(share)
-    value, low, high = (f"{100 * x:.{2 if x < 0.995 else 3}g}" for x in (one.value, one.low, one.high))
-    ends = f" ({low} to {high} %)" if np.isfinite(one.low) else ""
-    return text.UNKNOWN_TEXT if np.isnan(one.value) else f"{value} %{ends}"
+    estimate = share if isinstance(share, Estimate) else Estimate(share)
+    value, low, high = (f"{100 * x:.{2 if x < 0.995 else 3}g}" for x in (estimate.value, estimate.low, estimate.high))
+    ends = f" ({low} to {high} %)" if np.isfinite(estimate.low) else ""
+    return text.UNKNOWN_TEXT if np.isnan(estimate.value) else f"{value} %{ends}"
 
 
 FORMATS: dict[str, Callable[[Any], str]] = {
@@ -120,7 +120,7 @@ class Column:
         if isinstance(value, Cell):
             return replace(value, text=value.text.replace("\n", " ")) if terminal else value
         how = self.brief if terminal and callable(self.brief) else self.text
-        how = how or next(one for ending, one in FORMATS.items() if self.name.endswith(ending))
+        how = how or next(form for ending, form in FORMATS.items() if self.name.endswith(ending))
         return Cell(how(value), self.tone(row) if self.tone else "")
 
 
@@ -160,7 +160,7 @@ class Table:
             for column in self.stored:
                 value = column.of(row)
                 if column.spread:
-                    record |= {name: _scalar(one) for name, one in value.items()}
+                    record |= {name: _scalar(part) for name, part in value.items()}
                 elif len(column.names) > 1:
                     record |= dict(zip(column.names, (value.value, value.low, value.high), strict=True))
                 else:
@@ -201,7 +201,7 @@ class Table:
         """Return the labelled columns as text, for a page or in brief for a ``terminal``. ``only`` lists the labels to
         show; ``heads`` replaces declared labels, and an empty label hides its column."""
         shown = [column for column in self.columns if column.label and not (terminal and column.brief is False)]
-        labels = {one: (heads or {}).get(one.label, one.label) for one in shown if not only or one.label in only}
+        labels = {col: (heads or {}).get(col.label, col.label) for col in shown if not only or col.label in only}
         shown = [column for column, label in labels.items() if label]
         cells = [[column.cell(row, terminal=terminal) for column in shown] for row in rows]
         return Grid.of([labels[column] for column in shown], cells, self.left, self.title, self.kind)
@@ -228,10 +228,10 @@ def write_table(folder: Path, table: Table, frame: pd.DataFrame, about: Mapping[
         blocks = (pa.Table.from_pandas(part, preserve_index=False) for part in parts)
         block = next(blocks)
         fields = []
-        for one in block.schema:
-            column = noted.get(one.name)
+        for field in block.schema:
+            column = noted.get(field.name)
             facts = {} if column is None else {"unit": column.unit, "note": column.note}
-            fields.append(one.with_metadata({key: value for key, value in facts.items() if value}))
+            fields.append(field.with_metadata({key: value for key, value in facts.items() if value}))
         metadata = dict(block.schema.metadata or {})
         if about is not None:
             metadata[b"tofpod"] = json.dumps(about, sort_keys=True).encode()

@@ -154,7 +154,7 @@ def operating_notes(results: Sequence[SetUpResult]) -> list[str]:
         f"pixels above it, up to a share of {PRO_LIMIT:g} and divided by {PRO_LIMIT:g}, as in MVTec AD."
     )
     without = [result for result in results if result.pixels is not None and result.pixels.why]
-    return [text, *(f"{name_of(one.limit)}: no AU-PRO: {one.pixels.why}." for one in without if one.pixels)]
+    return [text, *(f"{name_of(result.limit)}: no AU-PRO: {result.pixels.why}." for result in without if result.pixels)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,18 +188,16 @@ def axis_groups(lines: Sequence[AxisLine]) -> list[AxisGroup]:
     groups = []
     for path in dict.fromkeys(line.axis for line in lines):
         of_axis = [line for line in lines if line.axis == path]
-        others = dict.fromkeys(other for line in of_axis for other in line.held)
-        taken = {other: [line.held.get(other) for line in of_axis] for other in others}
-        varied = [other for other, values in taken.items() if len(set(map(on_one_line, values))) > 1]
+        axes = dict.fromkeys(axis for line in of_axis for axis in line.held)
+        taken = {axis: [line.held.get(axis) for line in of_axis] for axis in axes}
+        varied = [axis for axis, values in taken.items() if len(set(map(on_one_line, values))) > 1]
 
-        def held(line: AxisLine, other: str, values: Sequence[Any]) -> str:
+        def held(line: AxisLine, axis: str, values: Sequence[Any]) -> str:
             """Return a label; a name such as ``kinect_v2`` explains itself, a number needs a key (``albedo=0.2``)."""
-            words = axis_value(other, differing(line.held[other], values))
-            return words if other == FRAMES or isinstance(line.held[other], str) else f"{names[other]}={words}"
+            words = axis_value(axis, differing(line.held[axis], values))
+            return words if axis == FRAMES or isinstance(line.held[axis], str) else f"{names[axis]}={words}"
 
-        labels = [
-            ", ".join(held(line, other, taken[other]) for other in varied if other in line.held) for line in of_axis
-        ]
+        labels = [", ".join(held(line, axis, taken[axis]) for axis in varied if axis in line.held) for line in of_axis]
         every = [value for line in of_axis for value in line.values]
         values = [value for at, value in enumerate(every) if value not in every[:at]]
         if all(line.numeric for line in of_axis):
@@ -241,7 +239,7 @@ def _step_text(row: AxisRow) -> str:
     beyond = " *" if step.beyond_chance else ""
     if not np.isfinite(step.ratio):
         return f"no a90 {'here' if np.isnan(step.to.a90_mm) else 'above'}{beyond}"
-    if all(one.beyond(one.a90_mm) for one in (step.frm, step.to)):
+    if all(end.beyond(end.a90_mm) for end in (step.frm, step.to)):
         return f"both beyond{beyond}"
     return f"× {step.ratio:.2f} ({text.interval(step.interval.low, step.interval.high)}){beyond}"
 

@@ -132,7 +132,7 @@ class Grid:
         heads: Iterable[str], rows: Iterable[Iterable[object]], left: int = 1, title: str = "", kind: str = "limits"
     ) -> Grid:
         """Make a grid of cells, or of their text."""
-        cells = tuple(tuple(one if isinstance(one, Cell) else Cell(str(one)) for one in row) for row in rows)
+        cells = tuple(tuple(cell if isinstance(cell, Cell) else Cell(str(cell)) for cell in row) for row in rows)
         return Grid(tuple(heads), cells, left, title, kind)
 
     def lines(self) -> list[str]:

@@ -244,17 +244,17 @@ PIXELS = Table(
 )
 
 
-def _mean(of: str, label: str) -> Column:
+def _mean(kind: str, label: str) -> Column:
     """Return a column for pages with a mean and its standard deviation."""
-    return Column("", label, lambda row: text.plus_minus(row[f"{of}_mean_mm"], row[f"{of}_std_mm"]))
+    return Column("", label, lambda row: text.plus_minus(row[f"{kind}_mean_mm"], row[f"{kind}_std_mm"]))
 
 
-def _error(of: str, label: str) -> Column:
+def _error(kind: str, label: str) -> Column:
     """Return a column for pages with a mean error, its standard deviation and the number of values."""
 
     def error(row: Mapping[str, Any]) -> str:
-        count = int(row[f"{of}_n"])
-        return f"{text.plus_minus(row[f'{of}_bias_mm'], row[f'{of}_std_mm'], '+')} ({count})" if count else "–"
+        count = int(row[f"{kind}_n"])
+        return f"{text.plus_minus(row[f'{kind}_bias_mm'], row[f'{kind}_std_mm'], '+')} ({count})" if count else "–"
 
     return Column("", label, error)
 
@@ -286,9 +286,9 @@ SUMMARY = Table(
         *_columns(status="found, missed or undecided: the interval lies above, lies below or contains 0.5"),
         _mean("extent_diameter", "extent (mm)"),
         _mean("model_diameter", "model (mm)"),
-        *(Column(f"{of}_{name}", note=f"{note} ({by})") for of, by in BY for name, note in STATISTICS.items()),
-        *(Column(f"{of}_bias_mm", note=f"mean diameter minus true diameter ({by})", interval=True) for of, by in BY),
-        *(Column(f"{of}_error_mean_mm", f"centre off, {of} (mm)", note=f"mean error of place ({by})") for of, by in BY),
+        *(Column(f"{k}_{name}", note=f"{note} ({by})") for k, by in BY for name, note in STATISTICS.items()),
+        *(Column(f"{k}_bias_mm", note=f"mean diameter minus true diameter ({by})", interval=True) for k, by in BY),
+        *(Column(f"{k}_error_mean_mm", f"centre off, {k} (mm)", note=f"mean error of place ({by})") for k, by in BY),
         Column("model_diameter_se_mean_mm", "its stated error (mm)", note="mean standard error stated by the fits"),
         Column("model_diameter_covered", "truth within 1.96 of it", None, COVERED, _percent),
         Column("model_depth_mean_mm", "depth (mm)", note="mean depth (the model)"),
@@ -351,10 +351,10 @@ SET_UPS = Table(
         Column("", "found", _found),
         Column("limit_mm", "from (mm)", note="smallest diameter at and above which all holes are found"),
         Column("half_mm", "50 % size (mm)", note="size found half of the time", interval=True, brief=False),
-        *(_error(of, label) for of, label in ERRORS.items()),
+        *(_error(kind, label) for kind, label in ERRORS.items()),
         *(
-            Column(f"{of}_{name}", note=f"{note} of the errors of found holes: {label.removesuffix(' (mm)')}")
-            for of, label in ERRORS.items()
+            Column(f"{kind}_{name}", note=f"{note} of the errors of found holes: {label.removesuffix(' (mm)')}")
+            for kind, label in ERRORS.items()
             for name, note in (("bias_mm", "mean"), ("std_mm", "standard deviation"), ("n", "number"))
         ),
         Column("", "mm per pixel", lambda row: " × ".join(text.mm(row.get(name, math.nan)) for name in PITCH)),

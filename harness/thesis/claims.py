@@ -231,16 +231,16 @@ def score_claims(
     units = summary[summary["variant"].isin({variant, *tables.variants["variant"][alone]})]
     every = (summary, with_columns(tables.holes), tables.runs, tables.probes)
     summary, holes, runs, probes = (table[table["variant"] == variant] for table in every)
-    case = Case(variant, summary, units, holes, runs, probes, [one for one in examples if one.variant == variant])
+    case = Case(variant, summary, units, holes, runs, probes, [shown for shown in examples if shown.variant == variant])
     return [verdict_of(claim, *rule(case)) for claim, rule in RULES.items()]
 
 
 def falling_rank(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     """Return Spearman's rho and the one-sided permutation p of "y falls as x grows", exact up to 8 pairs, or (0, 1)."""
-    ranks, other = rankdata(x), rankdata(y)
-    if np.ptp(ranks) == 0 or np.ptp(other) == 0:
+    x_ranks, y_ranks = rankdata(x), rankdata(y)
+    if np.ptp(x_ranks) == 0 or np.ptp(y_ranks) == 0:
         return 0.0, 1.0
-    a, b = ranks - ranks.mean(), other - other.mean()
+    a, b = x_ranks - x_ranks.mean(), y_ranks - y_ranks.mean()
     norm = np.sqrt((a @ a) * (b @ b))
     null = a[_orders(len(a))] @ b
     return float(a @ b / norm), float((null <= a @ b + 1e-12 * norm).mean())
@@ -263,7 +263,7 @@ def scatter_ratio(holes: pd.DataFrame, first: str, second: str) -> tuple[float, 
 
     def ratio(chosen: np.ndarray) -> np.ndarray:
         with np.errstate(invalid="ignore", divide="ignore"), warnings.catch_warnings(action="ignore"):
-            over, under = (np.nanvar(np.where(both, of, np.nan)[chosen], axis=1, ddof=1) for of in (top, bottom))
+            over, under = (np.nanvar(np.where(both, data, np.nan)[chosen], axis=1, ddof=1) for data in (top, bottom))
             ratios = over / under
         return np.nanmedian(np.where(np.isnan(ratios).all(axis=1, keepdims=True), np.inf, ratios), axis=1)
 
@@ -276,7 +276,7 @@ def _found(case: Case, frames: int, expected: frozenset[str], unexpected: frozen
     if set(status) != set(THESIS_HOLES):
         why = f"no trial has {frames} frames" if not status else "the target is not the thesis' row of eleven holes"
         return "undecided", f"Not judged: {why}."
-    by_state = {of: [hole for hole, state in status.items() if state == of] for of in ("found", "missed", "undecided")}
+    by_state = {k: [hole for hole, state in status.items() if state == k] for k in ("found", "missed", "undecided")}
     more = [hole for hole in by_state["found"] if hole in unexpected]
     fewer = [hole for hole in by_state["missed"] if hole in expected]
     open_ = [hole for hole in by_state["undecided"] if hole in expected | unexpected]
@@ -314,8 +314,8 @@ def claim_c11(summary: pd.DataFrame, axes: Sequence[str]) -> Verdict | None:
     }
     units = rows.groupby(CAMERA)[CAMERA_UNIT].nunique().min() if CAMERA_UNIT in axes else 1
     counts = [
-        f"{place} {' / '.join(' to '.join(map(str, sorted(set(of.get(one, ()))))) or '–' for one in (BEST, *OTHERS))}"
-        for place, of in found.items()
+        f"{place} {' / '.join(' to '.join(map(str, sorted(set(held.get(who, ()))))) or '–' for who in (BEST, *OTHERS))}"
+        for place, held in found.items()
     ]
     evidence = [f"Holes found with {MANY} frames by {BEST} / {' / '.join(OTHERS)}: {'; '.join(counts)}."]
     if units < FEWEST_UNITS:
@@ -323,9 +323,9 @@ def claim_c11(summary: pd.DataFrame, axes: Sequence[str]) -> Verdict | None:
     answers: list[bool | None] = []
     for camera in OTHERS:
         standings: dict[str, list[str]] = {word: [] for word in ("ahead", "level", "behind", "open")}
-        for place, of in found.items():
-            if {BEST, camera} <= set(of):
-                (low, high), (other_low, other_high) = of[BEST], of[camera]
+        for place, held in found.items():
+            if {BEST, camera} <= set(held):
+                (low, high), (other_low, other_high) = held[BEST], held[camera]
                 sure = low == high and other_low == other_high
                 word = "ahead" if low > other_high else "behind" if high < other_low else "level" if sure else "open"
                 standings[word].append(place)

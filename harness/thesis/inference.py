@@ -40,18 +40,18 @@ def posterior_of(summary: pd.DataFrame, axes: Sequence[str]) -> pd.DataFrame | N
     share = np.exp(logs - logs.max())
     share, prior = share / share.sum(), 1 / len(share)
     found = [
-        {"axis": SET_UP, "value": name, "prior_share": prior, "likelihood": np.exp(logs[name]), "posterior_share": of}
-        for name, of in share.sort_values(ascending=False, kind="stable").items()
+        {"axis": SET_UP, "value": name, "prior_share": prior, "likelihood": np.exp(logs[name]), "posterior_share": post}
+        for name, post in share.sort_values(ascending=False, kind="stable").items()
     ]
     of_set_up = rows.drop_duplicates("variant").set_index("variant")
     for path, name in names_of(list(axes)).items():
         among, kind = of_set_up, SPEAKS_OF.get(path)
         if kind and KIND in axes:
             among, name = of_set_up[of_set_up[KIND] == kind], f"{name} of {kind} holes"
-        for value, there in among.groupby(path, dropna=False):
-            own = {"axis": name, "value": value_text(path, value), "prior_share": len(there) / len(among)}
-            mean = float(np.exp(logs[there.index]).mean())
-            part = float(share[there.index].sum() / share[among.index].sum())
+        for value, group in among.groupby(path, dropna=False):
+            own = {"axis": name, "value": value_text(path, value), "prior_share": len(group) / len(among)}
+            mean = float(np.exp(logs[group.index]).mean())
+            part = float(share[group.index].sum() / share[among.index].sum())
             found.append({**own, "likelihood": mean, "posterior_share": part})
     return pd.DataFrame(found)
 

@@ -83,14 +83,14 @@ def _c8(case: maps.MapCase) -> tuple[Answer, str]:
 
 
 def _c10(case: maps.MapCase) -> tuple[Answer, str]:
-    chosen = [one for one in case.maps if (one.registration, one.merge) == SLAM and one.views > 1]
-    chosen.sort(key=lambda one: (not one.is_variation, -one.views))
-    ended = [one for one in chosen if case.frames(one.variant)]
-    finished = (maps.Map(one.variant, case.frames(one.variant)[-1], one.views) for one in ended)
+    chosen = [set_up for set_up in case.maps if (set_up.registration, set_up.merge) == SLAM and set_up.views > 1]
+    chosen.sort(key=lambda set_up: (not set_up.is_variation, -set_up.views))
+    ended = [set_up for set_up in chosen if case.frames(set_up.variant)]
+    finished = (maps.Map(set_up.variant, case.frames(set_up.variant)[-1], set_up.views) for set_up in ended)
     slam, alone, two = next(finished, None), case.single(), case.named(2, maps.THESIS_REGISTRATION, maps.THESIS_MERGE)
     if slam is None or alone is None or two is None:
-        there = {"SLAM map": slam, "single view": alone, "merge of two": two}
-        missing = ", no ".join(name for name, found in there.items() if not found)
+        named = {"SLAM map": slam, "single view": alone, "merge of two": two}
+        missing = ", no ".join(name for name, found in named.items() if not found)
         return "undecided", f"Not judged: the experiment has no {missing}."
     three = (slam, alone, two)
     # holes that all three maps measure in enough repeats
@@ -115,7 +115,7 @@ def _c10(case: maps.MapCase) -> tuple[Answer, str]:
         ("position error", [errors(each, "extent_offset_mm", "true_offset_mm") for each in three], _rms, rms_gap),
     ):
         if what == "surface noise" or values[0].size:
-            gaps = [gap(values[0], other) for other in values[1:]]
+            gaps = [gap(values[0], value) for value in values[1:]]
             parts += [interval.over(0) for interval in gaps]
             sizes = [size(each) for each in values]
             more = " and ".join(map(maps.span, gaps))
@@ -139,10 +139,10 @@ def rms_gap(first: np.ndarray, second: np.ndarray) -> intervals.Interval:
     draws = []
     for errors in (first, second):
         weights = rng.multinomial(len(errors), np.full(len(errors), 1 / len(errors)), intervals.RESAMPLES)
-        there = np.isfinite(errors)
-        squares = np.where(there, errors, 0.0) ** 2
+        valid = np.isfinite(errors)
+        squares = np.where(valid, errors, 0.0) ** 2
         with np.errstate(invalid="ignore"):
-            draws.append(np.sqrt(weights @ squares.sum(axis=1) / (weights @ there.sum(axis=1))))
+            draws.append(np.sqrt(weights @ squares.sum(axis=1) / (weights @ valid.sum(axis=1))))
     tail = (1 - intervals.CONFIDENCE) / 2
     low, high = np.nanquantile(draws[0] - draws[1], [tail, 1 - tail])
     return intervals.Interval(float(low), float(high))
@@ -166,25 +166,25 @@ def _h1(case: maps.MapCase) -> tuple[Answer, str]:
 def duels_of(case: maps.MapCase) -> list[tuple[tuple[Standing, ...], str]]:
     """Compare H1's map with a single view that has as many frames as each of its views, and with a single view that has
     as many exposures in total, if they exist. Return the standing in each respect, and the numbers as text."""
-    fused = [one for one in case.set_ups if one.merge == NOISE_REDUCING and one.views > 1 and case.frames(one.variant)]
-    registration = next((name for name in MARKED if any(one.registration == name for one in fused)), None)
-    fused = sorted((one for one in fused if one.registration == registration), key=lambda one: -one.views)
+    fused = [way for way in case.set_ups if way.merge == NOISE_REDUCING and way.views > 1 and case.frames(way.variant)]
+    registration = next((name for name in MARKED if any(way.registration == name for way in fused)), None)
+    fused = sorted((way for way in fused if way.registration == registration), key=lambda way: -way.views)
     first = case.single()
     equal_frames = (
-        (maps.Map(one.variant, rival.frames, one.views), rival)
-        for one in fused
-        for frames in [case.common_frames(one.variant, first.variant if first else None)]
+        (maps.Map(way.variant, rival.frames, way.views), rival)
+        for way in fused
+        for frames in [case.common_frames(way.variant, first.variant if first else None)]
         for rival in [case.single(frames) if frames is not None else None]
         if rival is not None
     )
-    lone = [one for one in case.maps if one.views == 1]
-    lone.sort(key=lambda one: (first is None or one.variant != first.variant, one.is_variation))
+    lone = [way for way in case.maps if way.views == 1]
+    lone.sort(key=lambda way: (first is None or way.variant != first.variant, way.is_variation))
     equal_exposures = (
-        (maps.Map(one.variant, frames, one.views), maps.Map(alone.variant, one.views * frames, 1))
-        for one in fused
-        for frames in reversed(case.frames(one.variant))
+        (maps.Map(way.variant, frames, way.views), maps.Map(alone.variant, way.views * frames, 1))
+        for way in fused
+        for frames in reversed(case.frames(way.variant))
         for alone in lone
-        if one.views * frames in case.frames(alone.variant)
+        if way.views * frames in case.frames(alone.variant)
     )
     pairs = [next(iter(kind), None) for kind in (equal_frames, equal_exposures)]
     return [_duel(case, *pair, registration or "") for pair in pairs if pair is not None]
@@ -197,7 +197,7 @@ def _duel(case: maps.MapCase, mapped: maps.Map, rival: maps.Map, registration: s
     sure = low == high == rival_low == rival_high
     standings: tuple[Standing, ...] = (
         "ahead" if low > rival_high else "behind" if high < rival_low else "level" if sure else "open",
-        *("ahead" if one.is_below else "behind" if one.interval.over(0) else "open" for one in (sizes, noise)),
+        *("ahead" if gap.is_below else "behind" if gap.interval.over(0) else "open" for gap in (sizes, noise)),
     )
     each = ", ".join(f"{respect} {standing}" for respect, standing in zip(RESPECTS, standings, strict=True))
     text = (
@@ -230,12 +230,12 @@ def score_views(cases: Sequence[maps.MapCase]) -> list[Verdict]:
     for claim, rule in VIEW_CLAIMS.items():
         judged = [(case, verdict_of(claim, *rule(case))) for case in cases]
         if len(cases) > 1:
-            judged = [(case, replace(one, evidence=f"{case.place}: {one.evidence}")) for case, one in judged]
+            judged = [(case, replace(result, evidence=f"{case.place}: {result.evidence}")) for case, result in judged]
         if claim in OVER_UNITS:
             places = dict.fromkeys(case.without_unit for case in cases)
-            verdicts += [_over_units([one for case, one in judged if case.without_unit == at]) for at in places]
+            verdicts += [_over_units([result for case, result in judged if case.without_unit == at]) for at in places]
         else:
-            verdicts += [one for _, one in judged]
+            verdicts += [result for _, result in judged]
     return verdicts
 
 

@@ -73,9 +73,9 @@ def _setting_in_words(part: str) -> str:
 def differing(value: Any, others: Iterable[Any]) -> Any:
     """Return a mapping without the entries that all ``others`` share; return any other value unchanged."""
     held = list(others)
-    if not all(isinstance(other, dict) for other in (value, *held)):
+    if not all(isinstance(item, dict) for item in (value, *held)):
         return value
-    return {key: own for key, own in value.items() if any(other.get(key) != own for other in held)}
+    return {key: own for key, own in value.items() if any(item.get(key) != own for item in held)}
 
 
 def _is_number(value: Any) -> bool:
@@ -86,7 +86,7 @@ def on_one_line(value: Any) -> str:
     """Return a value as text of at most `LONGEST` characters; a mapping starts with its kind, as in ``flat {...}``."""
     choice = next((key for key in CHOICES if key in value), "") if isinstance(value, dict) else ""
     if choice:
-        rest = {key: other for key, other in value.items() if key != choice}
+        rest = {key: part for key, part in value.items() if key != choice}
         text = f"{value[choice]} {json.dumps(rest, ensure_ascii=False)}".replace('"', "").removesuffix(" {}")
     else:
         text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)

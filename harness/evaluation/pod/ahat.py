@@ -133,7 +133,7 @@ def choose_axes(
     log_sizes = (False, True) if np.all(sizes > 0) else (False,)
     log_signals = (False, True) if min(lowest, decision) > 0 else (False,)
     fit = partial(fit_ahat, sizes, signals, decision=decision, left=left, right=right, inspections=inspections)
-    fits = [fit(log_size=one, log_signal=other) for one, other in product(log_sizes, log_signals)]
+    fits = [fit(log_size=of_size, log_signal=of_signal) for of_size, of_signal in product(log_sizes, log_signals)]
     return tuple(sorted(fits, key=lambda each: each.deviance))
 
 

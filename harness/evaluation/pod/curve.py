@@ -50,8 +50,8 @@ def logs_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarr
         return special.log_ndtr(t), special.log_ndtr(-t), -0.5 * t * t - 0.5 * np.log(2.0 * np.pi)
     signed = t if link == "cloglog" else -t
     hazard = np.exp(signed)
-    nearer, other = -hazard, np.log(-np.expm1(-hazard))
-    return (other, nearer, signed - hazard) if link == "cloglog" else (nearer, other, signed - hazard)
+    log_none, log_any = -hazard, np.log(-np.expm1(-hazard))
+    return (log_any, log_none, signed - hazard) if link == "cloglog" else (log_none, log_any, signed - hazard)
 
 
 def slopes_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -177,9 +177,9 @@ class HitsAndMisses:
 
     def climb(self, places: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return values and steps of the studies ``which``, for `ascend`."""
-        some = self if self.penalty is None and len(which) == len(self.hits) else self.of(which)
-        value = some.value(places)
-        return np.where(np.isfinite(value), value, -np.inf), some.step(places)
+        chosen = self if self.penalty is None and len(which) == len(self.hits) else self.of(which)
+        value = chosen.value(places)
+        return np.where(np.isfinite(value), value, -np.inf), chosen.step(places)
 
 
 def ascend(

@@ -175,8 +175,8 @@ def floor_ceiling_tests(fit: HitMissFit) -> tuple[FloorCeilingTest, ...]:
     for beyond, floor, ceiling in cases if fit.method == "ML" else ():
         place, value = _search(fit.data, np.append(fit.place, [0.0, 1.0]), floor, ceiling)
         statistic = max(2.0 * (value - fit.log_likelihood) / fit.repeats, 0.0)
-        one, two = stats.chi2.sf(statistic, [1, 2])
-        tail = 0.5 * one if beyond != "both" else 0.5 * one + 0.25 * two
+        p_one, p_two = stats.chi2.sf(statistic, [1, 2])
+        tail = 0.5 * p_one if beyond != "both" else 0.5 * p_one + 0.25 * p_two
         tests.append(FloorCeilingTest(beyond, float(tail) if statistic > 1e-9 else 1.0, *place[2:].tolist()))
     return tuple(tests)
 
@@ -261,8 +261,8 @@ def rows_of_target(size: np.ndarray, inspections: ArrayLike | None) -> np.ndarra
     if len(names) != len(size):
         raise UserError(f"{len(names)} target names for {len(size)} rows", legal="one for each row")
     _, first, target = np.unique(names, return_index=True, return_inverse=True)
-    if np.any(other := size != size[first][target]):
-        raise UserError(f"target {names[other][0]} has more than one size", legal="one size for each target")
+    if np.any(differs := size != size[first][target]):
+        raise UserError(f"target {names[differs][0]} has more than one size", legal="one size for each target")
     return np.bincount(target)[target]
 
 
@@ -300,7 +300,7 @@ def band(fit: HitMissFit, sizes: np.ndarray, confidence: float = 0.95) -> tuple[
 def largest_bound(fits: Sequence[HitMissFit], design_effects: Sequence[float] = ()) -> Bound:
     """Return the largest a90/95 of several models; infinite if any of them has none. ``design_effects``: by model."""
     effects = design_effects or [1.0] * len(fits)
-    bounds = (bound(fit, design_effect=of) for fit, of in zip(fits, effects, strict=True))
+    bounds = (bound(fit, design_effect=effect) for fit, effect in zip(fits, effects, strict=True))
     return max(bounds, key=lambda limit: limit.value)
 
 

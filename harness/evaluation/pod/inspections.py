@@ -74,13 +74,13 @@ def read_inspections(
     texts = [[row[column].strip() for _, row in rows] for column in columns]
     sizes = _numbers(path, size, lines, texts[0], notes)
     read_one = _hits if hits else _numbers
-    each = [read_one(path, name, lines, text, notes) for name, text in zip(responses, texts[1:], strict=False)]
+    parts = [read_one(path, name, lines, text, notes) for name, text in zip(responses, texts[1:], strict=False)]
     names = np.array(texts[-1]) if target else (lines.astype(str) if len(responses) > 1 else None)
     for line, name in zip(lines, names if target and names is not None else (), strict=False):
         if not name:
             raise UserError(f"{path}, line {line}: {target} is empty", fix="name the target, or remove the row")
     # from here on, one inspection per row: all of the first inspector, then all of the second ...
-    response, count = np.concatenate(each), len(responses)
+    response, count = np.concatenate(parts), len(responses)
     sizes, lines = np.tile(sizes, count), np.tile(lines, count)
     names = None if names is None else np.tile(names, count)
     if missing := int(np.isnan(response).sum()):

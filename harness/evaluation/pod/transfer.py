@@ -160,8 +160,8 @@ class Transfer:
         nodes = stream.choice(len(weight), DRAWS, p=weight)
         campaigns = np.vstack([self.hit, stream.random((DRAWS, len(self.size))) < np.exp(found[nodes])])
         statistic = []
-        for some in np.array_split(campaigns, -(-len(campaigns) * len(weight) // (CELLS * 64))):
-            value = some @ found.T + ~some @ missed.T
+        for block in np.array_split(campaigns, -(-len(campaigns) * len(weight) // (CELLS * 64))):
+            value = block @ found.T + ~block @ missed.T
             statistic.append(-np.log(np.exp(value - value.max(axis=1, keepdims=True)) @ weight))
         own, *others = np.concatenate(statistic).tolist()
         return float((1 + (np.array(others) >= own - 1e-9).sum()) / (1 + DRAWS))

@@ -62,8 +62,8 @@ def _shuffled(places: pd.DataFrame, runs: pd.DataFrame, findings: pd.DataFrame, 
     laid, near = int(len(own) * len(judged) - on_own), 0
     if not findings.empty:
         unmatched = findings[findings["role"].isin(("damaged", "hole_free")) & (findings["hole"] == "")]
-        for (role, board, _), here in unmatched.groupby(["role", "board", "repeat"]):
-            offset = at[:, None] - here[["x_mm", "y_mm"]].to_numpy(float)
+        for (role, board, _), calls in unmatched.groupby(["role", "board", "repeat"]):
+            offset = at[:, None] - calls[["x_mm", "y_mm"]].to_numpy(float)
             hit = ((offset**2).sum(axis=2) <= radius_mm**2).any(axis=1)
             near += int((hit & ((own.to_numpy() != board) | (role != "damaged"))).sum())
     return near / laid if laid else np.nan, laid
@@ -165,7 +165,7 @@ def pixel_curves(pixels: pd.DataFrame) -> PixelCurves | None:
         return None
     false = _counts(face["above"]).sum(axis=0) / face["pixels"].sum()
     overlap = (_counts(damage["above"]) / damage["pixels"].to_numpy()[:, None]).mean(axis=0)
-    false, overlap = (np.concatenate([[0.0], of[::-1], [1.0]]) for of in (false, overlap))
+    false, overlap = (np.concatenate([[0.0], rates[::-1], [1.0]]) for rates in (false, overlap))
     if false[-2] < PRO_LIMIT and overlap[-2] != 1:
         why = f"the thresholds counted end at a false-positive rate of {false[-2]:.3g}"
         return PixelCurves(false, overlap, np.nan, why)

@@ -122,7 +122,7 @@ def _level(ideal_mm: np.ndarray, ideal_index: np.ndarray, needed: np.ndarray, al
     """Return one share of damages found, from arrays (1 + draws,) that begin with the estimate."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         share = (ideal_index / needed) ** 2
-    of_index, of_share = (percentiles(of[1:]) if np.isfinite(needed[0]) else UNKNOWN for of in (needed, share))
+    of_index, of_share = (percentiles(draws[1:]) if np.isfinite(needed[0]) else UNKNOWN for draws in (needed, share))
     indices = float(ideal_index[0]), float(needed[0]), of_index
     return Level(float(ideal_mm[0]), percentiles(ideal_mm[1:]), all_found, *indices, float(share[0]), of_share)
 

@@ -74,12 +74,12 @@ def weights_in_blocks(draws: int, *rows: tuple[np.ndarray, str]) -> Iterator[tup
     often each draw has the board of each row, (draws, n). Draws are the same for equal numbers of boards of a
     population, so set-ups are paired; two populations ("damaged", "hole-free") are drawn independently."""
     found = [(*np.unique(board, return_inverse=True), population) for board, population in rows]
-    streams = [random_stream(0, "boards drawn again", of, len(names)) for names, _, of in found]
+    streams = [random_stream(0, "boards drawn again", population, len(names)) for names, _, population in found]
     at_once = max(1, CELLS // max(1, *(len(which) for _, which, _ in found)))
     for first in range(0, draws, at_once):
         count = min(at_once, draws - first)
-        each = zip(streams, found, strict=True)
-        yield tuple(_drawn(stream, len(names), count)[:, which] for stream, (names, which, _) in each)
+        drawn = zip(streams, found, strict=True)
+        yield tuple(_drawn(stream, len(names), count)[:, which] for stream, (names, which, _) in drawn)
 
 
 def refitted_sizes(targets: Targets, curve: PodCurve, pods: tuple[float, ...], draws: int = DRAWS) -> np.ndarray:
@@ -106,8 +106,8 @@ def _refitted(targets: Targets, curve: PodCurve, pods: tuple[float, ...], weight
     b[overlap] = maxima(data.of(overlap), start)
     apart = np.isfinite(largest_miss) & np.isfinite(smallest_hit) & ~overlap
     if apart.any():
-        some = HitsAndMisses(data.design, hits[apart], misses[apart], curve.link, repeats[apart])
-        b[apart] = penalised_maxima(some, 1e-6)
+        separated = HitsAndMisses(data.design, hits[apart], misses[apart], curve.link, repeats[apart])
+        b[apart] = penalised_maxima(separated, 1e-6)
     at = crossings(b, curve.link, pods)
     at[:, largest_miss == -np.inf] = z.min()
     with np.errstate(over="ignore"):

@@ -35,22 +35,22 @@ class HitsChange:
 
 def hits_change(first: Inspected, second: Inspected) -> HitsChange | None:
     """Compare hits on the inspections (board, hole, repeat) that both have; None if there are none."""
-    one, two = shared_rows(first, second)
-    if not len(one):
+    rows_1, rows_2 = shared_rows(first, second)
+    if not len(rows_1):
         return None
-    found, now = first.hit[one], second.hit[two]
+    found, now = first.hit[rows_1], second.hit[rows_2]
     only_first, only_second = int((found & ~now).sum()), int((now & ~found).sum())
-    names, board = np.unique(first.board[one], return_inverse=True)
+    names, board = np.unique(first.board[rows_1], return_inverse=True)
     gained = np.bincount(board, now.astype(float) - found.astype(float)).round().astype(int)
-    return HitsChange(len(names), len(one), only_first, only_second, *sign_flip(gained))
+    return HitsChange(len(names), len(rows_1), only_first, only_second, *sign_flip(gained))
 
 
 def shared_rows(first: Inspected, second: Inspected) -> tuple[np.ndarray, np.ndarray]:
     """Return the rows (k,) of ``first`` and of ``second`` that are the same inspection."""
     keys = (zip(t.board.tolist(), t.hole.tolist(), t.repeat.tolist(), strict=True) for t in (first, second))
-    at, there = ({key: row for row, key in enumerate(one)} for one in keys)
-    shared = [key for key in at if key in there]
-    return np.array([at[key] for key in shared], int), np.array([there[key] for key in shared], int)
+    row_1, row_2 = ({key: row for row, key in enumerate(inspections)} for inspections in keys)
+    shared = [key for key in row_1 if key in row_2]
+    return np.array([row_1[key] for key in shared], int), np.array([row_2[key] for key in shared], int)
 
 
 def sign_flip(gained: np.ndarray) -> Tails:
@@ -88,18 +88,18 @@ KNOWN = 0.9
 
 def limit_change(first: SetUpLimit, second: SetUpLimit, same_boards: bool) -> LimitChange:
     """Compare two a90 by resampled boards. ``same_boards``: boards with equal damage; paired if both saw the same."""
-    one, two = first.a90_draws_mm, second.a90_draws_mm
+    draws_1, draws_2 = first.a90_draws_mm, second.a90_draws_mm
     boards = [np.unique(limit.record.inspected.board) for limit in (first, second)]
-    paired = same_boards and bool(np.array_equal(boards[0], boards[1])) and len(one) == len(two)
+    paired = same_boards and bool(np.array_equal(boards[0], boards[1])) and len(draws_1) == len(draws_2)
     with np.errstate(invalid="ignore"):  # infinity minus infinity is NaN: no evidence
-        differences = two - one if paired else (two[:, None] - one[None, :]).ravel()
+        differences = draws_2 - draws_1 if paired else (draws_2[:, None] - draws_1[None, :]).ravel()
     tie = 0.5 * float(np.mean(np.isnan(differences) | (differences == 0)))
-    weight = 1.0 / (1 + len(one)) if paired else 0.0  # the least p-value that so few draws can support
+    weight = 1.0 / (1 + len(draws_1)) if paired else 0.0  # the least p-value that so few draws can support
     shares = (float(np.mean(differences < 0)) + tie, float(np.mean(differences > 0)) + tie)
     grown, shrunk = ((1 - weight) * share + weight for share in shares)
     before, now = first.a90_mm, second.a90_mm
     with np.errstate(all="ignore"):
-        change, logs = float(np.log(now / before)), np.log(two / one) if paired else np.empty(0)
+        change, logs = float(np.log(now / before)), np.log(draws_2 / draws_1) if paired else np.empty(0)
     known = logs[np.isfinite(logs)]
     if len(known) > KNOWN * len(logs) and known.std() > 0 and np.isfinite(change):
         grown, shrunk = t.sf([change, -change], len(boards[0]) - 1, scale=known.std()).tolist()
@@ -128,17 +128,17 @@ def signal_change(first: SetUpRecord, second: SetUpRecord) -> SignalChange | Non
     """Compare signals on the inspections that both have. This is more sensitive than hits: signals change with all
     noise and with the threshold, hits only near the limit. A damage counts if the geometric mean of its two signals,
     each over ``found_from``, exceeds 1; smaller signals are noise. None for two detectors or fewer than two boards."""
-    one, two = shared_rows(first.inspected, second.inspected)
-    if first.detector != second.detector or not len(one):
+    rows_1, rows_2 = shared_rows(first.inspected, second.inspected)
+    if first.detector != second.detector or not len(rows_1):
         return None
     needed = found_from(first), found_from(second)
     with np.errstate(divide="ignore", invalid="ignore"):
         before, now = (
-            np.log(of.inspected.signal[rows] / at)
-            for of, rows, (at, _) in zip((first, second), (one, two), needed, strict=True)
+            np.log(record.inspected.signal[rows] / at)
+            for record, rows, (at, _) in zip((first, second), (rows_1, rows_2), needed, strict=True)
         )
         clear = np.isfinite(before + now) & (before + now > 0)
-    change, board = (now - before)[clear], first.inspected.board[one][clear]
+    change, board = (now - before)[clear], first.inspected.board[rows_1][clear]
     names, which = np.unique(board, return_inverse=True)
     if len(names) < 2:
         return None
@@ -224,12 +224,12 @@ def calls_change(first: SetUpRecord, second: SetUpRecord, wanted_per_m2: float |
     distribution. On identical frames with the same threshold, the signs of each board's difference are randomised,
     which shows smaller changes; if the threshold differs on identical frames, both tests must agree. None if either
     set-up has no hole-free board. ``wanted_per_m2``: None without a wanted rate."""
-    one, two = first.unflawed, second.unflawed
-    areas = (float(one.area_m2.sum()), float(two.area_m2.sum()))
+    unflawed_1, unflawed_2 = first.unflawed, second.unflawed
+    areas = (float(unflawed_1.area_m2.sum()), float(unflawed_2.area_m2.sum()))
     if not min(areas) > 0:
         return None
-    calls = (int(one.calls.sum()), int(two.calls.sum()))
-    (boards_1, calling_1), (boards_2, calling_2) = _calling(one), _calling(two)
+    calls = (int(unflawed_1.calls.sum()), int(unflawed_2.calls.sum()))
+    (boards_1, calling_1), (boards_2, calling_2) = _calling(unflawed_1), _calling(unflawed_2)
     # on identical frames, an equal calibrated threshold means equal scores: two scorings give the same number by chance
     # only if scores are few whole numbers; a given threshold has no scatter
     given = not (first.calibration_runs or second.calibration_runs)
@@ -240,9 +240,9 @@ def calls_change(first: SetUpRecord, second: SetUpRecord, wanted_per_m2: float |
         way = "signs"
     by_signs = by_draws = (0.0, 0.0)
     if way != "calibrations":
-        _, at, there = np.intersect1d(np.unique(one.board), np.unique(two.board), return_indices=True)
-        sums = [np.bincount(np.unique(t.board, return_inverse=True)[1], t.calls) for t in (one, two)]
-        by_signs = sign_flip((sums[1][there] - sums[0][at]).round().astype(int))
+        _, row_1, row_2 = np.intersect1d(np.unique(unflawed_1.board), np.unique(unflawed_2.board), return_indices=True)
+        sums = [np.bincount(np.unique(t.board, return_inverse=True)[1], t.calls) for t in (unflawed_1, unflawed_2)]
+        by_signs = sign_flip((sums[1][row_2] - sums[0][row_1]).round().astype(int))
     if way != "signs":
         total = calling_1 + calling_2
         ranks = _rank(first, wanted_per_m2), _rank(second, wanted_per_m2)

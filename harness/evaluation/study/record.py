@@ -207,8 +207,8 @@ class StudyRecord:
     def hit_rule(self) -> str:
         """Rule for a hit, as the end of a sentence that begins with a damage."""
         long = any(set_up.inspected.size_of != "diameter" for set_up in self.set_ups)
-        of = "its centre line" if long else "its own" if self.hit_overlap is None else "its centre"
-        rule = f"where the centre of a finding lies within {self.hit_radius_mm:.3g} mm of {of}"
+        centre = "its centre line" if long else "its own" if self.hit_overlap is None else "its centre"
+        rule = f"where the centre of a finding lies within {self.hit_radius_mm:.3g} mm of {centre}"
         if self.hit_overlap is None:
             return rule
         share = f"{100 * self.hit_overlap:.3g} %"

@@ -335,9 +335,9 @@ def _set_up(record: SetUpRecord, tables: ResultTables, radius_mm: float, draws: 
     holes, sites, runs = own(tables.holes), own(tables.sites), own(tables.runs)
     limit, chance = limit_of(record, draws=draws, tested=True), None
     if not holes.empty and not runs.empty:
-        of = "model_diameter_mm" if record.inspected.size_of == "diameter" else f"{record.inspected.size_of}_mm"
-        sized = holes[holes["detected"].astype(bool) & holes[of].notna()]
-        typical_mm = float((sized[of] - sized["true_diameter_mm"]).abs().median())
+        column = "model_diameter_mm" if record.inspected.size_of == "diameter" else f"{record.inspected.size_of}_mm"
+        sized = holes[holes["detected"].astype(bool) & holes[column].notna()]
+        typical_mm = float((sized[column] - sized["true_diameter_mm"]).abs().median())
         seconds = float(runs.loc[runs["role"] == "damaged", "seconds_detect"].median())
         limit = replace(limit, size_error_mm=typical_mm, sized=len(sized), seconds_detect=seconds)
         chance = curves.chance_hits(holes, sites, runs, own(tables.findings), radius_mm, limit.false_calls)

@@ -90,19 +90,19 @@ def fewest_boards(set_ups: int, alpha: float = ALPHA) -> int:
 def compare_studies(first: StudyRecord, second: StudyRecord, alpha: float = ALPHA) -> Comparison:
     """Compare ``second`` with ``first``. Deterministic."""
     rows = []
-    for one, other in paired_set_ups(first, second):
-        if one is None or other is None:
-            limits = limit_of(one) if one else None, limit_of(other) if other else None
-            rows.append(ComparedSetUps(*limits, mark="only in second" if one is None else "only in first"))
+    for old, new in paired_set_ups(first, second):
+        if old is None or new is None:
+            limits = limit_of(old) if old else None, limit_of(new) if new else None
+            rows.append(ComparedSetUps(*limits, mark="only in second" if old is None else "only in first"))
             continue
-        before, now, changed = limit_of(one), limit_of(other), differences(one, other)
-        if why := not_comparable(first, second, one, other):
+        before, now, changed = limit_of(old), limit_of(new), differences(old, new)
+        if why := not_comparable(first, second, old, new):
             rows.append(ComparedSetUps(before, now, changed, mark="not comparable", why=why))
             continue
-        same = one.targets_digest == other.targets_digest
-        hits = paired.hits_change(one.inspected, other.inspected) if same else None
-        calls = paired.calls_change(one, other, first.false_calls_per_m2)
-        signal = paired.signal_change(one, other) if same else None
+        same = old.targets_digest == new.targets_digest
+        hits = paired.hits_change(old.inspected, new.inspected) if same else None
+        calls = paired.calls_change(old, new, first.false_calls_per_m2)
+        signal = paired.signal_change(old, new) if same else None
         rows.append(ComparedSetUps(before, now, changed, paired.limit_change(before, now, same), hits, calls, signal))
     # only questions that were asked belong to the family of tests
     p_values = [p for row in rows for p in _p_values(row)]
@@ -158,8 +158,8 @@ def not_comparable(first: StudyRecord, second: StudyRecord, one: SetUpRecord, ot
         return f"hits {first.hit_rule} there, {second.hit_rule} here"
     if first.false_calls_per_m2 != second.false_calls_per_m2:
         rates = (first.false_calls_per_m2, second.false_calls_per_m2)
-        there, here = ("no stated rate" if rate is None else f"{rate:g} false calls per m²" for rate in rates)
-        return f"thresholds for {there} there, for {here} here"
+        before, now = ("no stated rate" if rate is None else f"{rate:g} false calls per m²" for rate in rates)
+        return f"thresholds for {before} there, for {now} here"
     if bool(one.calibration_runs) != bool(other.calibration_runs):
         return "one threshold is calibrated, the other is given"
     boards = [len(np.unique(record.inspected.board)) for record in (one, other)]
@@ -175,7 +175,7 @@ def not_comparable(first: StudyRecord, second: StudyRecord, one: SetUpRecord, ot
 
 def differences(one: SetUpRecord, other: SetUpRecord) -> tuple[str, ...]:
     """Return differences that may be the cause."""
-    facts = [(f"{of.detector} {of.detector_version}", f"frames {of.frames}") for of in (one, other)]
+    facts = [(f"{record.detector} {record.detector_version}", f"frames {record.frames}") for record in (one, other)]
     changes = [f"{before} → {now.removeprefix('frames ')}" for before, now in zip(*facts, strict=True) if before != now]
     for axis in sorted({*one.axes, *other.axes}):
         before, now = one.axes.get(axis, "default"), other.axes.get(axis, "default")
@@ -207,8 +207,8 @@ def _verdict(row: ComparedSetUps, alpha: float) -> tuple[Mark, str]:
     growth, grown = _growth(first, second), f"a90 {first.a90_mm:.2f} → {second.a90_mm:.2f} mm"
     if first.a90_95.demonstrated != second.a90_95.demonstrated:
         bounds = (first.a90_95, second.a90_95)
-        there, here = (f"{bound.value:.2f} mm" if bound.demonstrated else "not demonstrated" for bound in bounds)
-        grown = f"a90/95 {there} → {here}"
+        before, now = (f"{bound.value:.2f} mm" if bound.demonstrated else "not demonstrated" for bound in bounds)
+        grown = f"a90/95 {before} → {now}"
     if why := _lost(first, second):
         return "newly failing", why
     margin = limit_margin(row.signal)
