@@ -53,7 +53,7 @@ class ExportedView:
         for number, frame in enumerate(self.source.frames()):
             rgb = frame.rgb if frame.rgb is not None else np.zeros((*region.shape, 3), np.uint8)
             amplitude = frame.amplitude if frame.amplitude is not None else np.full(region.shape, np.nan)
-            z_m, amplitude = (on_sensor(each.astype(np.float32), np.nan) for each in (frame.z_m, amplitude))
+            z_m, amplitude = (on_sensor(image.astype(np.float32), np.nan) for image in (frame.z_m, amplitude))
             reason = on_sensor(frame.reason, Reason.OUTSIDE_MASK)
             yield self.stamp_ns(number), Frame(frame.name, z_m, reason, rgb=on_sensor(rgb, 0), amplitude=amplitude)
 

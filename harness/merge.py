@@ -87,9 +87,9 @@ def merge_into(into: Journal, other: Journal, counts: Counter[str]) -> list[str]
 def _without_seconds(value: object) -> object:
     """Return a record without timings and learned arrays, whose last digits differ, so that results can be compared."""
     if isinstance(value, dict):
-        kept = {name: each for name, each in value.items() if not name.startswith("seconds") and name != "arrays"}
-        return {name: _without_seconds(each) for name, each in kept.items()}
-    return [_without_seconds(each) for each in value] if isinstance(value, list) else value
+        kept = {name: part for name, part in value.items() if not name.startswith("seconds") and name != "arrays"}
+        return {name: _without_seconds(part) for name, part in kept.items()}
+    return [_without_seconds(part) for part in value] if isinstance(value, list) else value
 
 
 def _alike(first: Any, second: Any, *, in_tenth_um: bool = False) -> bool:

@@ -110,14 +110,14 @@ def choice_facts(choice: Choice | None) -> dict[str, Any] | None:
         {
             "number": n,
             **{
-                f"{name}_mm": m / MM for name, m in zip(("nearest", "distance", "farthest"), each.depths_m, strict=True)
+                f"{name}_mm": m / MM for name, m in zip(("nearest", "distance", "farthest"), area.depths_m, strict=True)
             },
-            "extent_mm": [side / MM for side in each.extent_m],
-            "share_of_view": each.share,
-            "tilt_deg": each.tilt_deg,
-            "pixels": int(each.own.sum()),
+            "extent_mm": [side / MM for side in area.extent_m],
+            "share_of_view": area.share,
+            "tilt_deg": area.tilt_deg,
+            "pixels": int(area.own.sum()),
         }
-        for n, each in enumerate(choice.candidates, start=1)
+        for n, area in enumerate(choice.candidates, start=1)
     ]
     return {"taken": choice.taken, "warnings": choice.warnings, "candidates": candidates}
 

@@ -88,7 +88,7 @@ def shared_figures(found: Characteristics) -> Iterator[FigureRow]:
 def beside(found: Characteristics, twin: Characteristics, known: Characteristics | None) -> list[OwnFigure]:
     """Return each figure of the captures with those of the simulations; surfaces are matched by their numbers."""
     every = (found, twin, known)
-    places = [{plane.where: (plane.capture, plane.number) for plane in each.surfaces} if each else {} for each in every]
+    places = [{face.where: (face.capture, face.number) for face in each.surfaces} if each else {} for each in every]
     values = [
         {(row[0], place.get(row[1], row[1])): row[3] for row in own_figures(each)} if each else {}
         for each, place in zip(every, places, strict=True)

@@ -110,8 +110,8 @@ def command_of(command: str) -> list[Markup]:
 def closing(provenance: Mapping[str, Any], experiment_yaml_text: str, left_out: str = "") -> list[Markup]:
     """Return the last sections of every sweep's page. ``left_out`` is a sentence on frames excluded from averages."""
     reasons: dict[str, list[str]] = {}
-    for each in provenance.get("failures", ()):
-        reasons.setdefault(f"{each['state']}: {each['why']}", []).append(each["what"])
+    for failure in provenance.get("failures", ()):
+        reasons.setdefault(f"{failure['state']}: {failure['why']}", []).append(failure["what"])
     missing = f"{many(sum(map(len, reasons.values())), 'part')} of the experiment failed; no number above includes it."
     parts = [heading("Failures"), paragraph(missing if reasons else "No trial failed.")]
     for why, parts_of in reasons.items():

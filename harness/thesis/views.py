@@ -156,7 +156,7 @@ def _h1(case: maps.MapCase) -> tuple[Answer, str]:
     duels = duels_of(case)
     if not duels:
         return "undecided", "Not judged: the experiment has no fused map and single view to compare."
-    answers = [False if "behind" in each else True if "ahead" in each else None for each, _ in duels]
+    answers = [False if "behind" in standings else True if "ahead" in standings else None for standings, _ in duels]
     evidence = " ".join(text for _, text in duels)
     if len(duels) == 1:
         evidence += " No single view has as many exposures in total, so that comparison is left out."
