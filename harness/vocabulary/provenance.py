@@ -25,17 +25,17 @@ PACKAGES = ("mitsuba", "drjit", "trimesh", "numpy", "scipy", "numba", "pandas", 
 
 def commit_and_dirty() -> tuple[str | None, bool | None]:
     """Return the commit of the checkout that this code runs from, and whether it has changes; None without checkout."""
-    here = Path(__file__).resolve().parents[2]
+    root = Path(__file__).resolve().parents[2]
 
     def git(*arguments: str) -> str | None:
-        command = ["git", "-C", str(here), *arguments]
+        command = ["git", "-C", str(root), *arguments]
         try:
             return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
         except (OSError, subprocess.SubprocessError):
             return None
 
     top = git("rev-parse", "--show-toplevel")
-    if top is None or Path(top) != here:
+    if top is None or Path(top) != root:
         return None, None
     status = git("status", "--porcelain")
     return git("rev-parse", "HEAD"), None if status is None else bool(status)

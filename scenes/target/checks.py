@@ -69,7 +69,7 @@ def _board_problems(board: custom.BoardConfig) -> list[str]:
             return [f"board: {small}, which reaches {reach:g} mm from its middle: {needed}"]
     face = face_of(board)
     x, y = np.meshgrid(np.linspace(-half_x, half_x, 65) * MM, np.linspace(-half_y, half_y, 65) * MM)
-    steepest, tightest = (float(np.abs(of(x, y)).max()) for of in (face.slope, face.curvatures))
+    steepest, tightest = (float(np.abs(function(x, y)).max()) for function in (face.slope, face.curvatures))
     # A sphere at 0.8 of its radius has this slope exactly, hence the allowance for rounding.
     if steepest > STEEPEST_SLOPE * (1 + 1e-9):
         return [f"board: its face is too steep: slope {steepest:.3g}, the limit is {STEEPEST_SLOPE:.3g}"]
@@ -161,9 +161,9 @@ def _overlap_problems(damages: list[custom.AnyDamage], board: custom.BoardConfig
     apart_m = np.minimum(np.linalg.norm(at_face, axis=-1), np.linalg.norm(at_face - shared_m * turn, axis=-1))
     web_m = apart_m - rims_m[first] - rims_m[second]
     for i in np.flatnonzero(web_m < LEAST_WEB_MM * MM):
-        one, two = damages[first[i]], damages[second[i]]
-        if isinstance(one, FlawConfig) or isinstance(two, FlawConfig):
-            a, b = (_outline_m(damage, face) for damage in (one, two))
+        pair = damages[first[i]], damages[second[i]]
+        if any(isinstance(damage, FlawConfig) for damage in pair):
+            a, b = (_outline_m(damage, face) for damage in pair)
             web_m[i] = min(outside_m(a, b).min(), outside_m(b, a).min())
     return [
         f"{_name(damages[first[i]])} and {_name(damages[second[i]])} meet: centres {apart_m[i] / MM:.6g} mm apart, "
@@ -200,9 +200,9 @@ def _tape_problems(config: custom.TargetConfig) -> list[str]:
             gap = float(off_tape_mm(tape, np.array(damage.centre_mm))) - damage.reach_mm
             if gap <= 0:
                 problems.append(f"{name}: lies over {_name(damage)} by {-gap:.3g} mm")
-    for (first, strip), (second, other) in combinations(enumerate(config.tapes, start=1), 2):
-        one, two = ((tape.centre_mm, tape.size_mm, tape.angle_deg) for tape in (strip, other))
-        _, shared = cv2.rotatedRectangleIntersection(one, two)
+    for (first, tape_1), (second, tape_2) in combinations(enumerate(config.tapes, start=1), 2):
+        box_1, box_2 = ((tape.centre_mm, tape.size_mm, tape.angle_deg) for tape in (tape_1, tape_2))
+        _, shared = cv2.rotatedRectangleIntersection(box_1, box_2)
         shared_mm2 = 0.0 if shared is None else cv2.contourArea(cv2.convexHull(shared))
         if shared_mm2 > 1e-3:
             problems.append(f"tape {first} and tape {second} lie on each other over {shared_mm2:.3g} mm2")

@@ -384,7 +384,7 @@ class TargetConfig(SetUpConfig):
         surfaces: dict[str, Any] = {"tape": self.tapes, "backing": self.backing}
         if room is not None:
             surfaces |= {"floor": room.floor_below_lens_m, "back_wall": room.back_wall_distance_m}
-        lacking = [name for name, there in surfaces.items() if there and getattr(albedos, name) is None]
+        lacking = [name for name, surface in surfaces.items() if surface and getattr(albedos, name) is None]
         if lacking:
             what = f"other_wavelengths: at {albedos.wavelength_nm:g} nm there is no albedo for {', '.join(lacking)}"
             raise UserError(what, legal="an albedo for every surface that the target has")

@@ -109,11 +109,11 @@ def _sweep(corners: np.ndarray, low: np.ndarray, high: np.ndarray, strips: np.nd
 
 
 @numba.njit(cache=True, nogil=True)
-def _pierces(one: np.ndarray, other: np.ndarray) -> bool:
+def _pierces(edged: np.ndarray, triangle: np.ndarray) -> bool:
     """Return whether an edge of one triangle passes through the inside of another."""
-    a, b, c = other[0], other[1], other[2]
+    a, b, c = triangle[0], triangle[1], triangle[2]
     for k in range(3):
-        p, q = one[k], one[(k + 1) % 3]
+        p, q = edged[k], edged[(k + 1) % 3]
         if _volume(a, b, c, p) * _volume(a, b, c, q) < 0.0:
             first, second, third = _volume(p, q, a, b), _volume(p, q, b, c), _volume(p, q, c, a)
             if (first > 0.0 and second > 0.0 and third > 0.0) or (first < 0.0 and second < 0.0 and third < 0.0):

@@ -291,7 +291,7 @@ def truth_of(config: custom.TargetConfig, T_camera_board: np.ndarray) -> tuple[D
     """Return the truth of a declaration: holes, dents, then other kinds, in the order of their declaration."""
     face, truth = face_of(config.board), []
     for item in config.damages:
-        centre, axis, bends = (of(*item.centre_m) for of in (face.point, face.axis, face.curvatures))
+        centre, axis, bends = (function(*item.centre_m) for function in (face.point, face.axis, face.curvatures))
         in_camera = transform_points(T_camera_board, centre), rotate_vectors(T_camera_board, axis)
         if isinstance(item, FlawConfig):
             sizes, outline = _flaw_truth(item, face, config.board.thickness_mm * MM)

@@ -91,19 +91,19 @@ def problems_of(error: ValidationError, declared: shape.Declared, source: Source
     of the intended branch are reported; if that branch is unclear, the union as a whole is the problem."""
     alone: list[tuple[KeyPath, Any]] = []
     unions: dict[KeyPath, list[tuple[str, KeyPath, Any]]] = defaultdict(list)
-    for each in error.errors(include_url=False, include_input=False)[:MAX_PROBLEMS]:
+    for detail in error.errors(include_url=False, include_input=False)[:MAX_PROBLEMS]:
         path: KeyPath = ()
-        label, location, data = None, (*base, *each["loc"]), declared.data
+        label, location, data = None, (*base, *detail["loc"]), declared.data
         for number, key in enumerate(location, start=1):
             known = key in data if isinstance(data, Mapping) else isinstance(data, list) and key in range(len(data))
-            if known or (each["type"] == "missing" and number == len(location)):
+            if known or (detail["type"] == "missing" and number == len(location)):
                 path, data = (*path, key), shape.child(data, key)
             else:
                 label = label or (path, str(key))
         if label:
-            unions[label[0]].append((label[1], path, each))
+            unions[label[0]].append((label[1], path, detail))
         else:
-            alone.append((path, each))
+            alone.append((path, detail))
     problems = []
     for path, errors in unions.items():
         labels, data, slot = {label for label, _, _ in errors}, shape.get(declared.data, path), declared.at(path)
@@ -112,11 +112,11 @@ def problems_of(error: ValidationError, declared: shape.Declared, source: Source
             meant = meant or {getattr(shape.model_for(slot, data), "__name__", "")} & labels
         elif isinstance(data, list):
             meant = meant or {label for label in labels if label.startswith(("list[", "tuple["))}
-        alone += [(at, each) for label, at, each in errors if label in meant]
+        alone += [(at, detail) for label, at, detail in errors if label in meant]
         if not meant:
             message = f"`{dotted(path)}` is {shown(data)}, which matches none of the legal forms"
             problems.append(Problem(message, source.place_of(path), legal=shape.legal_at(slot)))
-    return problems + [_problem(path, each, declared, source) for path, each in alone]
+    return problems + [_problem(path, detail, declared, source) for path, detail in alone]
 
 
 def _problem(path: KeyPath, error: Any, declared: shape.Declared, source: Source) -> Problem:

@@ -133,9 +133,9 @@ class Source:
     def with_value(self, path: KeyPath, data: Any, donor: Source, donor_path: KeyPath = ()) -> Source:
         """Return this source with new ``data``, whose value at ``path`` came from ``donor`` at ``donor_path``."""
         depth, merged = len(donor_path), []
-        for own, others in ((self.values, donor.values), (self.keys, donor.keys)):
+        for own, donated in ((self.values, donor.values), (self.keys, donor.keys)):
             kept = {at: place for at, place in own.items() if at[: len(path)] != path}
-            merged.append(kept | {path + at[depth:]: p for at, p in others.items() if at[:depth] == donor_path})
+            merged.append(kept | {path + at[depth:]: p for at, p in donated.items() if at[:depth] == donor_path})
         merged[1][path] = donor.place_of(donor_path)
         return Source(self.origin, self.text, data, *merged)
 
@@ -251,21 +251,21 @@ class _Builder:
 
     def build(self, node: Node, path: KeyPath, within: tuple[Node, ...]) -> Any:
         """Return the data of a node at a path; ``within`` are the nodes that enclose it."""
-        self.values[path] = here = self._of(node)
+        self.values[path] = place = self._of(node)
         self._nodes += 1
         if len(self.problems) >= MAX_PROBLEMS or self._nodes > MAX_NODES + 1:
             return None
         if self._nodes > MAX_NODES:
-            return self._refuse("too many values", here, f"at most {MAX_NODES} values after aliases are expanded")
+            return self._refuse("too many values", place, f"at most {MAX_NODES} values after aliases are expanded")
         if any(node is outer for outer in within):
-            return self._refuse("an alias refers to a value that contains it", here)
+            return self._refuse("an alias refers to a value that contains it", place)
         if len(within) >= MAX_DEPTH:
-            return self._refuse("nested too deeply", here, f"at most {MAX_DEPTH} levels")
+            return self._refuse("nested too deeply", place, f"at most {MAX_DEPTH} levels")
         if isinstance(node, MappingNode) and node.tag == _TAG + "map":
             return self._mapping(node, path, (*within, node))
         if isinstance(node, SequenceNode) and node.tag == _TAG + "seq":
             return [self.build(item, (*path, index), (*within, node)) for index, item in enumerate(node.value)]
-        return self._scalar(node, here)
+        return self._scalar(node, place)
 
     def _mapping(self, node: MappingNode, path: KeyPath, within: tuple[Node, ...]) -> dict[str, Any]:
         result: dict[str, Any] = {}
@@ -286,7 +286,7 @@ class _Builder:
                 self._refuse("a key must be text", at, "text; put quotes around numbers")
         return result
 
-    def _scalar(self, node: Node, here: Place) -> Any:
+    def _scalar(self, node: Node, place: Place) -> Any:
         kind, text = str(node.tag).removeprefix(_TAG), node.value
         try:
             if not isinstance(node, ScalarNode):
@@ -302,9 +302,9 @@ class _Builder:
                 text.encode()
                 return text
         except (ValueError, KeyError):
-            return self._refuse(f"{text[:40]!r} cannot be read as {kind}", here)
+            return self._refuse(f"{text[:40]!r} cannot be read as {kind}", place)
         tag = str(node.tag).replace(_TAG, "!!")
-        return self._refuse(f"the tag {tag} is not supported", here, "plain mappings, lists, text and numbers")
+        return self._refuse(f"the tag {tag} is not supported", place, "plain mappings, lists, text and numbers")
 
     def _refuse(self, message: str, place: Place, legal: str | None = None) -> None:
         self.problems.append(Problem(message, place, legal=legal))
