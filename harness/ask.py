@@ -142,8 +142,8 @@ def _answer(options: argparse.Namespace, surfaces: Sequence[LimitSurface], title
     for text in _warnings(row.surface.camera for row in rows):
         print(f"warning: {text}")
     verdicts = [row.answer.verdict(size_mm) for row in rows]
-    others = ", ".join(f"{name} for {verdicts.count(name)}" for name in ("no", "undecided") if name in verdicts)
-    of_all = f"{verdicts.count('yes')} of {many(len(rows), 'set-up')}" + (f" ({others})." if others else ".")
+    counts = ", ".join(f"{name} for {verdicts.count(name)}" for name in ("no", "undecided") if name in verdicts)
+    of_all = f"{verdicts.count('yes')} of {many(len(rows), 'set-up')}" + (f" ({counts})." if counts else ".")
     asked_for = f"{damage_words(kind).capitalize()}s of {size_mm:g} mm at {distance_m:g} m"
     answer = f"{asked_for} are found nine times out of ten in {of_all}"
     errors = [row.surface.error for row in rows if np.isfinite(row.surface.error)]
@@ -174,7 +174,7 @@ def _chosen(options: argparse.Namespace, surfaces: Sequence[LimitSurface], kind:
             fix = "run a study of damage that is not in the atlas, such as tofpod sweep crack"
             raise UserError(what, legal=", ".join(legal), fix=fix if name == "kind" else None)
     cameras = options.camera or [surface.camera for surface in surfaces]
-    return [one for one in surfaces if one.kind == kind and one.detector == detector and one.camera in cameras]
+    return [s for s in surfaces if s.kind == kind and s.detector == detector and s.camera in cameras]
 
 
 def length_m(option: str, text: str) -> float:

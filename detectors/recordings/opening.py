@@ -107,7 +107,7 @@ def _statements_beside(files: Sequence[Path]) -> Iterator[tuple[Path, dict[str, 
 def _opened(paths: list[Path], given: Given) -> Recording:
     """Open a capture by the first format that its paths fit."""
     path, is_single = paths[0], len(paths) == 1
-    suffix, *others = {each.suffix.lower() for each in paths}
+    suffix, *more = {each.suffix.lower() for each in paths}
     opener: Callable[[Path, Given], Recording] | None = FILES.get(suffix) if is_single else None
     if is_single and path.is_dir():
         opener = open_bag if is_bag(path) and given.raw is None else _open_folder
@@ -123,10 +123,10 @@ def _opened(paths: list[Path], given: Given) -> Recording:
         return opener(path, given)
     if any(each.is_dir() for each in paths):
         raise UserError(f"{len(paths)} paths that include folders", legal=LEGAL_FORMATS, fix="name one folder alone")
-    if suffix in LISTS and not others:
+    if suffix in LISTS and not more:
         return LISTS[suffix](paths, given, path.name if is_single else f"{path.name} .. {paths[-1].name}")
     if not is_single:
-        raise UserError(f"{len(paths)} files of the kinds {', '.join(sorted((suffix, *others)))}", legal=LEGAL_FORMATS)
+        raise UserError(f"{len(paths)} files of the kinds {', '.join(sorted((suffix, *more)))}", legal=LEGAL_FORMATS)
     if suffix in (".bin", ".raw", ".dat"):
         raise raw_layout_of(path)
     fix = CONVERT.get(suffix, "").replace("FILE", str(path)) or None

@@ -48,7 +48,7 @@ class MapSetUp:
 
 def maps_of(tables: ResultTables) -> list[MapSetUp]:
     """Return all set-ups and variations in the table's order. For "all views", the runs give the number."""
-    others = [str(path) for path in tables.axes["path"] if path not in (VIEWS, REGISTRATION, MERGE)]
+    varied = [str(path) for path in tables.axes["path"] if path not in (VIEWS, REGISTRATION, MERGE)]
     runs, seen = tables.runs, dict[Any, Any]()
     if not runs.empty and "views_used" in runs:
         seen = (runs["views_used"] + runs["views_left_out"]).groupby(runs["variant"]).max().dropna().to_dict()
@@ -63,7 +63,7 @@ def maps_of(tables: ResultTables) -> list[MapSetUp]:
     for _, row in tables.variants.iterrows():
         named = [row.get(axis) for axis in (REGISTRATION, MERGE)]
         ways = [name if isinstance(name, str) and name != "null" else "" for name in named]
-        place = ", ".join(value_text(path, row[path]) for path in others)
+        place = ", ".join(value_text(path, row[path]) for path in varied)
         facts = place, bool(row["is_variation"]), str(row["reference"])
         found.append(MapSetUp(str(row["variant"]), views(row), ways[0], ways[1], *facts))
     return found

@@ -168,9 +168,9 @@ def effect_costs(tables: ResultTables) -> pd.DataFrame:
     if set_ups.empty:
         return EFFECTS.frame([])
     names = dict(zip(tables.axes["path"], tables.axes["name"], strict=True))
-    others, nothing, found = list(tables.axes["path"])[1:], frozenset[str](), list[dict[str, Any]]()
-    for values, part in set_ups.groupby(others, sort=False, dropna=False) if others else [((), set_ups)]:
-        place = ", ".join(f"{names[path]}={value}" for path, value in zip(others, values, strict=True))
+    axes, nothing, found = list(tables.axes["path"])[1:], frozenset[str](), list[dict[str, Any]]()
+    for values, part in set_ups.groupby(axes, sort=False, dropna=False) if axes else [((), set_ups)]:
+        place = ", ".join(f"{names[path]}={value}" for path, value in zip(axes, values, strict=True))
         switches = {str(row["variant"]): json.loads(row["switches"]) for _, row in part.iterrows()}
         by_switches = {frozenset(name for name, is_on in row.items() if is_on): name for name, row in switches.items()}
         everything = max(by_switches, key=len)

@@ -121,10 +121,10 @@ def closing(provenance: Mapping[str, Any], experiment_yaml_text: str, left_out: 
     seconds = dict(provenance.get("seconds", {}))
     rows = [(stage, f"{float(value):.1f}") for stage, value in seconds.items()]
     cost = Grid.of(("stage", "seconds"), rows).html() if rows else paragraph("Not recorded.")
-    others = [key for key in provenance if key not in (*SHOWN_FIRST, *SHOWN_APART)]
+    keys = [key for key in provenance if key not in (*SHOWN_FIRST, *SHOWN_APART)]
     recorded = [
         (key.replace("_mm", " (mm)").replace("_", " "), plain(provenance.get(key, "not recorded")))
-        for key in (*SHOWN_FIRST, *others)
+        for key in (*SHOWN_FIRST, *keys)
     ]
     lines = (tag("tr", tag("th", name, scope="row"), tag("td", value)) for name, value in recorded)
     parts += [heading("Provenance")]

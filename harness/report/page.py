@@ -336,7 +336,7 @@ def report_html(
 ) -> str:
     """Return the page of an experiment with one set-up as text; see `write_report`."""
     found = found or summaries(tables, examples, with_claims=about.with_claims)
-    main, noise, calls = (found[of][found[of]["variant"] == MAIN] for of in (SUMMARY, NOISE_BY_FRAMES, FALSE_CALLS))
+    main, noise, calls = (found[key][found[key]["variant"] == MAIN] for key in (SUMMARY, NOISE_BY_FRAMES, FALSE_CALLS))
     verdicts = verdicts_of(found)
     frames = sorted(int(n) for n in main["frames"].unique())
     clouds = sorted((e for e in examples if e.variant == MAIN), key=lambda e: e.frames)

@@ -101,8 +101,8 @@ def answer_sentence(cases: Sequence[maps.MapCase], verdicts: Sequence[Verdict] =
         alone = case.single()
         if alone is None:
             continue
-        others = [(map_, case.named(map_.views, map_.registration, map_.merge, alone.frames)) for map_ in case.set_ups]
-        ways = [(map_, list(case.status(found).values())) for map_, found in others if found and map_.views > 1]
+        finds = [(map_, case.named(map_.views, map_.registration, map_.merge, alone.frames)) for map_ in case.set_ups]
+        ways = [(map_, list(case.status(found).values())) for map_, found in finds if found and map_.views > 1]
         ways.sort(key=lambda way: (-way[0].views, -way[1].count("found")))
         counts: list[str] = []
         for way, states in [("one view finds", list(case.status(alone).values()))] + [

@@ -133,9 +133,9 @@ def _kept(scene: Scene3d) -> np.ndarray:
     if len(finite) <= MOST_POINTS:
         return finite
     first = np.zeros(len(scene.points_mm), bool) if scene.detected is None else scene.detected
-    marked, others = finite[first[finite]][:MOST_POINTS], finite[~first[finite]]
-    sample = np.random.default_rng(0).permutation(len(others))[: MOST_POINTS - len(marked)]
-    return np.sort(np.concatenate([marked, others[sample]]))
+    marked, unmarked = finite[first[finite]][:MOST_POINTS], finite[~first[finite]]
+    sample = np.random.default_rng(0).permutation(len(unmarked))[: MOST_POINTS - len(marked)]
+    return np.sort(np.concatenate([marked, unmarked[sample]]))
 
 
 def _base64(values: np.ndarray, dtype: str) -> str:

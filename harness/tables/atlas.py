@@ -99,10 +99,10 @@ def curves(surfaces: Sequence[LimitSurface], titles: Mapping[str, str]) -> list[
     rows = []
     for surface in surfaces:
         ends = surface.grid["distance_m"]
-        others = [axis for axis in surface.grid if axis != "distance_m"]
-        for values in product(*(surface.grid[axis] for axis in others)):
+        held = [axis for axis in surface.grid if axis != "distance_m"]
+        for values in product(*(surface.grid[axis] for axis in held)):
             for distance_m in np.round(np.geomspace(ends[0], ends[-1], DISTANCES), 4):
-                place = dict(zip(others, values, strict=True))
+                place = dict(zip(held, values, strict=True))
                 place["distance_m"] = float(np.clip(distance_m, ends[0], ends[-1]))
                 rows.append(Row(surface, titles[surface.camera], place, surface.at(**place)))
     return rows

@@ -54,7 +54,7 @@ def size_estimate(limit: SetUpLimit, of: str) -> Estimate:
     return Estimate(size_mm, ends.low, ends.high, limit.largest_mm, limit.is_at_most)
 
 
-a50_of, a90_of = (partial(size_estimate, of=of) for of in ("a50", "a90"))
+a50_of, a90_of = (partial(size_estimate, of=name) for name in ("a50", "a90"))
 FOUND_50, FOUND_90 = (f"size found {share} % of the time" for share in (50, 90))
 BRIEF: dict[str, Any] = {"interval": True, "brief": lambda estimate: estimate.text().partition(" ")[0]}
 OF = "what these sizes are: diameters (for long damage, widths or lengths), or depths if only the depth varies"

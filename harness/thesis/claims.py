@@ -305,12 +305,12 @@ def claim_c11(summary: pd.DataFrame, axes: Sequence[str]) -> Verdict | None:
     rows = summary[(summary["frames"] == MANY) & summary[CAMERA].isin((BEST, *OTHERS))]
     if rows.empty:
         return verdict_of("C11", "undecided", f"Not judged: no trial has {MANY} frames.")
-    others = [path for path in axes if path not in (CAMERA, CAMERA_UNIT)]
+    varied = [path for path in axes if path not in (CAMERA, CAMERA_UNIT)]
     found = {
-        " and ".join(map(value_text, others, values)) or "its one place": {
+        " and ".join(map(value_text, varied, values)) or "its one place": {
             camera: _bounds(each) for camera, each in part.groupby(CAMERA)
         }
-        for values, part in (rows.groupby(others, sort=False, dropna=False) if others else [((), rows)])
+        for values, part in (rows.groupby(varied, sort=False, dropna=False) if varied else [((), rows)])
     }
     units = rows.groupby(CAMERA)[CAMERA_UNIT].nunique().min() if CAMERA_UNIT in axes else 1
     counts = [
