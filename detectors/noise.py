@@ -13,9 +13,9 @@ from harness.vocabulary.geometry import Cloud, Frame
 REACH_FRAMES, REACH_WINDOW_PX, REACH_PIXELS, FARTHEST_LAG_PX = 6, 384, 5000, 30
 """Number of frames used; side of the window at the centre of the valid pixels; least number of pixels valid in two
 frames: they show a correlation to 0.07 if 25 pixels are alike."""
-LONE_LEVEL_PX, LONE_SIGMAS, LONE_MOST_PX = 21, 5.0, 7
+LONE_LEVEL_PX, LONE_SIGMAS, LONE_MOST_PX, LONE_OFF_PX = 21, 5.0, 7, 0.3
 """Side of the square of the local mean in a single frame; deviations that mark an edge; longest lag that is attributed
-to noise and not to a pattern or the surface."""
+to noise and not to a pattern or the surface; largest distance from the middle of the known pixels around."""
 LEAST_FRAMES, SCATTER_PX = 4, 7
 """Fewest frames whose scatter shows noise; side of the square of its average: to 12 % from 49 x 3 differences."""
 SHARED = 0.1  # correlation below which pixels share no noise: a box of b pixels, up to 9, falls below it at lag b
@@ -111,7 +111,11 @@ def noise_reach_px(frames: Sequence[Frame], z_step_m: float) -> float:
             if (sigma := sigma_of(noise[known])) < 0.5 * z_step_m:  # with smaller noise, rounding errors are correlated
                 continue
             known &= np.abs(noise) < LONE_SIGMAS * sigma
+            # where known pixels lie to one side, their mean keeps a part of the surface's tilt
+            off = (_levelled(places, known, LONE_LEVEL_PX) for places in np.indices(known.shape, float))
             noise = _levelled(difference, known, LONE_LEVEL_PX)
+            known &= np.hypot(*off) < LONE_OFF_PX
+            noise *= known
         else:
             known &= np.abs(np.nan_to_num(difference)) < 8 * float(np.abs(difference[known]).mean())
             noise = _levelled(difference, known, 2 * FARTHEST_LAG_PX + 1)
@@ -122,8 +126,11 @@ def noise_reach_px(frames: Sequence[Frame], z_step_m: float) -> float:
 
 def _levelled(values: np.ndarray, known: np.ndarray, side: int) -> np.ndarray:
     """Return the values (h, w) minus their mean over a square of known ones; 0 where unknown."""
-    weight = cv2.boxFilter(known.astype(np.float64), -1, (side, side))
-    level = cv2.boxFilter(np.where(known, values, 0.0), -1, (side, side)) / np.maximum(weight, 1e-9)
+    weight, total = (
+        cv2.boxFilter(each, -1, (side, side), borderType=cv2.BORDER_CONSTANT)
+        for each in (known.astype(np.float64), np.where(known, values, 0.0))
+    )
+    level = total / np.maximum(weight, 1e-9)
     return np.where(known, values - level, 0.0)
 
 

@@ -35,7 +35,7 @@ LISTS: dict[str, ListOpener] = {".png": open_depth_list, **dict.fromkeys((*CLOUD
 SAVE = "python -c \"import numpy, {}; numpy.save('depth.npy', {})\", then name depth.npy"
 PICTURE, HDF5 = SAVE.format("cv2", "cv2.imread('FILE', -1)"), SAVE.format("h5py", "h5py.File('FILE')['NAME'][:]")
 CONVERT = {
-    ".exr": f"OPENCV_IO_ENABLE_OPENEXR=1 {PICTURE}",
+    **{".exr": f"OPENCV_IO_ENABLE_OPENEXR=1 {PICTURE}", ".pgm": PICTURE},
     **dict.fromkeys((".h5", ".hdf5"), HDF5),
     **dict.fromkeys((".e57", ".las", ".laz", ".pcap", ".obj", ".stl", ".off"), "export its points as PLY"),
 }  # commands that convert unsupported files
