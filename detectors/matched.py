@@ -86,6 +86,8 @@ LOBE_SHARE = 0.5
 """A score below this share of a score of the other sign within `RIM_PX` is a side lobe of the whitening."""
 WIDE_PX = 5.0
 """Radius from which noise may split a template's finding into several peaks."""
+ROUGH = 0.4
+"""Error at which C^-1 r is solved for strong findings, as `whitening.CONVERGED`."""
 TAIL_PX, TAIL_SHARE, TAIL_SIGMAS = 1.5, 0.0005, 3.29
 """Largest radius at which a template's own scores show their tail; the share of pixels beyond it on either side; and
 where a Gaussian has it. Wider means are near Gaussian, and too few of them are independent."""
@@ -185,21 +187,19 @@ def _covariance(noise: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 class _Noise(NamedTuple):
-    """The bank for a picture's noise: ``grid`` of its transforms, ``power`` there, and each template's `Worth`."""
+    """The bank for a picture's noise: `whitening.Filters`, and each template's `Worth`."""
 
-    grid: tuple[int, ...]
-    power: np.ndarray
+    filters: whitening.Filters
     window_px: int
     worths: tuple[whitening.Worth, ...]
 
 
 def _judged(values: np.ndarray, known: np.ndarray, covariance: np.ndarray | None) -> tuple[np.ndarray, float]:
     """Return signed scores (r, c) of residuals in deviations, and the deviation of the narrowest template's height."""
-    grid = whitening.grid_of(values.shape)
     covariance = _covariance(values, known) if covariance is None else covariance
     window_px = whitening.window_of(covariance)
     worth_of = whitening.worths(whitening.spectrum(covariance, (whitening.GRID, whitening.GRID)), window_px)
-    noise = _Noise(grid, whitening.spectrum(covariance, grid), window_px, worth_of)
+    noise = _Noise(whitening.filters(covariance, values.shape), window_px, worth_of)
     tamed = _tamed(values)
     # strong residuals, as seen by round templates
     signed, by, solved = _scored(tamed, known, noise, rough=True)
@@ -231,16 +231,16 @@ def _scored(
     """Return each pixel's strongest score (r, c) with its sign, the index of its template, and C^-1 r, from the pixels
     ``seen`` (r, c). ``start``: an approximate solution. ``rough``: only round templates at the centres of pixels,
     without the scatter of scores, which strong residuals would spoil."""
-    solved = whitening.inverse_times(values, seen, noise.power, noise.grid, start)
+    solved = whitening.inverse_times(values, seen, noise.filters, start, ROUGH if rough else whitening.CONVERGED)
     (h, w), depth_px = seen.shape, _depth_px(seen)
     views, best, shares, tail = [], [], {}, 1.0
     for coarse in range(1 if rough else 2):
-        spectrum_of = (whitening.halved if coarse else whitening.transformed)(solved, noise.grid)
+        spectrum_of = (whitening.halved if coarse else whitening.transformed)(solved, noise.filters.grid)
         there, depth = (_halved(each) if coarse else each for each in (seen, depth_px))
         zone = ZONES[np.ceil(np.minimum(depth, len(ZONES) - 1)).astype(np.intp)]
         views.append((spectrum_of, there.astype(np.float32), zone, depth > RIM_PX))
         best.append((np.zeros(there.shape, np.float32), np.zeros(there.shape, np.uint8)))
-    templates = whitening.spectra(noise.grid, noise.window_px)
+    templates = whitening.spectra(noise.filters.grid, noise.window_px)
     for number, (template, worth) in enumerate(zip(whitening.bank(noise.window_px), noise.worths, strict=True)):
         if rough and (template.coarse or any(template.halves)):
             continue
