@@ -232,38 +232,41 @@ def _scored(
     ``seen`` (r, c). ``start``: an approximate solution. ``rough``: only round templates at the centres of pixels,
     without the scatter of scores, which strong residuals would spoil."""
     solved = whitening.inverse_times(values, seen, noise.filters, start, ROUGH if rough else whitening.CONVERGED)
-    (h, w), depth_px = seen.shape, _depth_px(seen)
-    views, best, shares, tail = [], [], {}, 1.0
+    (h, w), grid = seen.shape, noise.filters.grid
+    spectra, views, shares, tail = [whitening.transformed(solved, grid)], [], {}, 1.0
+    depth_px = np.zeros(seen.shape, np.float32) if rough else _depth_px(seen)
     for coarse in range(1 if rough else 2):
-        spectrum_of = (whitening.halved if coarse else whitening.transformed)(solved, noise.filters.grid)
         there, depth = (_halved(each) if coarse else each for each in (seen, depth_px))
-        zone = ZONES[np.ceil(np.minimum(depth, len(ZONES) - 1)).astype(np.intp)]
-        views.append((spectrum_of, there.astype(np.float32), zone, depth > RIM_PX))
-        best.append((np.zeros(there.shape, np.float32), np.zeros(there.shape, np.uint8)))
-    templates = whitening.spectra(noise.filters.grid, noise.window_px)
-    for number, (template, worth) in enumerate(zip(whitening.bank(noise.window_px), noise.worths, strict=True)):
-        if rough and (template.coarse or any(template.halves)):
+        views.append(_View(there.astype(np.float32), depth > RIM_PX, *_zones(there, depth)))
+    if not rough:
+        spectra.append(whitening.halved(spectra[0]))
+    best = [(np.zeros(view.there.shape, np.float32), np.zeros(view.there.shape, np.uint8)) for view in views]
+    templates = whitening.bank(noise.window_px)
+    for pair, numbers in whitening.spectra(grid, noise.window_px):
+        wanted = [number for number in numbers if not rough or not (templates[number].coarse or templates[number].halves != (0, 0))]
+        if not wanted:
             continue
-        spectrum_of, there, zone, inner = views[template.coarse]
-        key = template.coarse, template.slot, worth.sides
-        if key not in shares:
-            share = cv2.blur(there, worth.sides, borderType=cv2.BORDER_CONSTANT)
-            # errors along outlines, from light and flying pixels, look like slots
-            enough = (share > LEAST_SEEN) & (there > 0) & (inner if template.slot else True)
-            shares[key] = enough / np.sqrt(np.maximum(share, np.float32(LEAST_SEEN)))
-        score = whitening.response(spectrum_of, templates[number], there.shape, not any(template.halves))
-        cv2.multiply(score, shares[key], dst=score, scale=worth.energy**-0.5)
-        deviations = np.ones(N_ZONES)
-        if not rough:
-            step, round_px = 1 + template.coarse, 0.0 if template.slot else template.radius_px
-            deviations, loud = _deviations(score, zone, round(round_px / step) if round_px >= WIDE_PX else 0)
-            _calm(score, loud, deviations[-1], max(WINDOW_RADII * template.radius_px, LEAST_WINDOW) / step)
-            if template.radius_px <= TAIL_PX:
-                if not any(template.halves):
-                    tail = _tail(score * (1.0 / deviations).astype(np.float32)[zone])
-                deviations *= tail
-        per_deviation = (1.0 / deviations).astype(np.float32)
-        _keep_stronger(*best[template.coarse], score, zone, per_deviation, worth.raised, *template.halves, number)
+        coarse = templates[numbers[0]].coarse
+        view, both = views[coarse], whitening.responses(spectra[coarse], pair)
+        for number in wanted:
+            template, worth = templates[number], noise.worths[number]
+            key = coarse, template.slot, worth.sides
+            if key not in shares:
+                share = cv2.blur(view.there, worth.sides, borderType=cv2.BORDER_CONSTANT)
+                # errors along outlines, from light and flying pixels, look like slots
+                shares[key] = _visible(share, view.inner if template.slot else view.there > 0)
+            score = _one_of(both, numbers.index(number), shares[key], worth.energy**-0.5)
+            deviations = np.ones(N_ZONES)
+            if not rough:
+                step, round_px = 1 + coarse, 0.0 if template.slot else template.radius_px
+                deviations, quiet = _deviations(score, view, round(round_px / step) if round_px >= WIDE_PX else 0)
+                _calm(score, quiet, deviations[-1], max(WINDOW_RADII * template.radius_px, LEAST_WINDOW) / step)
+                _even(score, view.rim, view.starts, deviations[-1] / deviations)
+                if template.radius_px <= TAIL_PX:
+                    if not any(template.halves):
+                        tail = _tail(score, deviations[-1])
+                    deviations *= tail
+            _keep_stronger(*best[coarse], score, 1.0 / deviations[-1], worth.raised, *template.halves, number)
     signed, by = best[0]
     for half, half_by in best[1:]:
         wide, wide_by = (
@@ -275,55 +278,65 @@ def _scored(
     return signed * seen, by, solved
 
 
+class _View(NamedTuple):
+    """Where the scores of a solution lie: ``there`` (r, c), the share of known pixels; ``inner`` (r, c) bool, off the
+    outline; ``rim``, the flat indices of pixels outside the last zone, by zone, and where in it each zone ``starts``."""
+
+    there: np.ndarray
+    inner: np.ndarray
+    rim: np.ndarray
+    starts: np.ndarray
+
+
+def _zones(there: np.ndarray, depth_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    zone = ZONES[np.ceil(np.minimum(depth_px, len(ZONES) - 1)).astype(np.intp)]
+    rim = np.flatnonzero((zone < N_ZONES - 1) & (there > 0))
+    zones = zone.ravel()[rim]
+    return rim[np.argsort(zones, kind="stable")], np.searchsorted(np.sort(zones), np.arange(N_ZONES))
+
+
+@numba.njit(**PLAIN)
+def _visible(share: np.ndarray, judged: np.ndarray) -> np.ndarray:
+    """Return 1 / sqrt(share) (r, c) where a template is judged and enough of it is visible, 0 elsewhere."""
+    found = np.empty(share.shape, np.float32)
+    for i in range(share.shape[0]):
+        of, ok, to = share[i], judged[i], found[i]
+        for j in range(len(to)):
+            seen = max(of[j], np.float32(LEAST_SEEN))
+            to[j] = np.float32(1.0) / np.sqrt(seen) if ok[j] and of[j] > np.float32(LEAST_SEEN) else np.float32(0.0)
+    return found
+
+
+@numba.njit(**PLAIN)
+def _one_of(both: np.ndarray, which: int, share: np.ndarray, scale: float) -> np.ndarray:
+    """Return one of two interleaved pictures (r, c, 2), times ``share`` (r, c) and ``scale``."""
+    found, factor = np.empty(share.shape, np.float32), np.float32(scale)
+    for i in range(share.shape[0]):
+        of, by, to = both[i], share[i], found[i]
+        for j in range(len(to)):
+            to[j] = of[j, which] * by[j] * factor
+    return found
+
+
 def _halved(image: np.ndarray) -> np.ndarray:
     """Return the means (r / 2, c / 2) of 2 x 2 pixels; an odd last row or column is repeated."""
     even = np.pad(image, ((0, image.shape[0] % 2), (0, image.shape[1] % 2)), mode="edge").astype(np.float32)
     return np.asarray(cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
 
 
-def _deviations(score: np.ndarray, zone: np.ndarray, reach_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the deviation (z,) of the scores (r, c) in each ``zone`` (r, c), from sizes up to `CAP`, at least that of
-    the last zone; and (r, c) bool, the scores within ``reach_px`` of strong ones, which are excluded."""
-    loud = np.zeros(score.shape, np.bool_)
-    found, count = _scatter(score, zone, loud)
-    if reach_px:
-        loud = grown(np.abs(score) > FAINT * found[-1], reach_px)
-        again, count = _scatter(score, zone, loud)
-        found = again if count > FEWEST else found
-    return found, loud
+def _deviations(score: np.ndarray, view: _View, reach_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the deviation (z,) of the scores (r, c) in each zone of a view, from sizes up to `CAP`, at least that of
+    the last zone; and the scores, 0 within ``reach_px`` of strong ones, which are excluded."""
+    found, _ = _scatter(score, view)
+    if reach_px and (strong := np.abs(score) > FAINT * found[-1]).any():
+        quiet = np.where(grown(strong, reach_px), np.float32(0.0), score)
+        again, count = _scatter(quiet, view)
+        return (again if count > FEWEST else found), quiet
+    return found, score
 
 
-def _calm(score: np.ndarray, loud: np.ndarray, deviation: float, half_px: float) -> None:
-    """Divide the scores (r, c) where scores other than ``loud`` ones (r, c) within a square of ``half_px`` scatter by
-    more than `UNEVEN` deviations: the noise there differs from elsewhere."""
-    window = (2 * round(half_px / PART_PX) + 1,) * 2
-    sums, counts = (cv2.blur(each, window) for each in _parts(score, loud, CAP * deviation))
-    size = sums / np.maximum(counts, 0.05 * PART_PX**2) / deviation
-    if size.max() > CAPPED_UNEVEN:
-        local = np.maximum(np.interp(size, CAPPED, DEVIATIONS) / UNEVEN, 1.0).astype(np.float32)
-        score /= cv2.resize(local, score.shape[::-1], interpolation=cv2.INTER_LINEAR)
-
-
-@numba.njit(**PLAIN)
-def _parts(score: np.ndarray, loud: np.ndarray, cap: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sums of the sizes, at most ``cap``, of quiet scores in squares of `PART_PX`, and their number."""
-    h, w = score.shape
-    rows, columns = max(1, h // PART_PX), max(1, w // PART_PX)
-    sums, counts = np.zeros((rows, columns)), np.zeros((rows, columns))
-    for i in range(h):
-        for part in range(columns):
-            total, number = 0.0, 0
-            for j in range(part * w // columns, (part + 1) * w // columns):
-                if score[i, j] != 0 and not loud[i, j]:
-                    total += min(abs(score[i, j]), cap)
-                    number += 1
-            sums[i * rows // h, part] += total
-            counts[i * rows // h, part] += number
-    return sums, counts
-
-
-def _scatter(score: np.ndarray, zone: np.ndarray, loud: np.ndarray) -> tuple[np.ndarray, int]:
-    sums, counts = _capped(score, zone, loud, N_ZONES)
+def _scatter(score: np.ndarray, view: _View) -> tuple[np.ndarray, int]:
+    sums, counts = _capped(score, view.rim, view.starts)
     number = int(counts.sum())
     if counts[-1] < FEWEST:
         sums[-1], counts[-1] = sums.sum(), max(number, 1)
@@ -331,54 +344,95 @@ def _scatter(score: np.ndarray, zone: np.ndarray, loud: np.ndarray) -> tuple[np.
     return np.where(counts < FEWEST, found[-1], np.maximum(found, found[-1])), number
 
 
+def _calm(score: np.ndarray, quiet: np.ndarray, deviation: float, half_px: float) -> None:
+    """Divide the scores (r, c) where the ``quiet`` ones (r, c) that are not 0 within a square of ``half_px`` scatter by
+    more than `UNEVEN` deviations: the noise there differs from elsewhere."""
+    window = (2 * round(half_px / PART_PX) + 1,) * 2
+    sums, counts = (cv2.blur(each, window) for each in _parts(quiet, CAP * deviation))
+    size = sums / np.maximum(counts, 0.05 * PART_PX**2) / deviation
+    if size.max() > CAPPED_UNEVEN:
+        local = np.maximum(np.interp(size, CAPPED, DEVIATIONS) / UNEVEN, 1.0).astype(np.float32)
+        score /= cv2.resize(local, score.shape[::-1], interpolation=cv2.INTER_LINEAR)
+
+
 @numba.njit(**PLAIN)
-def _capped(score: np.ndarray, zone: np.ndarray, loud: np.ndarray, zones: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sums of the sizes, at most `CAP`, of quiet scores in each zone, and their number."""
-    sums, counts = np.zeros(zones), np.zeros(zones, np.int64)
-    for i in range(score.shape[0]):
-        total, number = 0.0, 0  # those of the last zone, which has most pixels
-        for j in range(score.shape[1]):
-            if score[i, j] != 0 and not loud[i, j]:
-                size = min(abs(score[i, j]), CAP)
-                if zone[i, j] == zones - 1:
-                    total += size
-                    number += 1
-                else:
-                    sums[zone[i, j]] += size
-                    counts[zone[i, j]] += 1
-        sums[-1] += total
-        counts[-1] += number
+def _parts(score: np.ndarray, cap: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the sums (r, c) of the sizes, at most ``cap``, of scores that are not 0 in squares of `PART_PX`, and their
+    number."""
+    (h, w), most = score.shape, np.float32(cap)
+    rows, columns = max(1, h // PART_PX), max(1, w // PART_PX)
+    sums, counts = np.zeros((rows, columns)), np.zeros((rows, columns))
+    sizes, numbers = np.empty(w, np.float32), np.empty(w, np.int32)
+    for row in range(rows):
+        sizes[:], numbers[:] = 0, 0
+        for i in range(row * h // rows, (row + 1) * h // rows):
+            of = score[i]
+            for j in range(w):
+                sizes[j] += min(abs(of[j]), most)
+                numbers[j] += of[j] != 0
+        for j in range(w):
+            sums[row, j * columns // w] += sizes[j]
+            counts[row, j * columns // w] += numbers[j]
     return sums, counts
 
 
 @numba.njit(**PLAIN)
+def _capped(score: np.ndarray, rim: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the sums of the sizes, at most `CAP`, of scores that are not 0 in each zone, and their number."""
+    sums, counts, most = np.zeros(len(starts)), np.zeros(len(starts), np.int64), np.float32(CAP)
+    sizes, numbers = np.zeros(score.shape[1], np.float32), np.zeros(score.shape[1], np.int32)
+    for i in range(score.shape[0]):
+        of = score[i]
+        for j in range(len(of)):
+            sizes[j] += min(abs(of[j]), most)
+            numbers[j] += of[j] != 0
+    flat = score.ravel()
+    for zone in range(len(starts) - 1):
+        for at in rim[starts[zone] : starts[zone + 1]]:
+            sums[zone] += min(abs(flat[at]), most)
+            counts[zone] += flat[at] != 0
+    sums[-1], counts[-1] = sizes.sum() - sums.sum(), numbers.sum() - counts.sum()
+    return sums, counts
+
+
+@numba.njit(**PLAIN)
+def _even(score: np.ndarray, rim: np.ndarray, starts: np.ndarray, factors: np.ndarray) -> None:
+    """Multiply the scores (r, c) of each zone but the last by its factor."""
+    flat = score.ravel()
+    for zone in range(len(starts) - 1):
+        for at in rim[starts[zone] : starts[zone + 1]]:
+            flat[at] *= np.float32(factors[zone])
+
+
+@numba.njit(**PLAIN)
 def _keep_stronger(  # type: ignore[no-untyped-def]
-    signed, by, score, zone, per_deviation, raised, down, right, number
+    signed, by, score, per_deviation, raised, down, right, number
 ):
-    """Keep the larger of each pixel's scores (r, c) by size, and that template's ``number``. Scores are scaled to
-    deviations of their ``zone`` (r, c) by the factors ``per_deviation`` (z,), and raised: their squares grow by
-    ``raised``, in proportion below `FAINT`. Scores between pixels, ``down`` or ``right``, belong to all around."""
-    faint = per_deviation * np.float32(np.sqrt(1.0 + raised / FAINT**2))
+    """Keep the larger of each pixel's scores (r, c) by size, and that template's ``number``. Scores are scaled by
+    ``per_deviation`` and raised: their squares grow by ``raised``, in proportion below `FAINT`. Scores between pixels,
+    ``down`` or ``right``, belong to all around."""
+    scale, more = np.float32(per_deviation), np.float32(raised)
+    faint = np.float32(per_deviation * np.sqrt(1.0 + raised / FAINT**2))
     height, width = score.shape
     for y in range(down + 1):
         for x in range(right + 1):
             for i in range(height - y):
+                of, most, most_by = score[i], signed[i + y][x:], by[i + y][x:]
                 for j in range(width - x):
-                    most, before = abs(score[i, j]) * faint[zone[i, j]], abs(signed[i + y, j + x])
-                    if most > before:
-                        square = (score[i, j] * per_deviation[zone[i, j]]) ** 2
-                        size = min(most, np.float32(np.sqrt(square + raised)))
-                        if size > before:
-                            signed[i + y, j + x], by[i + y, j + x] = np.copysign(size, score[i, j]), number
+                    size = min(abs(of[j]) * faint, np.sqrt((of[j] * scale) ** 2 + more))
+                    stronger = size > abs(most[j])
+                    most[j] = np.copysign(size, of[j]) if stronger else most[j]
+                    most_by[j] = number if stronger else most_by[j]
 
 
-def _tail(scores: np.ndarray) -> float:
-    """Return how much farther the tail of scores (r, c) reaches than a Gaussian's, on its shorter side; at least 1."""
-    count = int(TAIL_SHARE * np.count_nonzero(scores))
-    sides = [np.sort(np.abs(scores[beyond])) for beyond in (scores > TAIL_SIGMAS, scores < -TAIL_SIGMAS)]
+def _tail(scores: np.ndarray, deviation: float) -> float:
+    """Return how much farther the tail of scores (r, c) over their ``deviation`` reaches than a Gaussian's, on its
+    shorter side; at least 1."""
+    count, limit = int(TAIL_SHARE * np.count_nonzero(scores)), TAIL_SIGMAS * deviation
+    sides = [np.sort(np.abs(scores[beyond])) for beyond in (scores > limit, scores < -limit)]
     if count == 0 or min(map(len, sides)) < count:
         return 1.0
-    return float(min(side[-count] for side in sides)) / TAIL_SIGMAS
+    return float(min(side[-count] for side in sides)) / limit
 
 
 def _fill_discs(signed: np.ndarray, radius_px: np.ndarray) -> None:

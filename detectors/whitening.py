@@ -39,7 +39,7 @@ SIDES_PX = (0, 1, 2, 3, 5, 8, 12, 18)
 """Half-sides that a `Worth` may have: the visible share is computed once for each."""
 GRID = 96
 """Side of the grid that holds the widest template and the reach of its whitened edge."""
-CONVERGED, MOST_ITERATIONS, FADED = 0.2, 40, 0.1
+CONVERGED, MOST_ITERATIONS, FADED = 0.2, 40, 0.3
 """Error at which C^-1 r is solved, most steps, and weight of 0 in the values that fill unknown pixels."""
 TAPS = np.array([1.0, 2.0, 3.0], np.float32) / np.float32(9.0)
 """Weights, along each axis, of second and direct neighbours and of the pixel itself, which fill unknown pixels."""
@@ -180,10 +180,10 @@ def _blurred(image: np.ndarray, plus: np.ndarray, times: np.ndarray, out: np.nda
 
 
 def transformed(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the spectrum of an image (r, c), padded with zeros to a grid of even sides, packed as by `cv2.dft`."""
+    """Return the spectrum, complex (r, c), of an image padded with zeros to a grid of this shape."""
     padded = np.zeros(shape, np.float32)
     padded[: image.shape[0], : image.shape[1]] = image
-    return np.asarray(cv2.dft(padded))
+    return np.asarray(cv2.dft(padded, flags=cv2.DFT_COMPLEX_OUTPUT)).view(np.complex64)[..., 0]
 
 
 def packed(half: np.ndarray) -> np.ndarray:
@@ -198,29 +198,32 @@ def packed(half: np.ndarray) -> np.ndarray:
     return found
 
 
-def response(spectrum_of: np.ndarray, template: np.ndarray, shape: tuple[int, ...], symmetric: bool) -> np.ndarray:
-    """Return the correlation (r, c) of a picture with a template, both packed (`spectra`). For a `halved` picture and a
-    ``shape`` half as large, it is that in the middles of 2 x 2 pixels."""
-    whole = spectrum_of * template if symmetric else cv2.mulSpectrums(spectrum_of, template, 0, conjB=True)
-    return np.asarray(cv2.dft(whole, dst=whole, flags=cv2.DFT_INVERSE | cv2.DFT_SCALE))[: shape[0], : shape[1]]
+def responses(spectrum_of: np.ndarray, pair: np.ndarray) -> np.ndarray:
+    """Return the correlations (r, c, 2) of a picture with two templates, from its spectrum and theirs (`spectra`). For
+    a `halved` picture, they are those in the middles of 2 x 2 pixels."""
+    whole = (spectrum_of * pair).view(np.float32).reshape(*pair.shape, 2)
+    return np.asarray(cv2.dft(whole, dst=whole, flags=cv2.DFT_INVERSE | cv2.DFT_SCALE))
 
 
-def halved(picture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def halved(spectrum_of: np.ndarray) -> np.ndarray:
     """Return the spectrum of a picture sampled in the middles of 2 x 2 pixels, without higher frequencies."""
-    return packed(_low(scipy.fft.rfft2(picture, shape)) * _middles(shape))
+    return _low(spectrum_of) * _middles(spectrum_of.shape)
 
 
 @lru_cache(maxsize=4)
 def _middles(shape: tuple[int, ...]) -> np.ndarray:
     """Return the factors that shift a spectrum's lower half by half a pixel and scale it to a quarter of the pixels."""
-    cycles = np.add.outer(np.fft.fftfreq(shape[0] // 2) / 2, np.arange(shape[1] // 4 + 1) / shape[1])
-    return np.asarray(np.exp(1j * np.pi * cycles) / 4.0, np.complex64)
+    cycles = np.add.outer(*(np.fft.fftfreq(side // 2) / 2 for side in shape))
+    factors = np.asarray(np.exp(1j * np.pi * cycles) / 4.0, np.complex64)
+    # the highest frequency has no sign, so that half a pixel of it is not real
+    factors[shape[0] // 4], factors[:, shape[1] // 4] = 0.0, 0.0
+    return factors
 
 
 def _low(spectrum_of: np.ndarray) -> np.ndarray:
-    """Return the lower half of a spectrum's frequencies along both axes, ordered as by `scipy.fft.rfft2`."""
-    rows, columns = spectrum_of.shape[0] // 4, spectrum_of.shape[1] // 2 + 1
-    return np.concatenate((spectrum_of[:rows, :columns], spectrum_of[-rows:, :columns]))
+    """Return the lower half of a spectrum's frequencies along both axes."""
+    rows, columns = (np.r_[: side // 4, -(side // 4) : 0] for side in spectrum_of.shape)
+    return spectrum_of[np.ix_(rows, columns)]
 
 
 class Template(NamedTuple):
@@ -246,21 +249,16 @@ class Worth(NamedTuple):
 
 def worths(power: np.ndarray, window_px: int) -> tuple[Worth, ...]:
     """Return each template's `Worth` under noise with this spectrum on `GRID`."""
-    found, crowds, white = [], [], 1.0 / np.sqrt(power)
-    for sizes, seen_by in zip(_sizes(window_px), (white, _low(white)), strict=True):
-        values = sizes * seen_by
+    found, crowds = [], []
+    for cut, squares, beside, weights in _energies(window_px):
+        white = 1.0 / np.sqrt(power[cut])
+        side, pairs = len(white), (white * np.roll(white, 1, axis=0), white * np.roll(white, -1, axis=1))
+        energy, of_rows, of_columns = (squares @ (weights * np.square(white).ravel()).T).T
         # Parseval's theorem: a second moment over space is the energy of a derivative over frequency
-        side, half = values.shape[1], np.full(values.shape[2], 2.0, np.float32)
-        half[[0, -1]] = 1.0
-        energies, turned = values**2 * half, np.roll(values, 1, axis=1)
-        energy = energies.sum(axis=(1, 2))
-        down = 2.0 * (energy - np.einsum("kij,kij,j->k", values, turned, half))
-        along = 2.0 * (np.diff(values, axis=2) ** 2).sum(axis=(1, 2))
-        reach = np.sqrt(3.0 * np.stack((along, down), axis=1) / energy[:, None]) * side / (2.0 * math.pi)
+        spread = [2.0 * (energy - of @ each.ravel()) for of, each in zip(beside, pairs, strict=True)]
+        reach = np.sqrt(3.0 * np.stack(spread[::-1], axis=1) / energy[:, None]) * side / (2.0 * math.pi)
         halves = np.array(SIDES_PX)[np.abs(np.array(SIDES_PX) - reach[..., None]).argmin(axis=2)]
         # the density of maxima is the root of the score's second spectral moments (Adler 1981)
-        of_rows = energies.sum(axis=2) @ np.fft.fftfreq(side) ** 2
-        of_columns = energies.sum(axis=1) @ (np.arange(values.shape[2]) / side) ** 2
         crowds += (np.sqrt(of_rows * of_columns) / energy * side**2).tolist()
         found += [
             Worth(each / GRID**2, (2 * across + 1, 2 * along + 1), 0.0)
@@ -270,27 +268,40 @@ def worths(power: np.ndarray, window_px: int) -> tuple[Worth, ...]:
     return tuple(worth._replace(raised=math.log(most / crowd)) for worth, crowd in zip(found, crowds, strict=True))
 
 
-@lru_cache(maxsize=6)
-def spectra(shape: tuple[int, ...], window_px: int) -> tuple[np.ndarray, ...]:
-    """Return the templates' spectra, `packed`, on a grid that holds them, for an undisturbed damage of height 1. Coarse
-    templates have only the lower half, symmetric ones the real factor of each number."""
-    drawn = zip(bank(window_px), _drawn(shape, window_px), strict=True)
-    return tuple(packed(each if any(template.halves) else each.real * (1 + 1j)) for template, each in drawn)
-
-
-def _drawn(shape: tuple[int, ...], window_px: int) -> list[np.ndarray]:
-    """Return the spectra in the order of `scipy.fft.rfft2`."""
-    kinds = bank(window_px)
-    drawn = (scipy.fft.rfft2(_centred(template.image, shape)) for template in kinds)
-    return [_low(each) if template.coarse else each for template, each in zip(kinds, drawn, strict=True)]
-
-
 @lru_cache(maxsize=3)
-def _sizes(window_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the magnitudes (t, r, c) of the spectra on `GRID`; coarse templates, the last ones, separately."""
-    sizes = list(map(np.abs, _drawn((GRID, GRID), window_px)))
-    fine = sum(not template.coarse for template in bank(window_px))
-    return np.stack(sizes[:fine]), np.stack(sizes[fine:])
+def _energies(window_px: int) -> list[tuple[tuple[np.ndarray, ...], np.ndarray, list[np.ndarray], np.ndarray]]:
+    """Return what `worths` sums over half of the spectra (r, c) on `GRID`, of fine and coarse templates: where these
+    frequencies lie, the squares (t, r c) of the magnitudes, their products (t, r c) with those of the frequencies above
+    and to the right, and the weights (3, r c) of the squares: 1, and the squares of both frequencies."""
+    sizes = [np.abs(scipy.fft.rfft2(_centred(template.image, (GRID, GRID)))) for template in bank(window_px)]
+    found = []
+    for coarse, side in ((False, GRID), (True, GRID // 2)):
+        cut = np.ix_(np.r_[: side // 2, GRID - side // 2 : GRID], np.arange(side // 2 + 1))
+        values = np.stack([size[cut] for size, each in zip(sizes, bank(window_px), strict=True) if each.coarse == coarse])
+        half = np.full(side // 2 + 1, 2.0, np.float32)
+        half[[0, -1]] = 1.0
+        beside = [half * values * np.roll(values, 1, axis=1), 2.0 * values * np.roll(values, -1, axis=2)]
+        beside[1][..., -1] = 0.0
+        rows, columns = np.fft.fftfreq(side)[:, None] ** 2, (np.arange(side // 2 + 1) / side) ** 2
+        weights = np.stack([half + 0.0 * rows, half * rows, half * columns + 0.0 * rows]).reshape(3, -1)
+        flat = [np.asarray(each.reshape(len(values), -1), np.float32) for each in (values**2, *beside)]
+        found.append((cut, flat[0], flat[1:], weights.astype(np.float32)))
+    return found
+
+
+@lru_cache(maxsize=6)
+def spectra(shape: tuple[int, ...], window_px: int) -> tuple[tuple[np.ndarray, tuple[int, ...]], ...]:
+    """Return the spectra of pairs of templates (an odd one alone) of undisturbed damage of height 1 on a grid, and
+    their numbers in the `bank`: one complex transform correlates a real picture with both. Coarse templates have only
+    the lower half."""
+    pairs = []
+    for coarse in (False, True):
+        numbers = [number for number, template in enumerate(bank(window_px)) if template.coarse == coarse]
+        for pair in (tuple(numbers[at : at + 2]) for at in range(0, len(numbers), 2)):
+            drawn = [transformed(_centred(bank(window_px)[number].image, shape), shape) for number in pair]
+            both = sum(np.conj(_low(each) if coarse else each) * 1j**at for at, each in enumerate(drawn))
+            pairs.append((np.asarray(both, np.complex64), pair))
+    return tuple(pairs)
 
 
 @lru_cache(maxsize=3)
