@@ -208,7 +208,8 @@ def _judged(values: np.ndarray, known: np.ndarray, covariance: np.ndarray | None
     peaks = np.argwhere((size > STRONG) & _highest(size))
     core, taken = _cores(peaks, size, radius_px[by], values, known)
     seen = known & ~grown(core, MARGIN_PX) if core.any() else known
-    signed, by, _ = _scored(tamed * seen, seen, noise, start=solved)
+    # where much is removed, the first solution is a poor start
+    signed, by, _ = _scored(tamed * seen, seen, noise, start=None if core.any() else solved)
     _fill_discs(signed, radius_px[by])
     signed = np.where(core, taken, np.where(known, signed, 0.0))
     reach = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
@@ -234,12 +235,12 @@ def _scored(
     solved = whitening.inverse_times(values, seen, noise.filters, start, ROUGH if rough else whitening.CONVERGED)
     (h, w), grid = seen.shape, noise.filters.grid
     spectra, views, shares, tail = [whitening.transformed(solved, grid)], [], {}, 1.0
-    depth_px = np.zeros(seen.shape, np.float32) if rough else _depth_px(seen)
-    for coarse in range(1 if rough else 2):
-        there, depth = (_halved(each) if coarse else each for each in (seen, depth_px))
-        views.append(_View(there.astype(np.float32), depth > RIM_PX, *_zones(there, depth)))
-    if not rough:
+    there, depth_px = seen.astype(np.float32), None if rough else _depth_px(seen)
+    views.append(_View(there, there, *_zones(there, there if depth_px is None else depth_px)))
+    if depth_px is not None:
         spectra.append(whitening.halved(spectra[0]))
+        there, depth_px = _halved(there), _halved(depth_px)
+        views.append(_View(there, there * (depth_px > RIM_PX), *_zones(there, depth_px)))
     best = [(np.zeros(view.there.shape, np.float32), np.zeros(view.there.shape, np.uint8)) for view in views]
     templates = whitening.bank(noise.window_px)
     for pair, numbers in whitening.spectra(grid, noise.window_px):
@@ -254,8 +255,9 @@ def _scored(
             if key not in shares:
                 share = cv2.blur(view.there, worth.sides, borderType=cv2.BORDER_CONSTANT)
                 # errors along outlines, from light and flying pixels, look like slots
-                shares[key] = _visible(share, view.inner if template.slot else view.there > 0)
-            score = _one_of(both, numbers.index(number), shares[key], worth.energy**-0.5)
+                shares[key] = _visible(share, view.inner if template.slot else view.there)
+            score = cv2.extractChannel(both[: view.there.shape[0], : view.there.shape[1]], numbers.index(number))
+            cv2.multiply(score, shares[key], dst=score, scale=worth.energy**-0.5)
             deviations = np.ones(N_ZONES)
             if not rough:
                 step, round_px = 1 + coarse, 0.0 if template.slot else template.radius_px
@@ -279,8 +281,8 @@ def _scored(
 
 
 class _View(NamedTuple):
-    """Where the scores of a solution lie: ``there`` (r, c), the share of known pixels; ``inner`` (r, c) bool, off the
-    outline; ``rim``, the flat indices of pixels outside the last zone, by zone, and where in it each zone ``starts``."""
+    """Where the scores of a solution lie: ``there`` (r, c), the share of known pixels; ``inner`` (r, c), the same off
+    the outline; ``rim``, the flat indices of the pixels by zone, but for the last one, and where in it zones start."""
 
     there: np.ndarray
     inner: np.ndarray
@@ -288,33 +290,32 @@ class _View(NamedTuple):
     starts: np.ndarray
 
 
+@numba.njit(**PLAIN)
 def _zones(there: np.ndarray, depth_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    zone = ZONES[np.ceil(np.minimum(depth_px, len(ZONES) - 1)).astype(np.intp)]
-    rim = np.flatnonzero((zone < N_ZONES - 1) & (there > 0))
-    zones = zone.ravel()[rim]
-    return rim[np.argsort(zones, kind="stable")], np.searchsorted(np.sort(zones), np.arange(N_ZONES))
+    known, depths = there.ravel(), depth_px.ravel()
+    zones, ends = np.empty(len(known), np.uint8), np.zeros(N_ZONES + 1, np.int64)
+    for at in range(len(known)):
+        zone = ZONES[int(np.ceil(min(depths[at], np.float32(len(ZONES) - 1))))]
+        zones[at] = zone if known[at] > 0 else N_ZONES - 1
+        ends[zones[at] + 1] += 1
+    starts = np.cumsum(ends)[:-1]
+    rim, ends = np.empty(starts[-1], np.int64), starts.copy()
+    for at in range(len(known)):
+        if zones[at] < N_ZONES - 1:
+            rim[ends[zones[at]]] = at
+            ends[zones[at]] += 1
+    return rim, starts
 
 
 @numba.njit(**PLAIN)
 def _visible(share: np.ndarray, judged: np.ndarray) -> np.ndarray:
-    """Return 1 / sqrt(share) (r, c) where a template is judged and enough of it is visible, 0 elsewhere."""
-    found = np.empty(share.shape, np.float32)
+    """Return 1 / sqrt(share) (r, c) where ``judged`` is not 0 and enough of a template is visible, 0 elsewhere."""
+    found, least = np.empty(share.shape, np.float32), np.float32(LEAST_SEEN)
     for i in range(share.shape[0]):
         of, ok, to = share[i], judged[i], found[i]
         for j in range(len(to)):
-            seen = max(of[j], np.float32(LEAST_SEEN))
-            to[j] = np.float32(1.0) / np.sqrt(seen) if ok[j] and of[j] > np.float32(LEAST_SEEN) else np.float32(0.0)
-    return found
-
-
-@numba.njit(**PLAIN)
-def _one_of(both: np.ndarray, which: int, share: np.ndarray, scale: float) -> np.ndarray:
-    """Return one of two interleaved pictures (r, c, 2), times ``share`` (r, c) and ``scale``."""
-    found, factor = np.empty(share.shape, np.float32), np.float32(scale)
-    for i in range(share.shape[0]):
-        of, by, to = both[i], share[i], found[i]
-        for j in range(len(to)):
-            to[j] = of[j, which] * by[j] * factor
+            root = np.float32(1.0) / np.sqrt(max(of[j], least))
+            to[j] = root if (of[j] > least) & (ok[j] > 0) else np.float32(0.0)
     return found
 
 
@@ -327,21 +328,12 @@ def _halved(image: np.ndarray) -> np.ndarray:
 def _deviations(score: np.ndarray, view: _View, reach_px: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the deviation (z,) of the scores (r, c) in each zone of a view, from sizes up to `CAP`, at least that of
     the last zone; and the scores, 0 within ``reach_px`` of strong ones, which are excluded."""
-    found, _ = _scatter(score, view)
+    found, _ = _scatter(score, view.rim, view.starts)
     if reach_px and (strong := np.abs(score) > FAINT * found[-1]).any():
         quiet = np.where(grown(strong, reach_px), np.float32(0.0), score)
-        again, count = _scatter(quiet, view)
+        again, count = _scatter(quiet, view.rim, view.starts)
         return (again if count > FEWEST else found), quiet
     return found, score
-
-
-def _scatter(score: np.ndarray, view: _View) -> tuple[np.ndarray, int]:
-    sums, counts = _capped(score, view.rim, view.starts)
-    number = int(counts.sum())
-    if counts[-1] < FEWEST:
-        sums[-1], counts[-1] = sums.sum(), max(number, 1)
-    found = np.interp(sums / np.maximum(counts, 1), CAPPED, DEVIATIONS)
-    return np.where(counts < FEWEST, found[-1], np.maximum(found, found[-1])), number
 
 
 def _calm(score: np.ndarray, quiet: np.ndarray, deviation: float, half_px: float) -> None:
@@ -377,22 +369,35 @@ def _parts(score: np.ndarray, cap: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 @numba.njit(**PLAIN)
-def _capped(score: np.ndarray, rim: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sums of the sizes, at most `CAP`, of scores that are not 0 in each zone, and their number."""
-    sums, counts, most = np.zeros(len(starts)), np.zeros(len(starts), np.int64), np.float32(CAP)
+def _scatter(score: np.ndarray, rim: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return the deviation (z,) of the scores (r, c) that are not 0 in each zone, and the number of such scores."""
+    last, most, flat = len(starts) - 1, np.float32(CAP), score.ravel()
     sizes, numbers = np.zeros(score.shape[1], np.float32), np.zeros(score.shape[1], np.int32)
     for i in range(score.shape[0]):
         of = score[i]
         for j in range(len(of)):
             sizes[j] += min(abs(of[j]), most)
             numbers[j] += of[j] != 0
-    flat = score.ravel()
-    for zone in range(len(starts) - 1):
+    sums, counts = np.zeros(last + 1), np.zeros(last + 1, np.int64)
+    whole, number = sizes.sum(), int(numbers.sum())
+    for zone in range(last):
+        total, count = np.float32(0.0), 0
         for at in rim[starts[zone] : starts[zone + 1]]:
-            sums[zone] += min(abs(flat[at]), most)
-            counts[zone] += flat[at] != 0
-    sums[-1], counts[-1] = sizes.sum() - sums.sum(), numbers.sum() - counts.sum()
-    return sums, counts
+            total += min(abs(flat[at]), most)
+            count += flat[at] != 0
+        sums[zone], counts[zone] = total, count
+    sums[last], counts[last] = whole - sums.sum(), number - counts.sum()
+    if counts[last] < FEWEST:
+        sums[last], counts[last] = whole, max(number, 1)
+    found = np.empty(last + 1)
+    for zone in range(last, -1, -1):
+        size, k = sums[zone] / max(counts[zone], 1), 1
+        while k < len(CAPPED) - 1 and CAPPED[k] < size:
+            k += 1
+        share = min(max((size - CAPPED[k - 1]) / (CAPPED[k] - CAPPED[k - 1]), 0.0), 1.0)
+        found[zone] = DEVIATIONS[k - 1] + share * (DEVIATIONS[k] - DEVIATIONS[k - 1])
+        found[zone] = max(found[zone], found[last]) if counts[zone] >= FEWEST else found[last]
+    return found, number
 
 
 @numba.njit(**PLAIN)

@@ -41,6 +41,8 @@ GRID = 96
 """Side of the grid that holds the widest template and the reach of its whitened edge."""
 CONVERGED, MOST_ITERATIONS, FADED = 0.2, 40, 0.3
 """Error at which C^-1 r is solved, most steps, and weight of 0 in the values that fill unknown pixels."""
+EDGE_PX = 7.0
+"""Depth of an outline's pixels among which errors count, in units of the sum of what is unknown around its pixels."""
 TAPS = np.array([1.0, 2.0, 3.0], np.float32) / np.float32(9.0)
 """Weights, along each axis, of second and direct neighbours and of the pixel itself, which fill unknown pixels."""
 
@@ -58,13 +60,20 @@ def _fast(side: int) -> int:
 def noise_covariance(noise: np.ndarray, quiet: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Return the autocovariance (2 `LONGEST_LAG_PX` + 1, squared) of the quiet pixels, lag 0 in the middle: mean
     products of pairs of known pixels, faded out by Parzen's window."""
-    products = np.abs(scipy.fft.rfft2(np.where(quiet, noise, np.float32(0.0)), shape)) ** 2
-    pairs = np.abs(scipy.fft.rfft2(quiet.astype(np.float32), shape)) ** 2
     lags = np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1)
-    sums, counts = (scipy.fft.irfft2(each, shape)[np.ix_(lags, lags)] for each in (products, pairs))
+    sums, counts = (_by_lag(np.where(quiet, image, np.float32(0.0)), shape) for image in (noise, np.float32(1.0)))
     lag = np.minimum(np.hypot(lags[:, None], lags) / LONGEST_LAG_PX, 1.0)
     parzen = np.where(lag <= 0.5, 1.0 - 6.0 * lag**2 * (1.0 - lag), 2.0 * (1.0 - lag) ** 3)
     return np.asarray(parzen * sums / np.maximum(counts, 1.0), np.float32)
+
+
+def _by_lag(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the sums of products of an image's pairs of pixels by lag, up to `LONGEST_LAG_PX`."""
+    whole, reach = np.zeros(shape, np.float32), np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1)
+    whole[: image.shape[0], : image.shape[1]] = image
+    cv2.dft(whole, dst=whole)
+    cv2.mulSpectrums(whole, whole, 0, c=whole, conjB=True)
+    return np.asarray(cv2.dft(whole, dst=whole, flags=cv2.DFT_INVERSE | cv2.DFT_SCALE))[np.ix_(reach, reach)]
 
 
 def spectrum(covariance: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -120,13 +129,13 @@ def inverse_times(
     tight, share, filled = np.zeros((3, *by.inverse.shape), np.float32)
     tight[:h, :w] = mask
     near = cv2.GaussianBlur(tight, (13, 13), 2.0, borderType=cv2.BORDER_CONSTANT)
-    damp = tight * np.sqrt(near)
+    damp, enough = tight * np.sqrt(near), error**2 * EDGE_PX * float(tight.sum() - np.vdot(tight, near))
     _blurred(tight, tight, np.ones_like(share), share)
     share = (1.0 - tight) / (share + FADED)
 
-    def filtered(image: np.ndarray, by: np.ndarray, out: np.ndarray) -> np.ndarray:
+    def filtered(image: np.ndarray, factors: np.ndarray, out: np.ndarray) -> np.ndarray:
         cv2.dft(image, dst=out)
-        np.multiply(out, by, out=out)
+        np.multiply(out, factors, out=out)
         return np.asarray(cv2.dft(out, dst=out, flags=cv2.DFT_INVERSE))
 
     def covered(image: np.ndarray) -> np.ndarray:
@@ -144,8 +153,7 @@ def inverse_times(
         solution = mask * start
         rest -= covered(solution)
     direction = towards = conditioned(rest)
-    edge = np.count_nonzero(mask > 0) - np.count_nonzero(damp > 0.995)
-    product, enough = float(np.vdot(rest, towards)), error**2 * edge
+    product = float(np.vdot(rest, towards))
     for _ in range(MOST_ITERATIONS):
         if product <= enough:
             break
