@@ -66,6 +66,7 @@ ALONE_PX = 7
 """Half of the square in which a peak is the highest."""
 RIM_PX = 6
 """Depth of the target's rim, to which the camera's window and lens reach over its edge."""
+LAYER_PX = 4  # side of the squares in which what the rim shares is averaged
 RIM_ENDS_PX = (1, 2, 3, 5, 8, 12)
 """Distances from the outline up to which scores have their own scatter; farther inside, all scores share one."""
 N_ZONES = len(RIM_ENDS_PX) + 1
@@ -128,8 +129,8 @@ class MatchedDetector(LocalDetector):
         self, residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]
     ) -> tuple[np.ndarray, float, str]:
         """Return signed scores (r, c), the deviation of the narrowest template's depth (m), and the unit of score."""
-        values, unit_m, known = _in_deviations(residual_m, weights, rounding_m2)
-        signed, narrowest = _judged(values, known, self._covariance)
+        values, known, depth_px, unit_m = _in_deviations(residual_m, weights, rounding_m2)
+        signed, narrowest = _judged(values, known, depth_px, self._covariance)
         depth_m = narrowest * float(np.median(unit_m[known]))
         text = f"the deviation of matched filters on whitened noise, {1e3 * depth_m:.3g} mm for the narrowest"
         return signed, depth_m, text
@@ -145,7 +146,7 @@ class MatchedDetector(LocalDetector):
     def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
         """Return the mean covariance of the clouds' residuals by lag, in squared deviations of the local noise."""
         pictures = (self.picture(cloud) for cloud in hole_free)
-        seen = [_covariance(*_in_deviations(*picture.residuals)[::2]) for picture in pictures]
+        seen = [_covariance(*_in_deviations(*picture.residuals)[:3]) for picture in pictures]
         return {"covariance": np.mean(seen, axis=0)} if seen else {}
 
     def calibrated(self, learned: Mapping[str, np.ndarray]) -> MatchedDetector:
@@ -155,19 +156,22 @@ class MatchedDetector(LocalDetector):
 
 def _in_deviations(
     residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return residuals (r, c) in units of the noise nearby, increased where a point's own variance is larger, and minus
-    what they share along the outline; that unit (r, c) in metres; and (r, c) bool, the known pixels."""
+    what they share along the outline; (r, c) bool, the known pixels; their distances (r, c) from the outline; and that
+    unit (r, c) in metres."""
     known = weights > 0
     floor_m = max(float(np.sqrt(sum(rounding_m2))), 1e-9)
     values = np.where(known, residual_m * np.sqrt(weights), 0.0).astype(np.float32)
     # structure wider than a filter's window, objects and the surface's misfit are not noise of pixels
     side = (SHORT_PX, SHORT_PX)
     around = (cv2.blur(each, side, borderType=cv2.BORDER_REFLECT) for each in (values, known.astype(np.float32)))
-    short = np.where(known, values - next(around) / np.maximum(next(around), 1e-6), np.nan)
+    short = values - next(around) / np.maximum(next(around), np.float32(1e-6))
+    short[~known] = np.nan
     share = median_of(np.abs(short[known])) / max(median_of(np.abs(values[known])), 1e-12)
     unit_m = np.maximum(local_sigma(short) / max(share, 1e-3), floor_m)
-    return _without_rim(values / unit_m, known), unit_m, known
+    depth_px = _depth_px(known)
+    return _without_rim(values / unit_m, depth_px * known), known, depth_px, unit_m
 
 
 @lru_cache(maxsize=1)
@@ -175,12 +179,12 @@ def _own_covariance(evidence: Evidence) -> np.ndarray:
     """Return the covariance of a cloud's residuals, in squared deviations, once for all findings of the cloud."""
     known = np.isfinite(evidence.residual_m)
     residual_m = np.where(known, evidence.residual_m, 0.0)
-    return _covariance(_in_deviations(residual_m, known.astype(np.float32), (0.0, 0.0))[0], known)
+    return _covariance(*_in_deviations(residual_m, known.astype(np.float32), (0.0, 0.0))[:3])
 
 
-def _covariance(noise: np.ndarray, known: np.ndarray) -> np.ndarray:
+def _covariance(noise: np.ndarray, known: np.ndarray, depth_px: np.ndarray) -> np.ndarray:
     """Return the covariance of weak residuals, away from the rim unless most pixels lie there."""
-    inner = known & (_depth_px(known) > RIM_PX)
+    inner = known & (depth_px > RIM_PX)
     inner = inner if 2 * inner.sum() > known.sum() else known
     loud = cv2.dilate((np.abs(noise) > QUIET_SIGMAS).astype(np.uint8), np.ones((5, 5), np.uint8))
     return whitening.noise_covariance(noise, inner & (loud == 0), whitening.grid_of(noise.shape))
@@ -194,9 +198,11 @@ class _Noise(NamedTuple):
     worths: tuple[whitening.Worth, ...]
 
 
-def _judged(values: np.ndarray, known: np.ndarray, covariance: np.ndarray | None) -> tuple[np.ndarray, float]:
+def _judged(
+    values: np.ndarray, known: np.ndarray, depth_px: np.ndarray, covariance: np.ndarray | None
+) -> tuple[np.ndarray, float]:
     """Return signed scores (r, c) of residuals in deviations, and the deviation of the narrowest template's height."""
-    covariance = _covariance(values, known) if covariance is None else covariance
+    covariance = _covariance(values, known, depth_px) if covariance is None else covariance
     window_px = whitening.window_of(covariance)
     worth_of = whitening.worths(whitening.spectrum(covariance, (whitening.GRID, whitening.GRID)), window_px)
     noise = _Noise(whitening.filters(covariance, values.shape), window_px, worth_of)
@@ -211,11 +217,12 @@ def _judged(values: np.ndarray, known: np.ndarray, covariance: np.ndarray | None
     # where much is removed, the first solution is a poor start
     signed, by, _ = _scored(tamed * seen, seen, noise, start=None if core.any() else solved)
     _fill_discs(signed, radius_px[by])
-    signed = np.where(core, taken, np.where(known, signed, 0.0))
+    signed *= known
+    signed[core] = taken[core]
     reach = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
-    behind, before = (cv2.dilate(np.maximum(each, 0.0), reach) for each in (signed, -signed))
-    lobe = np.abs(signed) < LOBE_SHARE * np.where(signed > 0, before, behind)
-    return np.where(lobe, 0.0, signed).astype(np.float64), noise.worths[0].energy ** -0.5
+    low, high = (np.asarray(of(signed, reach)) for of in (cv2.erode, cv2.dilate))
+    lobe = (signed < -LOBE_SHARE * low) & (signed > -LOBE_SHARE * high)
+    return (signed * ~lobe).astype(np.float64), noise.worths[0].energy ** -0.5
 
 
 def _tamed(values: np.ndarray) -> np.ndarray:
@@ -233,61 +240,68 @@ def _scored(
     ``seen`` (r, c). ``start``: an approximate solution. ``rough``: only round templates at the centres of pixels,
     without the scatter of scores, which strong residuals would spoil."""
     solved = whitening.inverse_times(values, seen, noise.filters, start, ROUGH if rough else whitening.CONVERGED)
-    (h, w), grid = seen.shape, noise.filters.grid
-    spectra, views, shares, tail = [whitening.transformed(solved, grid)], [], {}, 1.0
-    there, depth_px = seen.astype(np.float32), None if rough else _depth_px(seen)
-    views.append(_View(there, there, *_zones(there, there if depth_px is None else depth_px)))
-    if depth_px is not None:
+    spectra, visible, tail = [whitening.transformed(solved, noise.filters.grid)], {}, 1.0
+    there = seen.astype(np.float32)
+    views = [_view(there, there if rough else _depth_px(seen))]
+    if not rough:
         spectra.append(whitening.halved(spectra[0]))
-        there, depth_px = _halved(there), _halved(depth_px)
-        views.append(_View(there, there * (depth_px > RIM_PX), *_zones(there, depth_px)))
+        views.append(_view(_halved(there), _halved(views[0].depth_px)))
     best = [(np.zeros(view.there.shape, np.float32), np.zeros(view.there.shape, np.uint8)) for view in views]
-    templates = whitening.bank(noise.window_px)
-    for pair, numbers in whitening.spectra(grid, noise.window_px):
-        wanted = [number for number in numbers if not rough or not (templates[number].coarse or templates[number].halves != (0, 0))]
-        if not wanted:
+    templates, worths = whitening.bank(noise.window_px), noise.worths
+    wanted = [not rough or not (each.coarse or any(each.halves)) for each in templates]
+    for pair, numbers in whitening.spectra(noise.filters.grid, noise.window_px):
+        if not any(wanted[number] for number in numbers):
             continue
         coarse = templates[numbers[0]].coarse
         view, both = views[coarse], whitening.responses(spectra[coarse], pair)
-        for number in wanted:
-            template, worth = templates[number], noise.worths[number]
+        cut = both[: view.there.shape[0], : view.there.shape[1]]
+        for channel, number in enumerate(numbers):
+            if not wanted[number]:
+                continue
+            template, worth = templates[number], worths[number]
             key = coarse, template.slot, worth.sides
-            if key not in shares:
-                share = cv2.blur(view.there, worth.sides, borderType=cv2.BORDER_CONSTANT)
+            if key not in visible:
                 # errors along outlines, from light and flying pixels, look like slots
-                shares[key] = _visible(share, view.inner if template.slot else view.there)
-            score = cv2.extractChannel(both[: view.there.shape[0], : view.there.shape[1]], numbers.index(number))
-            cv2.multiply(score, shares[key], dst=score, scale=worth.energy**-0.5)
-            deviations = np.ones(N_ZONES)
+                visible[key] = _visible(view.sums, view.inner if template.slot else view.there, *worth.sides)
+            score = cv2.extractChannel(cut, channel)
+            cv2.multiply(score, visible[key], dst=score, scale=worth.energy**-0.5)
+            deviation = 1.0
             if not rough:
                 step, round_px = 1 + coarse, 0.0 if template.slot else template.radius_px
                 deviations, quiet = _deviations(score, view, round(round_px / step) if round_px >= WIDE_PX else 0)
-                _calm(score, quiet, deviations[-1], max(WINDOW_RADII * template.radius_px, LEAST_WINDOW) / step)
-                _even(score, view.rim, view.starts, deviations[-1] / deviations)
+                deviation = float(deviations[-1])
+                _calm(score, quiet, deviation, max(WINDOW_RADII * template.radius_px, LEAST_WINDOW) / step)
+                _even(score, view.rim, view.starts, deviation / deviations)
                 if template.radius_px <= TAIL_PX:
-                    if not any(template.halves):
-                        tail = _tail(score, deviations[-1])
-                    deviations *= tail
-            _keep_stronger(*best[coarse], score, 1.0 / deviations[-1], worth.raised, *template.halves, number)
+                    tail = tail if any(template.halves) else _tail(score, deviation)
+                    deviation *= tail
+            _keep_stronger(*best[coarse], score, 1.0 / deviation, worth.raised, *template.halves, number)
     signed, by = best[0]
     for half, half_by in best[1:]:
         wide, wide_by = (
-            cv2.resize(each, None, fx=2, fy=2, interpolation=how)[:h, :w]
+            np.ascontiguousarray(cv2.resize(each, None, fx=2, fy=2, interpolation=how)[: len(seen), : seen.shape[1]])
             for each, how in ((half, cv2.INTER_LINEAR), (half_by, cv2.INTER_NEAREST))
         )
-        wider = np.abs(wide) > np.abs(signed)
-        signed, by = np.where(wider, wide, signed), np.where(wider, wide_by, by)
+        wider = (np.abs(wide) > np.abs(signed)).view(np.uint8)
+        cv2.copyTo(wide, wider, signed), cv2.copyTo(wide_by, wider, by)
     return signed * seen, by, solved
 
 
 class _View(NamedTuple):
-    """Where the scores of a solution lie: ``there`` (r, c), the share of known pixels; ``inner`` (r, c), the same off
-    the outline; ``rim``, the flat indices of the pixels by zone, but for the last one, and where in it zones start."""
+    """Where the scores of a solution lie: ``there`` (r, c), the share of known pixels, and its ``sums`` (r + 1, c + 1)
+    up to each pixel; ``inner`` (r, c), the same off the outline; ``depth_px`` (r, c), the distances from the outline;
+    ``rim``, the flat indices of the pixels by zone, but for the last one, and where in it zones start."""
 
     there: np.ndarray
+    sums: np.ndarray
     inner: np.ndarray
+    depth_px: np.ndarray
     rim: np.ndarray
     starts: np.ndarray
+
+
+def _view(there: np.ndarray, depth_px: np.ndarray) -> _View:
+    return _View(there, cv2.integral(there), there * (depth_px > RIM_PX), depth_px, *_zones(there, depth_px))
 
 
 @numba.njit(**PLAIN)
@@ -308,20 +322,28 @@ def _zones(there: np.ndarray, depth_px: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 @numba.njit(**PLAIN)
-def _visible(share: np.ndarray, judged: np.ndarray) -> np.ndarray:
-    """Return 1 / sqrt(share) (r, c) where ``judged`` is not 0 and enough of a template is visible, 0 elsewhere."""
-    found, least = np.empty(share.shape, np.float32), np.float32(LEAST_SEEN)
-    for i in range(share.shape[0]):
-        of, ok, to = share[i], judged[i], found[i]
-        for j in range(len(to)):
-            root = np.float32(1.0) / np.sqrt(max(of[j], least))
-            to[j] = root if (of[j] > least) & (ok[j] > 0) else np.float32(0.0)
+def _visible(sums: np.ndarray, judged: np.ndarray, across: int, down: int) -> np.ndarray:
+    """Return 1 / sqrt(s) (r, c) where ``judged`` is not 0 and enough of a template is visible, 0 elsewhere; s is the
+    mean over a rectangle of a picture that is 0 outside, from its ``sums`` (r + 1, c + 1)."""
+    (h, w), beside, under = judged.shape, across // 2, down // 2
+    found, least, area = np.empty((h, w), np.float32), np.float32(LEAST_SEEN), np.float32(1.0 / (across * down))
+    line = np.empty(w + across, np.float32)
+    for i in range(h):
+        top, bottom, inside = sums[max(i - under, 0)], sums[min(i + under + 1, h)], line[beside : beside + w + 1]
+        for j in range(w + 1):
+            inside[j] = bottom[j] - top[j]
+        line[:beside], line[beside + w + 1 :] = 0, inside[w]
+        left, right, ok, to = line[:w], line[across:], judged[i], found[i]
+        for j in range(w):
+            share = (right[j] - left[j]) * area
+            root = np.float32(1.0) / np.sqrt(max(share, least))
+            to[j] = root if (share > least) & (ok[j] > 0) else np.float32(0.0)
     return found
 
 
 def _halved(image: np.ndarray) -> np.ndarray:
     """Return the means (r / 2, c / 2) of 2 x 2 pixels; an odd last row or column is repeated."""
-    even = np.pad(image, ((0, image.shape[0] % 2), (0, image.shape[1] % 2)), mode="edge").astype(np.float32)
+    even = cv2.copyMakeBorder(image, 0, image.shape[0] % 2, 0, image.shape[1] % 2, cv2.BORDER_REPLICATE)
     return np.asarray(cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
 
 
@@ -329,8 +351,8 @@ def _deviations(score: np.ndarray, view: _View, reach_px: int) -> tuple[np.ndarr
     """Return the deviation (z,) of the scores (r, c) in each zone of a view, from sizes up to `CAP`, at least that of
     the last zone; and the scores, 0 within ``reach_px`` of strong ones, which are excluded."""
     found, _ = _scatter(score, view.rim, view.starts)
-    if reach_px and (strong := np.abs(score) > FAINT * found[-1]).any():
-        quiet = np.where(grown(strong, reach_px), np.float32(0.0), score)
+    if reach_px and cv2.norm(score, cv2.NORM_INF) > FAINT * found[-1]:
+        quiet = score * ~grown(np.abs(score) > FAINT * found[-1], reach_px)
         again, count = _scatter(quiet, view.rim, view.starts)
         return (again if count > FEWEST else found), quiet
     return found, score
@@ -446,10 +468,16 @@ def _fill_discs(signed: np.ndarray, radius_px: np.ndarray) -> None:
     peaks = (size > STRONG / 2) & (radius_px >= WIDE_PX) & _highest(size)
     for row, column in np.argwhere(peaks).tolist():
         radius, least = int(radius_px[row, column]), SADDLE * 1.01 * signed[row, column]
-        cut = np.s_[max(row - radius, 0) : row + radius + 1, max(column - radius, 0) : column + radius + 1]
-        rows, columns = np.indices(size[cut].shape)
-        inside = np.hypot(rows - min(row, radius), columns - min(column, radius)) <= radius
+        up, left = max(radius - row, 0), max(radius - column, 0)
+        cut = np.s_[row - radius + up : row + radius + 1, column - radius + left : column + radius + 1]
+        inside = _disc(radius)[up : up + size[cut].shape[0], left : left + size[cut].shape[1]]
         signed[cut][inside & (size[cut] < abs(least))] = least
+
+
+@lru_cache(maxsize=32)
+def _disc(radius_px: int) -> np.ndarray:
+    reach = np.arange(-radius_px, radius_px + 1)
+    return np.hypot(reach[:, None], reach) <= radius_px
 
 
 def _highest(size: np.ndarray) -> np.ndarray:
@@ -489,25 +517,43 @@ def _cores(
 
 def _depth_px(known: np.ndarray) -> np.ndarray:
     """Return the distance (r, c) of each pixel to the outline of the known pixels, ignoring single unknown pixels."""
-    closed = cv2.morphologyEx(np.pad(known.astype(np.uint8), 2), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-    return np.asarray(cv2.distanceTransform(closed, cv2.DIST_C, 3)[2:-2, 2:-2])
+    padded = cv2.copyMakeBorder(known.astype(np.uint8), 2, 2, 2, 2, cv2.BORDER_CONSTANT)
+    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    return np.ascontiguousarray(cv2.distanceTransform(closed, cv2.DIST_C, 3)[2:-2, 2:-2])
 
 
-def _without_rim(noise: np.ndarray, known: np.ndarray) -> np.ndarray:
+def _without_rim(noise: np.ndarray, depth_px: np.ndarray) -> np.ndarray:
     """Return the residuals (r, c) minus what they share, along some 65 pixels, with those at the same distance from the
-    outline, beyond what those next to the rim share: subtracting a mean would leave a step there."""
-    noise, depth_px = noise.astype(np.float32), _depth_px(known)
-    modest = np.clip(noise, -LEVEL_SIGMAS, LEVEL_SIGMAS)
+    outline, beyond what those next to the rim share: subtracting a mean would leave a step there. Pixels whose
+    ``depth_px`` (r, c) is 0 are unknown."""
+    sums = _layers(noise, depth_px)
+    side = 2 * (LEAST_WINDOW // LAYER_PX) + 1
+    total, count = (cv2.blur(each, (side, side), borderType=cv2.BORDER_CONSTANT) for each in sums)
+    shared = total / np.maximum(count, 1e-6)
+    return _lowered(noise, depth_px, shared - shared[..., RIM_PX:])
 
-    def shared(layer: np.ndarray) -> np.ndarray:
-        of, total = (
-            cv2.blur(each, (2 * LEAST_WINDOW + 1,) * 2, borderType=cv2.BORDER_CONSTANT)
-            for each in (layer.astype(np.float32), modest * layer)
-        )
-        return np.asarray(total / np.maximum(of, 1e-6))
 
-    inside = shared(known & (depth_px > RIM_PX) & (depth_px <= 2 * RIM_PX))
-    for step in range(1, RIM_PX + 1):
-        layer = known & (depth_px == step)
-        np.subtract(noise, shared(layer) - inside, out=noise, where=layer)
-    return noise
+@numba.njit(**PLAIN)
+def _layers(noise: np.ndarray, depth_px: np.ndarray) -> np.ndarray:
+    """Return the sums of clipped residuals, and their numbers (2, r, c, `RIM_PX` + 1), in squares of `LAYER_PX`, for
+    each distance from the outline within the rim, and for those next to the rim together."""
+    h, w = noise.shape
+    sums = np.zeros((2, -(-h // LAYER_PX), -(-w // LAYER_PX), RIM_PX + 1), np.float32)
+    for i in range(h):
+        for j in range(w):
+            if 0 < depth_px[i, j] <= 2 * RIM_PX:
+                layer = min(int(depth_px[i, j]) - 1, RIM_PX)
+                sums[0, i // LAYER_PX, j // LAYER_PX, layer] += min(max(noise[i, j], -LEVEL_SIGMAS), LEVEL_SIGMAS)
+                sums[1, i // LAYER_PX, j // LAYER_PX, layer] += 1
+    return sums
+
+
+@numba.njit(**PLAIN)
+def _lowered(noise: np.ndarray, depth_px: np.ndarray, shared: np.ndarray) -> np.ndarray:
+    """Return the residuals (r, c) minus what the pixels of the rim share, in the order of `_layers`."""
+    found = noise.astype(np.float32)
+    for i in range(noise.shape[0]):
+        for j in range(noise.shape[1]):
+            if 0 < depth_px[i, j] <= RIM_PX:
+                found[i, j] -= shared[i // LAYER_PX, j // LAYER_PX, int(depth_px[i, j]) - 1]
+    return found

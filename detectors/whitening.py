@@ -61,7 +61,7 @@ def noise_covariance(noise: np.ndarray, quiet: np.ndarray, shape: tuple[int, ...
     """Return the autocovariance (2 `LONGEST_LAG_PX` + 1, squared) of the quiet pixels, lag 0 in the middle: mean
     products of pairs of known pixels, faded out by Parzen's window."""
     lags = np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1)
-    sums, counts = (_by_lag(np.where(quiet, image, np.float32(0.0)), shape) for image in (noise, np.float32(1.0)))
+    sums, counts = (_by_lag(quiet * image, shape) for image in (noise, np.float32(1.0)))
     lag = np.minimum(np.hypot(lags[:, None], lags) / LONGEST_LAG_PX, 1.0)
     parzen = np.where(lag <= 0.5, 1.0 - 6.0 * lag**2 * (1.0 - lag), 2.0 * (1.0 - lag) ** 3)
     return np.asarray(parzen * sums / np.maximum(counts, 1.0), np.float32)
@@ -112,8 +112,14 @@ def filters(covariance: np.ndarray, shape: tuple[int, ...]) -> Filters:
     """Return the `Filters` of noise with this covariance for pictures of this ``shape``."""
     # what wraps around in the preconditioner costs no steps
     grid, tight = grid_of(shape), tuple(_fast(max(side, 2 * LONGEST_LAG_PX) + 4) for side in shape)
-    power, around = (packed(spectrum(covariance, each) * np.complex64(1 + 1j)) for each in (grid, tight))
-    return Filters(grid, power / np.float32(power.size), 1.0 / (around * np.float32(around.size)))
+    powers = []
+    for each in (grid, tight):
+        power = cv2.dft(_centred(covariance, each))
+        # a real spectrum: the real factor of each number takes the imaginary one's place too
+        power[:, 2::2], power[2::2, :: each[1] - 1] = power[:, 1:-1:2], power[1:-1:2, :: each[1] - 1]
+        least = np.float32(max(LEAST_POWER * float(covariance.max()), 1e-12))
+        powers.append(np.maximum(power, least) * np.float32(power.size))
+    return Filters(grid, powers[0] / np.float32(powers[0].size ** 2), 1.0 / powers[1])
 
 
 def inverse_times(
@@ -189,28 +195,16 @@ def _blurred(image: np.ndarray, plus: np.ndarray, times: np.ndarray, out: np.nda
 
 def transformed(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Return the spectrum, complex (r, c), of an image padded with zeros to a grid of this shape."""
-    padded = np.zeros(shape, np.float32)
-    padded[: image.shape[0], : image.shape[1]] = image
-    return np.asarray(cv2.dft(padded, flags=cv2.DFT_COMPLEX_OUTPUT)).view(np.complex64)[..., 0]
-
-
-def packed(half: np.ndarray) -> np.ndarray:
-    """Return a spectrum of `scipy.fft.rfft2` (r, c / 2 + 1), r and c even, packed as by `cv2.dft` (r, c)."""
-    rows = len(half)
-    found = np.empty((rows, 2 * half.shape[1] - 2), np.float32)
-    found[:, 1:-1:2], found[:, 2::2] = half[:, 1:-1].real, half[:, 1:-1].imag
-    for column in (0, -1):
-        found[0, column], found[-1, column] = half[0, column].real, half[rows // 2, column].real
-        found[1:-1:2, column] = half[1 : rows // 2, column].real
-        found[2:-1:2, column] = half[1 : rows // 2, column].imag
-    return found
+    padded = np.zeros((*shape, 2), np.float32)
+    padded[: image.shape[0], : image.shape[1], 0] = image
+    return np.asarray(cv2.dft(padded, dst=padded)).view(np.complex64)[..., 0]
 
 
 def responses(spectrum_of: np.ndarray, pair: np.ndarray) -> np.ndarray:
     """Return the correlations (r, c, 2) of a picture with two templates, from its spectrum and theirs (`spectra`). For
     a `halved` picture, they are those in the middles of 2 x 2 pixels."""
     whole = (spectrum_of * pair).view(np.float32).reshape(*pair.shape, 2)
-    return np.asarray(cv2.dft(whole, dst=whole, flags=cv2.DFT_INVERSE | cv2.DFT_SCALE))
+    return np.asarray(cv2.dft(whole, dst=whole, flags=cv2.DFT_INVERSE))
 
 
 def halved(spectrum_of: np.ndarray) -> np.ndarray:
@@ -300,15 +294,15 @@ def _energies(window_px: int) -> list[tuple[tuple[np.ndarray, ...], np.ndarray, 
 @lru_cache(maxsize=6)
 def spectra(shape: tuple[int, ...], window_px: int) -> tuple[tuple[np.ndarray, tuple[int, ...]], ...]:
     """Return the spectra of pairs of templates (an odd one alone) of undisturbed damage of height 1 on a grid, and
-    their numbers in the `bank`: one complex transform correlates a real picture with both. Coarse templates have only
-    the lower half."""
+    their numbers in the `bank`: one complex transform correlates a real picture with both. They are divided by the number
+    of pixels of the inverse transform. Coarse templates have only the lower half."""
     pairs = []
     for coarse in (False, True):
         numbers = [number for number, template in enumerate(bank(window_px)) if template.coarse == coarse]
         for pair in (tuple(numbers[at : at + 2]) for at in range(0, len(numbers), 2)):
             drawn = [transformed(_centred(bank(window_px)[number].image, shape), shape) for number in pair]
             both = sum(np.conj(_low(each) if coarse else each) * 1j**at for at, each in enumerate(drawn))
-            pairs.append((np.asarray(both, np.complex64), pair))
+            pairs.append((np.asarray(both / drawn[0].size * (4 if coarse else 1), np.complex64), pair))
     return tuple(pairs)
 
 
