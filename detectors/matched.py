@@ -246,6 +246,7 @@ def _scored(
     if not rough:
         spectra.append(whitening.halved(spectra[0]))
         views.append(_view(_halved(there), _halved(views[0].depth_px)))
+    scores, products = [np.empty_like(view.there) for view in views], [np.empty_like(each) for each in spectra]
     best = [(np.zeros(view.there.shape, np.float32), np.zeros(view.there.shape, np.uint8)) for view in views]
     templates, worths = whitening.bank(noise.window_px), noise.worths
     wanted = [not rough or not (each.coarse or any(each.halves)) for each in templates]
@@ -253,8 +254,8 @@ def _scored(
         if not any(wanted[number] for number in numbers):
             continue
         coarse = templates[numbers[0]].coarse
-        view, both = views[coarse], whitening.responses(spectra[coarse], pair)
-        cut = both[: view.there.shape[0], : view.there.shape[1]]
+        view, score = views[coarse], scores[coarse]
+        both = whitening.responses(spectra[coarse], pair, products[coarse])[: len(score), : score.shape[1]]
         for channel, number in enumerate(numbers):
             if not wanted[number]:
                 continue
@@ -263,7 +264,7 @@ def _scored(
             if key not in visible:
                 # errors along outlines, from light and flying pixels, look like slots
                 visible[key] = _visible(view.sums, view.inner if template.slot else view.there, *worth.sides)
-            score = cv2.extractChannel(cut, channel)
+            cv2.extractChannel(both, channel, dst=score)
             cv2.multiply(score, visible[key], dst=score, scale=worth.energy**-0.5)
             deviation = 1.0
             if not rough:

@@ -131,12 +131,12 @@ def inverse_times(
     instead, ragged outlines and missing pixels take up to four times the steps. Along outlines it would still be too
     large: the less is known around a pixel, the more it is damped there, which saves a third of the steps."""
     (h, w), mask = values.shape, known.astype(np.float32)
-    wide, whole = np.zeros(by.grid, np.float32), np.empty(by.grid, np.float32)
-    tight, share, filled = np.zeros((3, *by.inverse.shape), np.float32)
+    wide, whole, onward = np.zeros(by.grid, np.float32), np.empty(by.grid, np.float32), np.empty_like(mask)
+    tight, share, towards = np.zeros_like(by.inverse), np.empty_like(by.inverse), np.empty_like(mask)
     tight[:h, :w] = mask
-    near = cv2.GaussianBlur(tight, (13, 13), 2.0, borderType=cv2.BORDER_CONSTANT)
-    damp, enough = tight * np.sqrt(near), error**2 * EDGE_PX * float(tight.sum() - np.vdot(tight, near))
-    _blurred(tight, tight, np.ones_like(share), share)
+    near = cv2.GaussianBlur(tight, (13, 13), 2.0, borderType=cv2.BORDER_CONSTANT)[:h, :w]
+    damp, enough = mask * np.sqrt(near), error**2 * EDGE_PX * float(mask.sum() - np.vdot(mask, near))
+    _spread(mask, mask, np.ones_like(share), False, share)
     share = (1.0 - tight) / (share + FADED)
 
     def filtered(image: np.ndarray, factors: np.ndarray, out: np.ndarray) -> np.ndarray:
@@ -146,50 +146,57 @@ def inverse_times(
 
     def covered(image: np.ndarray) -> np.ndarray:
         wide[:h, :w] = image
-        return filtered(wide, by.power, whole)[:h, :w] * mask
+        return np.multiply(filtered(wide, by.power, whole)[:h, :w], mask, out=onward)
 
     def conditioned(image: np.ndarray) -> np.ndarray:
-        np.multiply(image, damp[:h, :w], out=tight[:h, :w])
-        _blurred(tight, tight, share, filled)
-        filtered(filled, by.inverse, filled)
-        return _blurred(filled * share, filled * damp, damp, np.empty_like(mask))
+        filled = _spread(image, damp, share, False, tight)
+        return _spread(filtered(filled, by.inverse, filled), share, damp, True, towards)
 
     solution, rest = np.zeros_like(mask), values * mask
     if start is not None:
         solution = mask * start
         rest -= covered(solution)
-    direction = towards = conditioned(rest)
+    direction = conditioned(rest).copy()
     product = float(np.vdot(rest, towards))
     for _ in range(MOST_ITERATIONS):
         if product <= enough:
             break
-        onward = covered(direction)
-        step = product / float(np.vdot(direction, onward))
+        step = product / float(np.vdot(direction, covered(direction)))
         cv2.scaleAdd(direction, step, solution, dst=solution)
         cv2.scaleAdd(onward, -step, rest, dst=rest)
-        towards = conditioned(rest)
-        before, product = product, float(np.vdot(rest, towards))
-        direction = cv2.scaleAdd(direction, product / before, towards)
+        before, product = product, float(np.vdot(rest, conditioned(rest)))
+        cv2.scaleAdd(direction, product / before, towards, dst=direction)
     return solution
 
 
 @numba.njit(**PLAIN)
-def _blurred(image: np.ndarray, plus: np.ndarray, times: np.ndarray, out: np.ndarray) -> np.ndarray:
-    """Write ``plus`` and ``times`` an ``image`` blurred by `TAPS`, on its grid, into the corner ``out`` (r, c) of it."""
-    rows, columns = image.shape
-    one, two, three = TAPS[0], TAPS[1], TAPS[2]
-    padded, down = np.zeros((rows + 4, columns), np.float32), np.zeros(columns + 4, np.float32)
-    padded[2:-2] = image
+def _spread(image: np.ndarray, inner: np.ndarray, outer: np.ndarray, back: bool, out: np.ndarray) -> np.ndarray:
+    """Write s = ``image`` x ``inner``, on a grid that is 0 elsewhere, plus ``outer`` x s blurred by `TAPS`, into the grid
+    ``out``; or if ``back``, the transpose: the image plus s blurred, times ``outer``. Grids share their first pixel."""
+    (height, width), (h, w) = out.shape, image.shape
+    columns, (one, two, three) = max(width, w), (TAPS[0], TAPS[1], TAPS[2])
+    lines, down = np.zeros((5, columns), np.float32), np.zeros(columns + 4, np.float32)
     # views instead of offsets, so that the compiler uses vectors
     left, beside, middle, next_to, right = down, down[1:], down[2 : 2 + columns], down[3:], down[4:]
-    for i in range(out.shape[0]):
-        above, over, own, under, below = padded[i], padded[i + 1], padded[i + 2], padded[i + 3], padded[i + 4]
-        for j in range(columns):
-            middle[j] = one * (above[j] + below[j]) + two * (over[j] + under[j]) + three * own[j]
-        to, add, by = out[i], plus[i], times[i]
-        for j in range(len(to)):
-            sides = one * (left[j] + right[j]) + two * (beside[j] + next_to[j])
-            to[j] = add[j] + by[j] * (sides + three * middle[j])
+    for i in range(height + 2):
+        line = lines[i % 5]
+        if i < h:
+            seen, by = image[i], inner[i]
+            for j in range(w):
+                line[j] = seen[j] * by[j]
+        else:
+            line[:] = 0
+        row = i - 2
+        if row >= 0:
+            above, over, own = lines[(i + 1) % 5], lines[(i + 2) % 5], lines[(i + 3) % 5]
+            under, to, times = lines[(i + 4) % 5], out[row], outer[row]
+            for j in range(columns):
+                middle[j] = one * (above[j] + line[j]) + two * (over[j] + under[j]) + three * own[j]
+            add = image[row] if back else own
+            for j in range(width):
+                sides = one * (left[j] + right[j]) + two * (beside[j] + next_to[j])
+                blurred = sides + three * middle[j]
+                to[j] = (add[j] + blurred) * times[j] if back else add[j] + blurred * times[j]
     return out
 
 
@@ -200,10 +207,10 @@ def transformed(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return np.asarray(cv2.dft(padded, dst=padded)).view(np.complex64)[..., 0]
 
 
-def responses(spectrum_of: np.ndarray, pair: np.ndarray) -> np.ndarray:
+def responses(spectrum_of: np.ndarray, pair: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
     """Return the correlations (r, c, 2) of a picture with two templates, from its spectrum and theirs (`spectra`). For
     a `halved` picture, they are those in the middles of 2 x 2 pixels."""
-    whole = (spectrum_of * pair).view(np.float32).reshape(*pair.shape, 2)
+    whole = np.multiply(spectrum_of, pair, out=out).view(np.float32).reshape(*pair.shape, 2)
     return np.asarray(cv2.dft(whole, dst=whole, flags=cv2.DFT_INVERSE))
 
 
