@@ -362,22 +362,19 @@ def _deviations(score: np.ndarray, view: _View, reach_px: int) -> tuple[np.ndarr
 def _calm(score: np.ndarray, quiet: np.ndarray, deviation: float, half_px: float) -> None:
     """Divide the scores (r, c) where the ``quiet`` ones (r, c) that are not 0 within a square of ``half_px`` scatter by
     more than `UNEVEN` deviations: the noise there differs from elsewhere."""
-    window = (2 * round(half_px / PART_PX) + 1,) * 2
-    sums, counts = (cv2.blur(each, window) for each in _parts(quiet, CAP * deviation))
-    size = sums / np.maximum(counts, 0.05 * PART_PX**2) / deviation
+    size = _parts(quiet, CAP * deviation, round(half_px / PART_PX)) / deviation
     if size.max() > CAPPED_UNEVEN:
         local = np.maximum(np.interp(size, CAPPED, DEVIATIONS) / UNEVEN, 1.0).astype(np.float32)
         score /= cv2.resize(local, score.shape[::-1], interpolation=cv2.INTER_LINEAR)
 
 
 @numba.njit(**PLAIN)
-def _parts(score: np.ndarray, cap: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sums (r, c) of the sizes, at most ``cap``, of scores that are not 0 in squares of `PART_PX`, and their
-    number."""
+def _parts(score: np.ndarray, cap: float, reach: int) -> np.ndarray:
+    """Return, for each square (r, c) of `PART_PX`, the mean size, at most ``cap``, of the scores that are not 0 in the
+    squares up to ``reach`` squares away; a mean of few is drawn towards 0."""
     (h, w), most = score.shape, np.float32(cap)
     rows, columns = max(1, h // PART_PX), max(1, w // PART_PX)
-    sums, counts = np.zeros((rows, columns)), np.zeros((rows, columns))
-    sizes, numbers = np.empty(w, np.float32), np.empty(w, np.int32)
+    sums, sizes, numbers = np.zeros((rows + 1, columns + 1, 2)), np.empty(w, np.float32), np.empty(w, np.int32)
     for row in range(rows):
         sizes[:], numbers[:] = 0, 0
         for i in range(row * h // rows, (row + 1) * h // rows):
@@ -385,10 +382,24 @@ def _parts(score: np.ndarray, cap: float) -> tuple[np.ndarray, np.ndarray]:
             for j in range(w):
                 sizes[j] += min(abs(of[j]), most)
                 numbers[j] += of[j] != 0
+        part, total, count = 0, 0.0, 0
         for j in range(w):
-            sums[row, j * columns // w] += sizes[j]
-            counts[row, j * columns // w] += numbers[j]
-    return sums, counts
+            total += sizes[j]
+            count += numbers[j]
+            if j + 1 == (part + 1) * w // columns:
+                part += 1
+                sums[row + 1, part, 0] = sums[row, part, 0] + total
+                sums[row + 1, part, 1] = sums[row, part, 1] + count
+    found = np.empty((rows, columns))
+    for row in range(rows):
+        top, bottom = max(row - reach, 0), min(row + reach + 1, rows)
+        above, under = sums[top], sums[bottom]
+        for part in range(columns):
+            left, right = max(part - reach, 0), min(part + reach + 1, columns)
+            whole = under[right, 0] - under[left, 0] - above[right, 0] + above[left, 0]
+            known = under[right, 1] - under[left, 1] - above[right, 1] + above[left, 1]
+            found[row, part] = whole / max(known, 0.05 * PART_PX**2 * (right - left) * (bottom - top))
+    return found
 
 
 @numba.njit(**PLAIN)
