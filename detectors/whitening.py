@@ -39,7 +39,7 @@ SIDES_PX = (0, 1, 2, 3, 5, 8, 12, 18)
 """Half-sides that a `Worth` may have: the visible share is computed once for each."""
 GRID = 96
 """Side of the grid that holds the widest template and the reach of its whitened edge."""
-CONVERGED, MOST_ITERATIONS, FADED = 0.15, 40, 0.3
+CONVERGED, MOST_ITERATIONS, FADED = 0.15, 80, 0.3
 """Error at which C^-1 r is solved, most steps, and weight of 0 in the values that fill unknown pixels."""
 EDGE_PX = 7.0
 """Depth of an outline's pixels among which errors count, in units of the sum of what is unknown around its pixels."""
@@ -99,40 +99,34 @@ def _centred(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return np.roll(padded, (-(image.shape[0] // 2), -(image.shape[1] // 2)), (0, 1))
 
 
-class Filters(NamedTuple):
-    """A covariance on the ``grid`` of a picture's transforms, and its inverse on a smaller grid: spectra packed as by
-    `cv2.dft`, over the number of the grid's pixels."""
-
-    grid: tuple[int, ...]
-    power: np.ndarray
-    inverse: np.ndarray
-
-
-def filters(covariance: np.ndarray, shape: tuple[int, ...]) -> Filters:
-    """Return the `Filters` of noise with this covariance for pictures of this ``shape``."""
-    # what wraps around in the preconditioner costs no steps
+def filters(covariance: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the power spectrum of noise with this covariance on the grid of pictures of this ``shape``, and its
+    inverse on a smaller grid, where what wraps around costs no steps. Both are packed as by `cv2.dft`, over sizes."""
     grid, tight = grid_of(shape), tuple(_fast(max(side, 2 * LONGEST_LAG_PX) + 4) for side in shape)
     powers = []
     for each in (grid, tight):
         power = cv2.dft(_centred(covariance, each))
         # a real spectrum: the real factor of each number takes the imaginary one's place too
         power[:, 2::2], power[2::2, :: each[1] - 1] = power[:, 1:-1:2], power[1:-1:2, :: each[1] - 1]
-        least = np.float32(max(LEAST_POWER * float(covariance.max()), 1e-12))
-        powers.append(np.maximum(power, least) * np.float32(power.size))
-    return Filters(grid, powers[0] / np.float32(powers[0].size ** 2), 1.0 / powers[1])
+        powers.append(np.maximum(power, np.float32(max(LEAST_POWER * float(covariance.max()), 1e-12))))
+    return powers[0] / np.float32(powers[0].size), np.float32(1.0 / powers[1].size) / powers[1]
 
 
 def inverse_times(
-    values: np.ndarray, known: np.ndarray, by: Filters, start: np.ndarray | None = None, error: float = CONVERGED
+    values: np.ndarray,
+    known: np.ndarray,
+    by: tuple[np.ndarray, np.ndarray],
+    start: np.ndarray | None = None,
+    error: float = CONVERGED,
 ) -> np.ndarray:
-    """Return C^-1 r (r, c) over the known pixels, 0 elsewhere, by conjugate gradients from ``start`` (r, c), until the
-    scores near unknown pixels, where errors gather, err by some ``error`` deviations. The preconditioner fills unknown
-    pixels from their neighbours, applies the stationary inverse, and then the transpose of the filling: with zeros
-    instead, ragged outlines and missing pixels take up to four times the steps. Along outlines it would still be too
-    large: the less is known around a pixel, the more it is damped there, which saves a third of the steps."""
-    (h, w), mask = values.shape, known.astype(np.float32)
-    wide, whole, onward = np.zeros(by.grid, np.float32), np.empty(by.grid, np.float32), np.empty_like(mask)
-    tight, share, towards = np.zeros_like(by.inverse), np.empty_like(by.inverse), np.empty_like(mask)
+    """Return C^-1 r (r, c) over the known pixels, 0 elsewhere, for the `filters` of C. Conjugate gradients go on from
+    ``start`` (r, c) until scores near unknown pixels, where errors gather, err by some ``error`` deviations. The
+    preconditioner fills unknown pixels from their neighbours, applies the stationary inverse, and then the transpose of
+    the filling: with zeros instead, ragged outlines and missing pixels take up to four times the steps. It would still
+    be too large along outlines: damping it the more, the less is known around a pixel, saves a third of the steps."""
+    (h, w), mask, (power, inverse) = values.shape, known.astype(np.float32), by
+    wide, whole, onward = np.zeros_like(power), np.empty_like(power), np.empty_like(mask)
+    tight, share, towards = np.zeros_like(inverse), np.empty_like(inverse), np.empty_like(mask)
     tight[:h, :w] = mask
     near = cv2.GaussianBlur(tight, (13, 13), 2.0, borderType=cv2.BORDER_CONSTANT)[:h, :w]
     damp, unknown = mask * np.sqrt(near), float(mask.sum() - np.vdot(mask, near))
@@ -147,11 +141,11 @@ def inverse_times(
 
     def covered(image: np.ndarray) -> np.ndarray:
         wide[:h, :w] = image
-        return np.multiply(filtered(wide, by.power, whole)[:h, :w], mask, out=onward)
+        return np.multiply(filtered(wide, power, whole)[:h, :w], mask, out=onward)
 
     def conditioned(image: np.ndarray) -> np.ndarray:
         filled = _spread(image, damp, share, False, tight)
-        return _spread(filtered(filled, by.inverse, filled), share, damp, True, towards)
+        return _spread(filtered(filled, inverse, filled), share, damp, True, towards)
 
     solution, rest = np.zeros_like(mask), values * mask
     if start is not None:
@@ -172,8 +166,8 @@ def inverse_times(
 
 @numba.njit(**PLAIN)
 def _spread(image: np.ndarray, inner: np.ndarray, outer: np.ndarray, back: bool, out: np.ndarray) -> np.ndarray:
-    """Write s = ``image`` x ``inner``, on a grid that is 0 elsewhere, plus ``outer`` x s blurred by `TAPS`, into the grid
-    ``out``; or if ``back``, the transpose: the image plus s blurred, times ``outer``. Grids share their first pixel."""
+    """Write s = ``image`` x ``inner``, on a grid that is 0 elsewhere, plus ``outer`` x s blurred by `TAPS`, into the
+    grid ``out``; or if ``back``, the transpose: the image plus s blurred, times ``outer``. Grids share a corner."""
     (height, width), (h, w) = out.shape, image.shape
     columns, (one, two, three) = max(width, w), (TAPS[0], TAPS[1], TAPS[2])
     lines, down = np.zeros((5, columns), np.float32), np.zeros(columns + 4, np.float32)
@@ -287,7 +281,9 @@ def _energies(window_px: int) -> list[tuple[tuple[np.ndarray, ...], np.ndarray, 
     found = []
     for coarse, side in ((False, GRID), (True, GRID // 2)):
         cut = np.ix_(np.r_[: side // 2, GRID - side // 2 : GRID], np.arange(side // 2 + 1))
-        values = np.stack([size[cut] for size, each in zip(sizes, bank(window_px), strict=True) if each.coarse == coarse])
+        values = np.stack(
+            [size[cut] for size, each in zip(sizes, bank(window_px), strict=True) if each.coarse == coarse]
+        )
         half = np.full(side // 2 + 1, 2.0, np.float32)
         half[[0, -1]] = 1.0
         beside = [half * values * np.roll(values, 1, axis=1), 2.0 * values * np.roll(values, -1, axis=2)]
@@ -302,8 +298,8 @@ def _energies(window_px: int) -> list[tuple[tuple[np.ndarray, ...], np.ndarray, 
 @lru_cache(maxsize=6)
 def spectra(shape: tuple[int, ...], window_px: int) -> tuple[tuple[np.ndarray, tuple[int, ...]], ...]:
     """Return the spectra of pairs of templates (an odd one alone) of undisturbed damage of height 1 on a grid, and
-    their numbers in the `bank`: one complex transform correlates a real picture with both. They are divided by the number
-    of pixels of the inverse transform. Coarse templates have only the lower half."""
+    their numbers in the `bank`: one complex transform correlates a real picture with both. They are divided by the size
+    of the inverse transform. Coarse templates have only the lower half."""
     pairs = []
     for coarse in (False, True):
         numbers = [number for number, template in enumerate(bank(window_px)) if template.coarse == coarse]
