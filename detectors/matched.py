@@ -73,7 +73,7 @@ CAPPED = DEVIATIONS * np.sqrt(2.0 / np.pi) * (1.0 - np.exp(-0.5 * (CAP / DEVIATI
 )
 STEPS = 4096
 DEVIATION_OF = np.interp(np.arange(STEPS * CAP + 2) / STEPS, CAPPED, DEVIATIONS)
-"""Deviations of a Gaussian, the mean of its size if more than `CAP` counts as `CAP`, and the inverse in `STEPS` a unit."""
+"""Deviations of a Gaussian, the mean of its size if more than `CAP` counts as `CAP`; and the inverse, by `STEPS`."""
 FAINT = 3.5
 """Scores below this are all raised by the same factor, because `Worth` counts maxima."""
 LOBE_SHARE = 0.5
