@@ -25,7 +25,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import cv2
 import numba
@@ -184,22 +184,14 @@ def _covariance(noise: np.ndarray, known: np.ndarray, depth_px: np.ndarray) -> n
     return whitening.noise_covariance(noise, inner & (loud == 0), whitening.grid_of(noise.shape))
 
 
-class _Noise(NamedTuple):
-    """The bank for a picture's noise: `whitening.filters`, and each template's `Worth`."""
-
-    filters: tuple[np.ndarray, np.ndarray]
-    window_px: int
-    worths: tuple[whitening.Worth, ...]
-
-
 def _judged(
     values: np.ndarray, known: np.ndarray, depth_px: np.ndarray, covariance: np.ndarray | None
 ) -> tuple[np.ndarray, float]:
     """Return signed scores (r, c) of residuals in deviations, and the deviation of the narrowest template's height."""
     covariance = _covariance(values, known, depth_px) if covariance is None else covariance
     window_px = whitening.window_of(covariance)
-    worth_of = whitening.worths(whitening.spectrum(covariance, (whitening.GRID, whitening.GRID)), window_px)
-    noise = _Noise(whitening.filters(covariance, values.shape), window_px, worth_of)
+    worths = whitening.worths(whitening.spectrum(covariance, (whitening.GRID, whitening.GRID)), window_px)
+    noise = whitening.filters(covariance, values.shape), window_px, worths
     tamed = _tamed(values)
     # strong residuals, as seen by round templates
     signed, by, solved = _scored(tamed, known, noise, rough=True)
@@ -216,7 +208,7 @@ def _judged(
     reach = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
     low, high = (np.asarray(of(signed, reach)) for of in (cv2.erode, cv2.dilate))
     lobe = (signed < -LOBE_SHARE * low) & (signed > -LOBE_SHARE * high)
-    return (signed * ~lobe).astype(np.float64), noise.worths[0].energy ** -0.5
+    return (signed * ~lobe).astype(np.float64), worths[0].energy ** -0.5
 
 
 def _tamed(values: np.ndarray) -> np.ndarray:
@@ -228,13 +220,19 @@ def _tamed(values: np.ndarray) -> np.ndarray:
 
 
 def _scored(
-    values: np.ndarray, seen: np.ndarray, noise: _Noise, start: np.ndarray | None = None, rough: bool = False
+    values: np.ndarray,
+    seen: np.ndarray,
+    noise: tuple[whitening.Filters, int, Sequence[whitening.Worth]],
+    start: np.ndarray | None = None,
+    rough: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return each pixel's strongest score (r, c) with its sign, the index of its template, and C^-1 r, from the pixels
-    ``seen`` (r, c). ``start``: an approximate solution. ``rough``: only round templates at the centres of pixels,
-    without the scatter of scores, which strong residuals would spoil."""
-    solved = whitening.inverse_times(values, seen, noise.filters, start, ROUGH if rough else whitening.CONVERGED)
-    spectra, visible, tail = [whitening.transformed(solved, noise.filters[0].shape)], {}, 1.0
+    ``seen`` (r, c). ``noise``: its `whitening.filters`, the window's side, and each template's `Worth`. ``start``: an
+    approximate solution. ``rough``: only round templates at the centres of pixels, without the scatter of scores, which
+    strong residuals would spoil."""
+    filters, window_px, worths = noise
+    solved = whitening.inverse_times(values, seen, filters, start, ROUGH if rough else whitening.CONVERGED)
+    spectra, visible, tail = [whitening.transformed(solved, filters[0].shape)], {}, 1.0
     views = [(seen.astype(np.float32), np.full(seen.shape, 2.0 * RIM_PX, np.float32) if rough else _depth_px(seen))]
     if not rough:
         spectra.append(whitening.halved(spectra[0]))
@@ -242,17 +240,15 @@ def _scored(
     zones = [_zones(*view) for view in views]
     scores, products = [np.empty_like(there) for there, _ in views], [np.empty_like(each) for each in spectra]
     best = [(np.zeros_like(there), np.zeros(there.shape, np.uint8)) for there, _ in views]
-    templates, worths = whitening.bank(noise.window_px), noise.worths
-    wanted = [not rough or not (each.coarse or any(each.halves)) for each in templates]
-    for pair, numbers in whitening.spectra(noise.filters[0].shape, noise.window_px):
-        if not any(wanted[number] for number in numbers):
+    templates = whitening.bank(window_px)
+    for pair, numbers in whitening.spectra(filters[0].shape, window_px):
+        wanted = [not rough or not (templates[number].coarse or any(templates[number].halves)) for number in numbers]
+        if not any(wanted):
             continue
         coarse = templates[numbers[0]].coarse
         (there, depth_px), score = views[coarse], scores[coarse]
         both = whitening.responses(spectra[coarse], pair, products[coarse])[: len(score), : score.shape[1]]
-        for channel, number in enumerate(numbers):
-            if not wanted[number]:
-                continue
+        for channel, number in [each for each in enumerate(numbers) if wanted[each[0]]]:
             template, worth = templates[number], worths[number]
             key = coarse, template.slot, worth.sides
             if key not in visible:

@@ -16,6 +16,7 @@ import scipy.linalg
 
 from detectors.clusters import PLAIN
 
+Filters = tuple[np.ndarray, np.ndarray]
 SMALL_RADII_PX, HALVES_PX = (0.5, 1.5), ((0.0, 0.0), (0.5, 0.5), (0.0, 0.5), (0.5, 0.0))
 """Radii of small discs, and the positions between pixels at which they are compared: half a pixel costs up to a seventh
 of the score if the window has sharp sides. The first radius stands for all holes smaller than a pixel."""
@@ -47,14 +48,10 @@ TAPS = np.array([1.0, 2.0, 3.0], np.float32) / np.float32(9.0)
 """Weights, along each axis, of second and direct neighbours and of the pixel itself, which fill unknown pixels."""
 
 
-def grid_of(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the grid for transforms of pictures of this shape; it holds every template, and its half is even."""
-    return tuple(_fast(max(side, GRID) + LONGEST_LAG_PX) for side in shape)
-
-
-def _fast(side: int) -> int:
-    """Return the next side that transforms fast."""
-    return 8 * scipy.fft.next_fast_len(math.ceil(side / 8))
+def grid_of(shape: tuple[int, ...], least: int = GRID, more: int = LONGEST_LAG_PX) -> tuple[int, ...]:
+    """Return the grid for transforms of pictures of this shape, as they are fast; it holds every template, and its half
+    is even. ``least``: its least side without the margin of ``more`` pixels."""
+    return tuple(8 * scipy.fft.next_fast_len(math.ceil((max(side, least) + more) / 8)) for side in shape)
 
 
 def noise_covariance(noise: np.ndarray, quiet: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -99,12 +96,11 @@ def _centred(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return np.roll(padded, (-(image.shape[0] // 2), -(image.shape[1] // 2)), (0, 1))
 
 
-def filters(covariance: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+def filters(covariance: np.ndarray, shape: tuple[int, ...]) -> Filters:
     """Return the power spectrum of noise with this covariance on the grid of pictures of this ``shape``, and its
     inverse on a smaller grid, where what wraps around costs no steps. Both are packed as by `cv2.dft`, over sizes."""
-    grid, tight = grid_of(shape), tuple(_fast(max(side, 2 * LONGEST_LAG_PX) + 4) for side in shape)
     powers = []
-    for each in (grid, tight):
+    for each in (grid_of(shape), grid_of(shape, 2 * LONGEST_LAG_PX, 4)):
         power = cv2.dft(_centred(covariance, each))
         # a real spectrum: the real factor of each number takes the imaginary one's place too
         power[:, 2::2], power[2::2, :: each[1] - 1] = power[:, 1:-1:2], power[1:-1:2, :: each[1] - 1]
@@ -113,11 +109,7 @@ def filters(covariance: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray,
 
 
 def inverse_times(
-    values: np.ndarray,
-    known: np.ndarray,
-    by: tuple[np.ndarray, np.ndarray],
-    start: np.ndarray | None = None,
-    error: float = CONVERGED,
+    values: np.ndarray, known: np.ndarray, by: Filters, start: np.ndarray | None = None, error: float = CONVERGED
 ) -> np.ndarray:
     """Return C^-1 r (r, c) over the known pixels, 0 elsewhere, for the `filters` of C. Conjugate gradients go on from
     ``start`` (r, c) until scores near unknown pixels, where errors gather, err by some ``error`` deviations. The
@@ -135,8 +127,7 @@ def inverse_times(
     share = (1.0 - tight) / (share + FADED)
 
     def filtered(image: np.ndarray, factors: np.ndarray, out: np.ndarray) -> np.ndarray:
-        cv2.dft(image, dst=out)
-        np.multiply(out, factors, out=out)
+        np.multiply(cv2.dft(image, dst=out), factors, out=out)
         return np.asarray(cv2.dft(out, dst=out, flags=cv2.DFT_INVERSE))
 
     def covered(image: np.ndarray) -> np.ndarray:
@@ -144,8 +135,8 @@ def inverse_times(
         return np.multiply(filtered(wide, power, whole)[:h, :w], mask, out=onward)
 
     def conditioned(image: np.ndarray) -> np.ndarray:
-        filled = _spread(image, damp, share, False, tight)
-        return _spread(filtered(filled, inverse, filled), share, damp, True, towards)
+        filled = filtered(_spread(image, damp, share, False, tight), inverse, tight)
+        return _spread(filled, share, damp, True, towards)
 
     solution, rest = np.zeros_like(mask), values * mask
     if start is not None:
