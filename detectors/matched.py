@@ -233,11 +233,11 @@ def _scored(
     filters, window_px, worths = noise
     solved = whitening.inverse_times(values, seen, filters, start, ROUGH if rough else whitening.CONVERGED)
     spectra, visible, tail = [whitening.transformed(solved, filters[0].shape)], {}, 1.0
-    views = [(seen.astype(np.float32), np.full(seen.shape, 2.0 * RIM_PX, np.float32) if rough else _depth_px(seen))]
+    views = [(seen.astype(np.float32), seen if rough else _depth_px(seen))]
     if not rough:
         spectra.append(whitening.halved(spectra[0]))
         views.append((_halved(views[0][0]), _halved(views[0][1])))
-    zones = [_zones(*view) for view in views]
+    zones = [] if rough else [_zones(*view) for view in views]
     scores, products = [np.empty_like(there) for there, _ in views], [np.empty_like(each) for each in spectra]
     best = [(np.zeros_like(there), np.zeros(there.shape, np.uint8)) for there, _ in views]
     templates = whitening.bank(window_px)
@@ -333,10 +333,9 @@ def _scatter(score: np.ndarray, rim: np.ndarray, zones: np.ndarray) -> tuple[np.
     sizes up to `CAP`; and the sums of these sizes in squares of `PART_PX`, and their numbers."""
     (h, w), most, flat, last = score.shape, np.float32(CAP), score.ravel(), N_ZONES - 1
     rows, columns = max(1, h // PART_PX), max(1, w // PART_PX)
-    sums, counts = np.zeros((rows, columns)), np.zeros((rows, columns))
-    sizes, numbers = np.empty(w, np.float32), np.empty(w, np.int32)
+    sums, counts, whole, number = np.zeros((rows, columns)), np.zeros((rows, columns)), 0.0, 0.0
     for row in range(rows):
-        sizes[:], numbers[:] = 0, 0
+        sizes, numbers = np.zeros(w, np.float32), np.zeros(w, np.int32)
         for i in range(row * h // rows, (row + 1) * h // rows):
             of = score[i]
             for j in range(w):
@@ -346,16 +345,22 @@ def _scatter(score: np.ndarray, rim: np.ndarray, zones: np.ndarray) -> tuple[np.
             for j in range(part * w // columns, (part + 1) * w // columns):
                 sums[row, part] += sizes[j]
                 counts[row, part] += numbers[j]
+            whole += sums[row, part]
+            number += counts[row, part]
     totals, known, found = np.zeros(N_ZONES), np.zeros(N_ZONES), np.zeros(N_ZONES)
+    size_there, number_there = 0.0, 0
     for k in range(len(rim)):
-        totals[zones[k]] += min(abs(flat[rim[k]]), most)
-        known[zones[k]] += flat[rim[k]] != 0
-    totals[last], known[last] = sums.sum() - totals.sum(), counts.sum() - known.sum()
+        size, one = min(abs(flat[rim[k]]), most), flat[rim[k]] != 0
+        totals[zones[k]] += size
+        known[zones[k]] += one
+        size_there += size
+        number_there += one
+    totals[last], known[last] = whole - size_there, number - number_there
     if known[last] < FEWEST:
-        totals[last], known[last] = sums.sum(), counts.sum()
+        totals[last], known[last] = whole, number
     for zone in range(last, -1, -1):
         if zone == last or known[zone] >= FEWEST:
-            found[zone] = DEVIATION_OF[int(STEPS * totals[zone] / max(known[zone], 1.0))]
+            found[zone] = DEVIATION_OF[int(STEPS * max(totals[zone], 0.0) / max(known[zone], 1.0))]
         found[zone] = max(found[zone], found[last])
     return found, sums, counts
 

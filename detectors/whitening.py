@@ -171,7 +171,8 @@ def _spread(image: np.ndarray, inner: np.ndarray, outer: np.ndarray, back: bool,
             for j in range(w):
                 line[j] = seen[j] * by[j]
         else:
-            line[:] = 0
+            for j in range(w):
+                line[j] = 0
         row = i - 2
         if row >= 0:
             above, over, own = lines[(i + 1) % 5], lines[(i + 2) % 5], lines[(i + 3) % 5]
