@@ -43,20 +43,15 @@ from detectors.noise import median_of
 from harness.vocabulary.geometry import Cloud
 
 LEAST_SEEN = 0.6
-SHORT_PX = 13
-"""Width over which noise is compared between places: wider filters count there as much as elsewhere."""
-QUIET_SIGMAS = 4.0
-"""Larger residuals and their neighbours do not count for the covariance."""
+SHORT_PX = 13  # width over which noise is compared between places: wider filters count there as much as elsewhere
+QUIET_SIGMAS = 4.0  # larger residuals and their neighbours do not count for the covariance
 CLIP_SIGMAS = 5.0
 """Limit to which a pixel is clipped if its neighbours are smaller: a single flying pixel is not a finding."""
 STRONG, LOUD_SIGMAS, MARGIN_PX = 6.0, 3.0, 2
 """A peak with this score, the loud pixels connected to it, and those around are removed; the rest is judged again."""
-LOUD_SHARE = 0.5
-"""The loud pixels at a peak fill at least this share of its template's disc."""
-ALONE_PX = 7
-"""Half of the square in which a peak is the highest."""
-RIM_PX = 6
-"""Depth of the target's rim, to which the camera's window and lens reach over its edge."""
+LOUD_SHARE = 0.5  # the loud pixels at a peak fill at least this share of its template's disc
+ALONE_PX = 7  # half of the square in which a peak is the highest
+RIM_PX = 6  # depth of the target's rim, to which the camera's window and lens reach over its edge
 LAYER_PX, MODEST_SIGMAS = 4, local.LEVEL_SIGMAS
 """Side of the squares in which what the rim shares is averaged, and the limit to which residuals are clipped there."""
 RIM_ENDS_PX = (1, 2, 3, 5, 8, 12)
@@ -65,8 +60,7 @@ N_ZONES = len(RIM_ENDS_PX) + 1
 ZONES = np.searchsorted(RIM_ENDS_PX, np.arange(RIM_ENDS_PX[-1] + 2)).astype(np.uint8)
 WINDOW_RADII, PART_PX, UNEVEN = 6, 8, 1.25
 """Half of the window of the local scatter in radii, the side of its squares, and scatter that chance explains."""
-CAP, FEWEST = 2.0, 200
-"""Largest score that counts in the scatter, and the fewest scores that determine it."""
+CAP, FEWEST = 2.0, 200  # largest score that counts in the scatter, and the fewest scores that determine it
 DEVIATIONS = np.geomspace(0.2, 50.0, 200)
 CAPPED = DEVIATIONS * np.sqrt(2.0 / np.pi) * (1.0 - np.exp(-0.5 * (CAP / DEVIATIONS) ** 2)) + 2.0 * CAP * special.ndtr(
     -CAP / DEVIATIONS
@@ -74,14 +68,11 @@ CAPPED = DEVIATIONS * np.sqrt(2.0 / np.pi) * (1.0 - np.exp(-0.5 * (CAP / DEVIATI
 STEPS = 4096
 DEVIATION_OF = np.interp(np.arange(STEPS * CAP + 2) / STEPS, CAPPED, DEVIATIONS)
 """Deviations of a Gaussian, the mean of its size if more than `CAP` counts as `CAP`; and the inverse, by `STEPS`."""
-FAINT = 3.5
-"""Scores below this are all raised by the same factor, because `Worth` counts maxima."""
+FAINT = 3.5  # scores below this are all raised by the same factor, because `Worth` counts maxima
 LOBE_SHARE = 0.5
 """A score below this share of a score of the other sign within `RIM_PX` is a side lobe of the whitening."""
-WIDE_PX = 5.0
-"""Radius from which noise may split a template's finding into several peaks."""
-ROUGH = 0.4
-"""Error at which C^-1 r is solved for strong findings, as `whitening.CONVERGED`."""
+WIDE_PX = 5.0  # radius from which noise may split a template's finding into several peaks
+ROUGH = 0.4  # error at which C^-1 r is solved for strong findings, as `whitening.CONVERGED`
 TAIL_PX, TAIL_SHARE, TAIL_SIGMAS = 1.5, 0.0005, 3.29
 """Largest radius at which a template's own scores show their tail; the share of pixels beyond it on either side; and
 where a Gaussian has it. Wider means are near Gaussian, and too few of them are independent."""

@@ -20,8 +20,7 @@ Filters = tuple[np.ndarray, np.ndarray]
 SMALL_RADII_PX, HALVES_PX = (0.5, 1.5), ((0.0, 0.0), (0.5, 0.5), (0.0, 0.5), (0.5, 0.0))
 """Radii of small discs, and the positions between pixels at which they are compared: half a pixel costs up to a seventh
 of the score if the window has sharp sides. The first radius stands for all holes smaller than a pixel."""
-RADII_PX = (2.2, 3.2, 4.5, 6.4, 9.0, 13.0, 18.0)
-"""Radii of further discs."""
+RADII_PX = (2.2, 3.2, 4.5, 6.4, 9.0, 13.0, 18.0)  # radii of further discs
 DENT_RADII_PX = (5.0, 6.5, 8.0, 10.0, 12.0, 14.5, 17.5)
 """Radii of paraboloids. They are denser because before a fixed pattern the rims decide."""
 SLOT_PX, SLOTS_DEG = (20.0, 2.0), tuple(22.5 * k for k in range(8))
@@ -29,17 +28,13 @@ SLOT_PX, SLOTS_DEG = (20.0, 2.0), tuple(22.5 * k for k in range(8))
 WINDOWS_PX = (1, 3, 5)
 """Sides of the square over which cameras average: 3 for a Kinect v2, 5 for an Azure Kinect, 1: only the lens blurs."""
 LENS_BLUR_PX = 0.6
-LONGEST_LAG_PX = 28
-"""Lag at which Parzen's window fades the covariance to 0."""
+LONGEST_LAG_PX = 28  # lag at which Parzen's window fades the covariance to 0
 COARSE_PX = 9.0
 """Radius from which only every second pixel is scored: between these pixels, scores change by some hundredths."""
-LEAST_POWER = 0.01
-"""Least value of the spectrum, as a share of its mean."""
+LEAST_POWER = 0.01  # least value of the spectrum, as a share of its mean
 MOST_WHITENED = 2000  # most pixels whose dense covariance is factored: 0.2 s and 64 MB
-SIDES_PX = (0, 1, 2, 3, 5, 8, 12, 18)
-"""Half-sides that a `Worth` may have: the visible share is computed once for each."""
-GRID = 96
-"""Side of the grid that holds the widest template and the reach of its whitened edge."""
+SIDES_PX = (0, 1, 2, 3, 5, 8, 12, 18)  # half-sides that a `Worth` may have: the visible share is computed once for each
+GRID = 96  # side of the grid that holds the widest template and the reach of its whitened edge
 CONVERGED, MOST_ITERATIONS, FADED = 0.15, 80, 0.3
 """Error at which C^-1 r is solved, most steps, and weight of 0 in the values that fill unknown pixels."""
 EDGE_PX = 7.0
