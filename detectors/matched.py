@@ -25,7 +25,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import cv2
 import numba
@@ -33,59 +33,46 @@ import numpy as np
 import scipy.fft
 from scipy import special
 
-from detectors import whitening
+from detectors import local, whitening
 from detectors.clusters import PLAIN
 from detectors.interface import Evidence
-from detectors.local import (
-    LEAST_WINDOW,
-    LEVEL_SIGMAS,
-    SADDLE,
-    FilterConfig,
-    LocalDetector,
-    LocalEvidence,
-    LocalPicture,
-    local_sigma,
-)
+from detectors.local import FilterConfig, LocalDetector, LocalEvidence, LocalPicture
 from detectors.masks import grown
 from detectors.missing import missing_evidence
 from detectors.noise import median_of
 from harness.vocabulary.geometry import Cloud
 
 LEAST_SEEN = 0.6
-SHORT_PX = 13
-"""Width over which noise is compared between places: wider filters count there as much as elsewhere."""
-QUIET_SIGMAS = 4.0
-"""Larger residuals and their neighbours do not count for the covariance."""
+SHORT_PX = 13  # width over which noise is compared between places: wider filters count there as much as elsewhere
+QUIET_SIGMAS = 4.0  # larger residuals and their neighbours do not count for the covariance
 CLIP_SIGMAS = 5.0
 """Limit to which a pixel is clipped if its neighbours are smaller: a single flying pixel is not a finding."""
 STRONG, LOUD_SIGMAS, MARGIN_PX = 6.0, 3.0, 2
 """A peak with this score, the loud pixels connected to it, and those around are removed; the rest is judged again."""
-LOUD_SHARE = 0.5
-"""The loud pixels at a peak fill at least this share of its template's disc."""
-ALONE_PX = 7
-"""Half of the square in which a peak is the highest."""
-RIM_PX = 6
-"""Depth of the target's rim, to which the camera's window and lens reach over its edge."""
+LOUD_SHARE = 0.5  # the loud pixels at a peak fill at least this share of its template's disc
+ALONE_PX = 7  # half of the square in which a peak is the highest
+RIM_PX = 6  # depth of the target's rim, to which the camera's window and lens reach over its edge
+LAYER_PX, MODEST_SIGMAS = 4, local.LEVEL_SIGMAS
+"""Side of the squares in which what the rim shares is averaged, and the limit to which residuals are clipped there."""
 RIM_ENDS_PX = (1, 2, 3, 5, 8, 12)
 """Distances from the outline up to which scores have their own scatter; farther inside, all scores share one."""
 N_ZONES = len(RIM_ENDS_PX) + 1
 ZONES = np.searchsorted(RIM_ENDS_PX, np.arange(RIM_ENDS_PX[-1] + 2)).astype(np.uint8)
 WINDOW_RADII, PART_PX, UNEVEN = 6, 8, 1.25
 """Half of the window of the local scatter in radii, the side of its squares, and scatter that chance explains."""
-CAP, FEWEST = 2.0, 200
-"""Largest score that counts in the scatter, and the fewest scores that determine it."""
+CAP, FEWEST = 2.0, 200  # largest score that counts in the scatter, and the fewest scores that determine it
 DEVIATIONS = np.geomspace(0.2, 50.0, 200)
 CAPPED = DEVIATIONS * np.sqrt(2.0 / np.pi) * (1.0 - np.exp(-0.5 * (CAP / DEVIATIONS) ** 2)) + 2.0 * CAP * special.ndtr(
     -CAP / DEVIATIONS
 )
-CAPPED_UNEVEN = float(np.interp(UNEVEN, DEVIATIONS, CAPPED))
-"""Deviations of a Gaussian, and the mean of its size if more than `CAP` counts as `CAP`."""
-FAINT = 3.5
-"""Scores below this are all raised by the same factor, because `Worth` counts maxima."""
+STEPS = 4096
+DEVIATION_OF = np.interp(np.arange(STEPS * CAP + 2) / STEPS, CAPPED, DEVIATIONS)
+"""Deviations of a Gaussian, the mean of its size if more than `CAP` counts as `CAP`; and the inverse, by `STEPS`."""
+FAINT = 3.5  # scores below this are all raised by the same factor, because `Worth` counts maxima
 LOBE_SHARE = 0.5
 """A score below this share of a score of the other sign within `RIM_PX` is a side lobe of the whitening."""
-WIDE_PX = 5.0
-"""Radius from which noise may split a template's finding into several peaks."""
+WIDE_PX = 5.0  # radius from which noise may split a template's finding into several peaks
+ROUGH = 0.4  # error at which C^-1 r is solved for strong findings, as `whitening.CONVERGED`
 TAIL_PX, TAIL_SHARE, TAIL_SIGMAS = 1.5, 0.0005, 3.29
 """Largest radius at which a template's own scores show their tail; the share of pixels beyond it on either side; and
 where a Gaussian has it. Wider means are near Gaussian, and too few of them are independent."""
@@ -100,7 +87,7 @@ class MatchedDetector(LocalDetector):
 
     settings_type: ClassVar[type[MatchedConfig]] = MatchedConfig
     name = "matched"
-    version = 7
+    version = 8
 
     def __init__(self, settings: FilterConfig, covariance: np.ndarray | None = None) -> None:
         """``covariance``: the noise's, in squared deviations, that `calibrate` has learned."""
@@ -126,8 +113,8 @@ class MatchedDetector(LocalDetector):
         self, residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]
     ) -> tuple[np.ndarray, float, str]:
         """Return signed scores (r, c), the deviation of the narrowest template's depth (m), and the unit of score."""
-        values, unit_m, known = _in_deviations(residual_m, weights, rounding_m2)
-        signed, narrowest = _judged(values, known, self._covariance)
+        values, known, depth_px, unit_m = _in_deviations(residual_m, weights, rounding_m2)
+        signed, narrowest = _judged(values, known, depth_px, self._covariance)
         depth_m = narrowest * float(np.median(unit_m[known]))
         text = f"the deviation of matched filters on whitened noise, {1e3 * depth_m:.3g} mm for the narrowest"
         return signed, depth_m, text
@@ -143,7 +130,7 @@ class MatchedDetector(LocalDetector):
     def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
         """Return the mean covariance of the clouds' residuals by lag, in squared deviations of the local noise."""
         pictures = (self.picture(cloud) for cloud in hole_free)
-        seen = [_covariance(*_in_deviations(*picture.residuals)[::2]) for picture in pictures]
+        seen = [_covariance(*_in_deviations(*picture.residuals)[:3]) for picture in pictures]
         return {"covariance": np.mean(seen, axis=0)} if seen else {}
 
     def calibrated(self, learned: Mapping[str, np.ndarray]) -> MatchedDetector:
@@ -153,19 +140,23 @@ class MatchedDetector(LocalDetector):
 
 def _in_deviations(
     residual_m: np.ndarray, weights: np.ndarray, rounding_m2: tuple[float, float]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return residuals (r, c) in units of the noise nearby, increased where a point's own variance is larger, and minus
-    what they share along the outline; that unit (r, c) in metres; and (r, c) bool, the known pixels."""
+    what they share along the outline; (r, c) bool, the known pixels; their distances (r, c) from the outline; and that
+    unit (r, c) in metres."""
     known = weights > 0
     floor_m = max(float(np.sqrt(sum(rounding_m2))), 1e-9)
     values = np.where(known, residual_m * np.sqrt(weights), 0.0).astype(np.float32)
     # structure wider than a filter's window, objects and the surface's misfit are not noise of pixels
     side = (SHORT_PX, SHORT_PX)
     around = (cv2.blur(each, side, borderType=cv2.BORDER_REFLECT) for each in (values, known.astype(np.float32)))
-    short = np.where(known, values - next(around) / np.maximum(next(around), 1e-6), np.nan)
-    share = median_of(np.abs(short[known])) / max(median_of(np.abs(values[known])), 1e-12)
-    unit_m = np.maximum(local_sigma(short) / max(share, 1e-3), floor_m)
-    return _without_rim(values / unit_m, known), unit_m, known
+    short = values - next(around) / np.maximum(next(around), np.float32(1e-6))
+    short[~known] = np.nan
+    some = slice(None, None, max(1, np.count_nonzero(known) // 65536))
+    share = median_of(np.abs(short[known][some])) / max(median_of(np.abs(values[known][some])), 1e-12)
+    unit_m = np.maximum(local.local_sigma(short) / max(share, 1e-3), floor_m)
+    depth_px = _depth_px(known)
+    return _without_rim(values / unit_m, depth_px * known), known, depth_px, unit_m
 
 
 @lru_cache(maxsize=1)
@@ -173,33 +164,25 @@ def _own_covariance(evidence: Evidence) -> np.ndarray:
     """Return the covariance of a cloud's residuals, in squared deviations, once for all findings of the cloud."""
     known = np.isfinite(evidence.residual_m)
     residual_m = np.where(known, evidence.residual_m, 0.0)
-    return _covariance(_in_deviations(residual_m, known.astype(np.float32), (0.0, 0.0))[0], known)
+    return _covariance(*_in_deviations(residual_m, known.astype(np.float32), (0.0, 0.0))[:3])
 
 
-def _covariance(noise: np.ndarray, known: np.ndarray) -> np.ndarray:
+def _covariance(noise: np.ndarray, known: np.ndarray, depth_px: np.ndarray) -> np.ndarray:
     """Return the covariance of weak residuals, away from the rim unless most pixels lie there."""
-    inner = known & (_depth_px(known) > RIM_PX)
+    inner = known & (depth_px > RIM_PX)
     inner = inner if 2 * inner.sum() > known.sum() else known
     loud = cv2.dilate((np.abs(noise) > QUIET_SIGMAS).astype(np.uint8), np.ones((5, 5), np.uint8))
     return whitening.noise_covariance(noise, inner & (loud == 0), whitening.grid_of(noise.shape))
 
 
-class _Noise(NamedTuple):
-    """The bank for a picture's noise: ``grid`` of its transforms, ``power`` there, and each template's `Worth`."""
-
-    grid: tuple[int, ...]
-    power: np.ndarray
-    window_px: int
-    worths: tuple[whitening.Worth, ...]
-
-
-def _judged(values: np.ndarray, known: np.ndarray, covariance: np.ndarray | None) -> tuple[np.ndarray, float]:
+def _judged(
+    values: np.ndarray, known: np.ndarray, depth_px: np.ndarray, covariance: np.ndarray | None
+) -> tuple[np.ndarray, float]:
     """Return signed scores (r, c) of residuals in deviations, and the deviation of the narrowest template's height."""
-    grid = whitening.grid_of(values.shape)
-    covariance = _covariance(values, known) if covariance is None else covariance
+    covariance = _covariance(values, known, depth_px) if covariance is None else covariance
     window_px = whitening.window_of(covariance)
-    worth_of = whitening.worths(whitening.spectrum(covariance, (whitening.GRID, whitening.GRID)), window_px)
-    noise = _Noise(grid, whitening.spectrum(covariance, grid), window_px, worth_of)
+    worths = whitening.worths(whitening.spectrum(covariance, (whitening.GRID, whitening.GRID)), window_px)
+    noise = whitening.filters(covariance, values.shape), window_px, worths
     tamed = _tamed(values)
     # strong residuals, as seen by round templates
     signed, by, solved = _scored(tamed, known, noise, rough=True)
@@ -208,13 +191,15 @@ def _judged(values: np.ndarray, known: np.ndarray, covariance: np.ndarray | None
     peaks = np.argwhere((size > STRONG) & _highest(size))
     core, taken = _cores(peaks, size, radius_px[by], values, known)
     seen = known & ~grown(core, MARGIN_PX) if core.any() else known
-    signed, by, _ = _scored(tamed * seen, seen, noise, start=solved)
+    # where much is removed, the first solution is a poor start
+    signed, by, _ = _scored(tamed * seen, seen, noise, start=None if core.any() else solved)
     _fill_discs(signed, radius_px[by])
-    signed = np.where(core, taken, np.where(known, signed, 0.0))
+    signed *= known
+    signed[core] = taken[core]
     reach = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
-    behind, before = (cv2.dilate(np.maximum(each, 0.0), reach) for each in (signed, -signed))
-    lobe = np.abs(signed) < LOBE_SHARE * np.where(signed > 0, before, behind)
-    return np.where(lobe, 0.0, signed).astype(np.float64), noise.worths[0].energy ** -0.5
+    low, high = (np.asarray(of(signed, reach)) for of in (cv2.erode, cv2.dilate))
+    lobe = (signed < -LOBE_SHARE * low) & (signed > -LOBE_SHARE * high)
+    return (signed * ~lobe).astype(np.float64), worths[0].energy ** -0.5
 
 
 def _tamed(values: np.ndarray) -> np.ndarray:
@@ -226,159 +211,180 @@ def _tamed(values: np.ndarray) -> np.ndarray:
 
 
 def _scored(
-    values: np.ndarray, seen: np.ndarray, noise: _Noise, start: np.ndarray | None = None, rough: bool = False
+    values: np.ndarray,
+    seen: np.ndarray,
+    noise: tuple[whitening.Filters, int, Sequence[whitening.Worth]],
+    start: np.ndarray | None = None,
+    rough: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return each pixel's strongest score (r, c) with its sign, the index of its template, and C^-1 r, from the pixels
-    ``seen`` (r, c). ``start``: an approximate solution. ``rough``: only round templates at the centres of pixels,
-    without the scatter of scores, which strong residuals would spoil."""
-    solved = whitening.inverse_times(values, seen, noise.power, noise.grid, start)
-    (h, w), depth_px = seen.shape, _depth_px(seen)
-    views, best, shares, tail = [], [], {}, 1.0
-    for coarse in range(1 if rough else 2):
-        spectrum_of = (whitening.halved if coarse else whitening.transformed)(solved, noise.grid)
-        there, depth = (_halved(each) if coarse else each for each in (seen, depth_px))
-        zone = ZONES[np.ceil(np.minimum(depth, len(ZONES) - 1)).astype(np.intp)]
-        views.append((spectrum_of, there.astype(np.float32), zone, depth > RIM_PX))
-        best.append((np.zeros(there.shape, np.float32), np.zeros(there.shape, np.uint8)))
-    templates = whitening.spectra(noise.grid, noise.window_px)
-    for number, (template, worth) in enumerate(zip(whitening.bank(noise.window_px), noise.worths, strict=True)):
-        if rough and (template.coarse or any(template.halves)):
+    ``seen`` (r, c). ``noise``: its `whitening.filters`, the window's side, and each template's `Worth`. ``start``: an
+    approximate solution. ``rough``: only round templates at the centres of pixels, without the scatter of scores, which
+    strong residuals would spoil."""
+    filters, window_px, worths = noise
+    solved = whitening.inverse_times(values, seen, filters, start, ROUGH if rough else whitening.CONVERGED)
+    spectra, visible, tail = [whitening.transformed(solved, filters[0].shape)], {}, 1.0
+    views = [(seen.astype(np.float32), seen if rough else _depth_px(seen))]
+    if not rough:
+        spectra.append(whitening.halved(spectra[0]))
+        views.append((_halved(views[0][0]), _halved(views[0][1])))
+    zones = [] if rough else [_zones(*view) for view in views]
+    scores, products = [np.empty_like(there) for there, _ in views], [np.empty_like(each) for each in spectra]
+    best = [(np.zeros_like(there), np.zeros(there.shape, np.uint8)) for there, _ in views]
+    templates = whitening.bank(window_px)
+    for pair, numbers in whitening.spectra(filters[0].shape, window_px):
+        wanted = [not rough or not (templates[number].coarse or any(templates[number].halves)) for number in numbers]
+        if not any(wanted):
             continue
-        spectrum_of, there, zone, inner = views[template.coarse]
-        key = template.coarse, template.slot, worth.sides
-        if key not in shares:
-            share = cv2.blur(there, worth.sides, borderType=cv2.BORDER_CONSTANT)
-            # errors along outlines, from light and flying pixels, look like slots
-            enough = (share > LEAST_SEEN) & (there > 0) & (inner if template.slot else True)
-            shares[key] = enough / np.sqrt(np.maximum(share, np.float32(LEAST_SEEN)))
-        score = whitening.response(spectrum_of, templates[number], there.shape, not any(template.halves))
-        cv2.multiply(score, shares[key], dst=score, scale=worth.energy**-0.5)
-        deviations = np.ones(N_ZONES)
-        if not rough:
-            step, round_px = 1 + template.coarse, 0.0 if template.slot else template.radius_px
-            deviations, loud = _deviations(score, zone, round(round_px / step) if round_px >= WIDE_PX else 0)
-            _calm(score, loud, deviations[-1], max(WINDOW_RADII * template.radius_px, LEAST_WINDOW) / step)
-            if template.radius_px <= TAIL_PX:
-                if not any(template.halves):
-                    tail = _tail(score * (1.0 / deviations).astype(np.float32)[zone])
-                deviations *= tail
-        per_deviation = (1.0 / deviations).astype(np.float32)
-        _keep_stronger(*best[template.coarse], score, zone, per_deviation, worth.raised, *template.halves, number)
+        coarse = templates[numbers[0]].coarse
+        (there, depth_px), score = views[coarse], scores[coarse]
+        both = whitening.responses(spectra[coarse], pair, products[coarse])[: len(score), : score.shape[1]]
+        for channel, number in [each for each in enumerate(numbers) if wanted[each[0]]]:
+            template, worth = templates[number], worths[number]
+            key = coarse, template.slot, worth.sides
+            if key not in visible:
+                share = cv2.blur(there, worth.sides, borderType=cv2.BORDER_CONSTANT)
+                # errors along outlines, from light and flying pixels, look like slots
+                visible[key] = _visible(share, there * (depth_px > RIM_PX) if template.slot else there)
+            cv2.extractChannel(both, channel, dst=score)
+            cv2.multiply(score, visible[key], dst=score, scale=worth.energy**-0.5)
+            deviation = 1.0
+            if not rough:
+                deviation = _evened(score, template, *zones[coarse])
+                if template.radius_px <= TAIL_PX:
+                    tail = tail if any(template.halves) else _tail(score, deviation)
+                    deviation *= tail
+            _keep_stronger(*best[coarse], score, 1.0 / deviation, worth.raised, *template.halves, number)
     signed, by = best[0]
     for half, half_by in best[1:]:
         wide, wide_by = (
-            cv2.resize(each, None, fx=2, fy=2, interpolation=how)[:h, :w]
+            np.ascontiguousarray(cv2.resize(each, None, fx=2, fy=2, interpolation=how)[: len(seen), : seen.shape[1]])
             for each, how in ((half, cv2.INTER_LINEAR), (half_by, cv2.INTER_NEAREST))
         )
-        wider = np.abs(wide) > np.abs(signed)
-        signed, by = np.where(wider, wide, signed), np.where(wider, wide_by, by)
+        wider = (np.abs(wide) > np.abs(signed)).view(np.uint8)
+        cv2.copyTo(wide, wider, signed), cv2.copyTo(wide_by, wider, by)
     return signed * seen, by, solved
+
+
+@numba.njit(**PLAIN)
+def _visible(share: np.ndarray, judged: np.ndarray) -> np.ndarray:
+    """Return 1 / sqrt(share) (r, c) where ``judged`` is not 0 and enough of a template is visible, 0 elsewhere."""
+    found, least = np.empty(share.shape, np.float32), np.float32(LEAST_SEEN)
+    for i in range(share.shape[0]):
+        of, ok, to = share[i], judged[i], found[i]
+        for j in range(len(to)):
+            root = np.float32(1.0) / np.sqrt(max(of[j], least))
+            to[j] = root if (of[j] > least) & (ok[j] > 0) else np.float32(0.0)
+    return found
+
+
+def _zones(there: np.ndarray, depth_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the flat indices (n,) of the known pixels outside the last zone, and their zones (n,)."""
+    zone = ZONES[np.ceil(np.minimum(depth_px, len(ZONES) - 1)).astype(np.uint8)]
+    rim = np.flatnonzero((zone < N_ZONES - 1) & (there > 0))
+    return rim, zone.ravel()[rim]
 
 
 def _halved(image: np.ndarray) -> np.ndarray:
     """Return the means (r / 2, c / 2) of 2 x 2 pixels; an odd last row or column is repeated."""
-    even = np.pad(image, ((0, image.shape[0] % 2), (0, image.shape[1] % 2)), mode="edge").astype(np.float32)
+    even = cv2.copyMakeBorder(image, 0, image.shape[0] % 2, 0, image.shape[1] % 2, cv2.BORDER_REPLICATE)
     return np.asarray(cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
 
 
-def _deviations(score: np.ndarray, zone: np.ndarray, reach_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the deviation (z,) of the scores (r, c) in each ``zone`` (r, c), from sizes up to `CAP`, at least that of
-    the last zone; and (r, c) bool, the scores within ``reach_px`` of strong ones, which are excluded."""
-    loud = np.zeros(score.shape, np.bool_)
-    found, count = _scatter(score, zone, loud)
-    if reach_px:
-        loud = grown(np.abs(score) > FAINT * found[-1], reach_px)
-        again, count = _scatter(score, zone, loud)
-        found = again if count > FEWEST else found
-    return found, loud
-
-
-def _calm(score: np.ndarray, loud: np.ndarray, deviation: float, half_px: float) -> None:
-    """Divide the scores (r, c) where scores other than ``loud`` ones (r, c) within a square of ``half_px`` scatter by
-    more than `UNEVEN` deviations: the noise there differs from elsewhere."""
+def _evened(score: np.ndarray, template: whitening.Template, rim: np.ndarray, zones: np.ndarray) -> float:
+    """Return the deviation of the scores (r, c) in the last zone, and divide the scores where others scatter more: in
+    the ``zones`` (n,) of the pixels ``rim`` (n,), and where the squares around scatter by more than `UNEVEN` deviations
+    because the noise there differs from elsewhere. Scores next to strong ones of wide templates do not count."""
+    step, round_px = 1 + template.coarse, 0.0 if template.slot else template.radius_px
+    found, sums, counts = _scatter(score, rim, zones)
+    if round_px >= WIDE_PX and cv2.norm(score, cv2.NORM_INF) > FAINT * found[-1]:
+        quiet = score * ~grown(np.abs(score) > FAINT * found[-1], round(round_px / step))
+        again, sums, counts = _scatter(quiet, rim, zones)
+        found = again if counts.sum() > FEWEST else found
+    deviation, half_px = float(found[-1]), max(WINDOW_RADII * template.radius_px, local.LEAST_WINDOW) / step
     window = (2 * round(half_px / PART_PX) + 1,) * 2
-    sums, counts = (cv2.blur(each, window) for each in _parts(score, loud, CAP * deviation))
-    size = sums / np.maximum(counts, 0.05 * PART_PX**2) / deviation
-    if size.max() > CAPPED_UNEVEN:
-        local = np.maximum(np.interp(size, CAPPED, DEVIATIONS) / UNEVEN, 1.0).astype(np.float32)
-        score /= cv2.resize(local, score.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    size = cv2.blur(sums, window) / np.maximum(cv2.blur(counts, window), 0.05 * PART_PX**2)
+    if DEVIATION_OF[int(STEPS * size.max())] > UNEVEN * deviation:
+        more = np.maximum(np.interp(size, CAPPED, DEVIATIONS) / (UNEVEN * deviation), 1.0).astype(np.float32)
+        score /= cv2.resize(more, score.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    _even(score, rim, zones, (deviation / found).astype(np.float32))
+    return deviation
 
 
 @numba.njit(**PLAIN)
-def _parts(score: np.ndarray, loud: np.ndarray, cap: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sums of the sizes, at most ``cap``, of quiet scores in squares of `PART_PX`, and their number."""
-    h, w = score.shape
+def _even(score: np.ndarray, rim: np.ndarray, zones: np.ndarray, factors: np.ndarray) -> None:
+    flat = score.ravel()
+    for k in range(len(rim)):
+        flat[rim[k]] *= factors[zones[k]]
+
+
+@numba.njit(**PLAIN)
+def _scatter(score: np.ndarray, rim: np.ndarray, zones: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the deviations (z,) of the scores (r, c) that are not 0 in each zone, at least that of the last, from
+    sizes up to `CAP`; and the sums of these sizes in squares of `PART_PX`, and their numbers."""
+    (h, w), most, flat, last = score.shape, np.float32(CAP), score.ravel(), N_ZONES - 1
     rows, columns = max(1, h // PART_PX), max(1, w // PART_PX)
-    sums, counts = np.zeros((rows, columns)), np.zeros((rows, columns))
-    for i in range(h):
+    sums, counts, whole, number = np.zeros((rows, columns)), np.zeros((rows, columns)), 0.0, 0.0
+    for row in range(rows):
+        sizes, numbers = np.zeros(w, np.float32), np.zeros(w, np.int32)
+        for i in range(row * h // rows, (row + 1) * h // rows):
+            of = score[i]
+            for j in range(w):
+                sizes[j] += min(abs(of[j]), most)
+                numbers[j] += of[j] != 0
         for part in range(columns):
-            total, number = 0.0, 0
             for j in range(part * w // columns, (part + 1) * w // columns):
-                if score[i, j] != 0 and not loud[i, j]:
-                    total += min(abs(score[i, j]), cap)
-                    number += 1
-            sums[i * rows // h, part] += total
-            counts[i * rows // h, part] += number
-    return sums, counts
-
-
-def _scatter(score: np.ndarray, zone: np.ndarray, loud: np.ndarray) -> tuple[np.ndarray, int]:
-    sums, counts = _capped(score, zone, loud, N_ZONES)
-    number = int(counts.sum())
-    if counts[-1] < FEWEST:
-        sums[-1], counts[-1] = sums.sum(), max(number, 1)
-    found = np.interp(sums / np.maximum(counts, 1), CAPPED, DEVIATIONS)
-    return np.where(counts < FEWEST, found[-1], np.maximum(found, found[-1])), number
-
-
-@numba.njit(**PLAIN)
-def _capped(score: np.ndarray, zone: np.ndarray, loud: np.ndarray, zones: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sums of the sizes, at most `CAP`, of quiet scores in each zone, and their number."""
-    sums, counts = np.zeros(zones), np.zeros(zones, np.int64)
-    for i in range(score.shape[0]):
-        total, number = 0.0, 0  # those of the last zone, which has most pixels
-        for j in range(score.shape[1]):
-            if score[i, j] != 0 and not loud[i, j]:
-                size = min(abs(score[i, j]), CAP)
-                if zone[i, j] == zones - 1:
-                    total += size
-                    number += 1
-                else:
-                    sums[zone[i, j]] += size
-                    counts[zone[i, j]] += 1
-        sums[-1] += total
-        counts[-1] += number
-    return sums, counts
+                sums[row, part] += sizes[j]
+                counts[row, part] += numbers[j]
+            whole += sums[row, part]
+            number += counts[row, part]
+    totals, known, found = np.zeros(N_ZONES), np.zeros(N_ZONES), np.zeros(N_ZONES)
+    size_there, number_there = 0.0, 0
+    for k in range(len(rim)):
+        size, one = min(abs(flat[rim[k]]), most), flat[rim[k]] != 0
+        totals[zones[k]] += size
+        known[zones[k]] += one
+        size_there += size
+        number_there += one
+    totals[last], known[last] = whole - size_there, number - number_there
+    if known[last] < FEWEST:
+        totals[last], known[last] = whole, number
+    for zone in range(last, -1, -1):
+        if zone == last or known[zone] >= FEWEST:
+            found[zone] = DEVIATION_OF[int(STEPS * max(totals[zone], 0.0) / max(known[zone], 1.0))]
+        found[zone] = max(found[zone], found[last])
+    return found, sums, counts
 
 
 @numba.njit(**PLAIN)
 def _keep_stronger(  # type: ignore[no-untyped-def]
-    signed, by, score, zone, per_deviation, raised, down, right, number
+    signed, by, score, per_deviation, raised, down, right, number
 ):
-    """Keep the larger of each pixel's scores (r, c) by size, and that template's ``number``. Scores are scaled to
-    deviations of their ``zone`` (r, c) by the factors ``per_deviation`` (z,), and raised: their squares grow by
-    ``raised``, in proportion below `FAINT`. Scores between pixels, ``down`` or ``right``, belong to all around."""
-    faint = per_deviation * np.float32(np.sqrt(1.0 + raised / FAINT**2))
+    """Keep the larger of each pixel's scores (r, c) by size, and that template's ``number``. Scores are scaled by
+    ``per_deviation`` and raised: their squares grow by ``raised``, in proportion below `FAINT`. Scores between pixels,
+    ``down`` or ``right``, belong to all around."""
+    scale, more = np.float32(per_deviation), np.float32(raised)
+    faint = np.float32(per_deviation * np.sqrt(1.0 + raised / FAINT**2))
     height, width = score.shape
     for y in range(down + 1):
         for x in range(right + 1):
             for i in range(height - y):
+                of, most, most_by = score[i], signed[i + y][x:], by[i + y][x:]
                 for j in range(width - x):
-                    most, before = abs(score[i, j]) * faint[zone[i, j]], abs(signed[i + y, j + x])
-                    if most > before:
-                        square = (score[i, j] * per_deviation[zone[i, j]]) ** 2
-                        size = min(most, np.float32(np.sqrt(square + raised)))
-                        if size > before:
-                            signed[i + y, j + x], by[i + y, j + x] = np.copysign(size, score[i, j]), number
+                    size = min(abs(of[j]) * faint, np.sqrt((of[j] * scale) ** 2 + more))
+                    stronger = size > abs(most[j])
+                    most[j] = np.copysign(size, of[j]) if stronger else most[j]
+                    most_by[j] = number if stronger else most_by[j]
 
 
-def _tail(scores: np.ndarray) -> float:
-    """Return how much farther the tail of scores (r, c) reaches than a Gaussian's, on its shorter side; at least 1."""
-    count = int(TAIL_SHARE * np.count_nonzero(scores))
-    sides = [np.sort(np.abs(scores[beyond])) for beyond in (scores > TAIL_SIGMAS, scores < -TAIL_SIGMAS)]
+def _tail(scores: np.ndarray, deviation: float) -> float:
+    """Return how much farther the tail of scores (r, c) over their ``deviation`` reaches than a Gaussian's, on its
+    shorter side; at least 1."""
+    count, limit = int(TAIL_SHARE * np.count_nonzero(scores)), TAIL_SIGMAS * deviation
+    sides = [np.sort(np.abs(scores[beyond])) for beyond in (scores > limit, scores < -limit)]
     if count == 0 or min(map(len, sides)) < count:
         return 1.0
-    return float(min(side[-count] for side in sides)) / TAIL_SIGMAS
+    return float(min(side[-count] for side in sides)) / limit
 
 
 def _fill_discs(signed: np.ndarray, radius_px: np.ndarray) -> None:
@@ -386,10 +392,10 @@ def _fill_discs(signed: np.ndarray, radius_px: np.ndarray) -> None:
     size = np.abs(signed)
     peaks = (size > STRONG / 2) & (radius_px >= WIDE_PX) & _highest(size)
     for row, column in np.argwhere(peaks).tolist():
-        radius, least = int(radius_px[row, column]), SADDLE * 1.01 * signed[row, column]
+        radius, least = int(radius_px[row, column]), local.SADDLE * 1.01 * signed[row, column]
         cut = np.s_[max(row - radius, 0) : row + radius + 1, max(column - radius, 0) : column + radius + 1]
-        rows, columns = np.indices(size[cut].shape)
-        inside = np.hypot(rows - min(row, radius), columns - min(column, radius)) <= radius
+        rows, columns = np.ogrid[: size[cut].shape[0], : size[cut].shape[1]]
+        inside = (rows - min(row, radius)) ** 2 + (columns - min(column, radius)) ** 2 <= radius**2
         signed[cut][inside & (size[cut] < abs(least))] = least
 
 
@@ -430,25 +436,36 @@ def _cores(
 
 def _depth_px(known: np.ndarray) -> np.ndarray:
     """Return the distance (r, c) of each pixel to the outline of the known pixels, ignoring single unknown pixels."""
-    closed = cv2.morphologyEx(np.pad(known.astype(np.uint8), 2), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-    return np.asarray(cv2.distanceTransform(closed, cv2.DIST_C, 3)[2:-2, 2:-2])
+    padded = cv2.copyMakeBorder(known.astype(np.uint8), 2, 2, 2, 2, cv2.BORDER_CONSTANT)
+    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    return np.ascontiguousarray(cv2.distanceTransform(closed, cv2.DIST_C, 3)[2:-2, 2:-2])
 
 
-def _without_rim(noise: np.ndarray, known: np.ndarray) -> np.ndarray:
+def _without_rim(noise: np.ndarray, depth_px: np.ndarray) -> np.ndarray:
     """Return the residuals (r, c) minus what they share, along some 65 pixels, with those at the same distance from the
-    outline, beyond what those next to the rim share: subtracting a mean would leave a step there."""
-    noise, depth_px = noise.astype(np.float32), _depth_px(known)
-    modest = np.clip(noise, -LEVEL_SIGMAS, LEVEL_SIGMAS)
-
-    def shared(layer: np.ndarray) -> np.ndarray:
-        of, total = (
-            cv2.blur(each, (2 * LEAST_WINDOW + 1,) * 2, borderType=cv2.BORDER_CONSTANT)
-            for each in (layer.astype(np.float32), modest * layer)
-        )
-        return np.asarray(total / np.maximum(of, 1e-6))
-
-    inside = shared(known & (depth_px > RIM_PX) & (depth_px <= 2 * RIM_PX))
-    for step in range(1, RIM_PX + 1):
-        layer = known & (depth_px == step)
-        np.subtract(noise, shared(layer) - inside, out=noise, where=layer)
+    outline, beyond what those next to the rim share: subtracting a mean would leave a step there. Pixels whose
+    ``depth_px`` (r, c) is 0 are unknown."""
+    noise, sums = noise.astype(np.float32), np.zeros((2, *(-(-side // LAYER_PX) for side in noise.shape), RIM_PX + 1))
+    _layers(noise, depth_px, sums, True)
+    side = 2 * (local.LEAST_WINDOW // LAYER_PX) + 1
+    total, count = (cv2.blur(each, (side, side), borderType=cv2.BORDER_CONSTANT) for each in sums)
+    sums[0] = total / np.maximum(count, 1e-6)
+    sums[0] -= sums[0, ..., RIM_PX:]
+    _layers(noise, depth_px, sums, False)
     return noise
+
+
+@numba.njit(**PLAIN)
+def _layers(noise: np.ndarray, depth_px: np.ndarray, sums: np.ndarray, summed: bool) -> None:
+    """Add clipped residuals to ``sums``, and their numbers (2, r, c, `RIM_PX` + 1), in squares of `LAYER_PX`, for each
+    distance from the outline within the rim, and for those next to it together; or subtract from the rim's residuals
+    the first of the sums there."""
+    for i in range(noise.shape[0]):
+        for j in range(noise.shape[1]):
+            if 0 < depth_px[i, j] <= (2 * RIM_PX if summed else RIM_PX):
+                at = i // LAYER_PX, j // LAYER_PX, min(int(depth_px[i, j]) - 1, RIM_PX)
+                if summed:
+                    sums[0][at] += min(max(noise[i, j], -MODEST_SIGMAS), MODEST_SIGMAS)
+                    sums[1][at] += 1
+                else:
+                    noise[i, j] -= np.float32(sums[0][at])

@@ -9,15 +9,18 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
+import numba
 import numpy as np
 import scipy.fft
 import scipy.linalg
 
+from detectors.clusters import PLAIN
+
+Filters = tuple[np.ndarray, np.ndarray]
 SMALL_RADII_PX, HALVES_PX = (0.5, 1.5), ((0.0, 0.0), (0.5, 0.5), (0.0, 0.5), (0.5, 0.0))
 """Radii of small discs, and the positions between pixels at which they are compared: half a pixel costs up to a seventh
 of the score if the window has sharp sides. The first radius stands for all holes smaller than a pixel."""
-RADII_PX = (2.2, 3.2, 4.5, 6.4, 9.0, 13.0, 18.0)
-"""Radii of further discs."""
+RADII_PX = (2.2, 3.2, 4.5, 6.4, 9.0, 13.0, 18.0)  # radii of further discs
 DENT_RADII_PX = (5.0, 6.5, 8.0, 10.0, 12.0, 14.5, 17.5)
 """Radii of paraboloids. They are denser because before a fixed pattern the rims decide."""
 SLOT_PX, SLOTS_DEG = (20.0, 2.0), tuple(22.5 * k for k in range(8))
@@ -25,37 +28,44 @@ SLOT_PX, SLOTS_DEG = (20.0, 2.0), tuple(22.5 * k for k in range(8))
 WINDOWS_PX = (1, 3, 5)
 """Sides of the square over which cameras average: 3 for a Kinect v2, 5 for an Azure Kinect, 1: only the lens blurs."""
 LENS_BLUR_PX = 0.6
-LONGEST_LAG_PX = 28
-"""Lag at which Parzen's window fades the covariance to 0."""
+LONGEST_LAG_PX = 28  # lag at which Parzen's window fades the covariance to 0
 COARSE_PX = 9.0
 """Radius from which only every second pixel is scored: between these pixels, scores change by some hundredths."""
-LEAST_POWER = 0.01
-"""Least value of the spectrum, as a share of its mean."""
+LEAST_POWER = 0.01  # least value of the spectrum, as a share of its mean
 MOST_WHITENED = 2000  # most pixels whose dense covariance is factored: 0.2 s and 64 MB
-SIDES_PX = (0, 1, 2, 3, 5, 8, 12, 18)
-"""Half-sides that a `Worth` may have: the visible share is computed once for each."""
-GRID = 96
-"""Side of the grid that holds the widest template and the reach of its whitened edge."""
-CONVERGED, MOST_ITERATIONS, FADED = 0.01, 40, 0.1
-"""Relative residual at which C^-1 r is solved, most steps, and weight of 0 in the values that fill unknown pixels."""
+SIDES_PX = (0, 1, 2, 3, 5, 8, 12, 18)  # half-sides that a `Worth` may have: the visible share is computed once for each
+GRID = 96  # side of the grid that holds the widest template and the reach of its whitened edge
+CONVERGED, MOST_ITERATIONS, FADED = 0.15, 80, 0.3
+"""Error at which C^-1 r is solved, most steps, and weight of 0 in the values that fill unknown pixels."""
+EDGE_PX = 7.0
+"""Depth of an outline's pixels among which errors count, in units of the sum of what is unknown around its pixels."""
+TAPS = np.array([1.0, 2.0, 3.0], np.float32) / np.float32(9.0)
+"""Weights, along each axis, of second and direct neighbours and of the pixel itself, which fill unknown pixels."""
 
 
-def grid_of(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the grid for transforms of pictures of this shape; it holds every template, and its half is even."""
-    quarters = (math.ceil((max(side, GRID) + LONGEST_LAG_PX) / 4) for side in shape)
-    return tuple(4 * scipy.fft.next_fast_len(quarter, real=True) for quarter in quarters)
+def grid_of(shape: tuple[int, ...], least: int = GRID, more: int = LONGEST_LAG_PX) -> tuple[int, ...]:
+    """Return the grid for transforms of pictures of this shape, as they are fast; it holds every template, and its half
+    is even. ``least``: its least side without the margin of ``more`` pixels."""
+    return tuple(8 * scipy.fft.next_fast_len(math.ceil((max(side, least) + more) / 8)) for side in shape)
 
 
 def noise_covariance(noise: np.ndarray, quiet: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Return the autocovariance (2 `LONGEST_LAG_PX` + 1, squared) of the quiet pixels, lag 0 in the middle: mean
     products of pairs of known pixels, faded out by Parzen's window."""
-    products = np.abs(scipy.fft.rfft2(np.where(quiet, noise, np.float32(0.0)), shape)) ** 2
-    pairs = np.abs(scipy.fft.rfft2(quiet.astype(np.float32), shape)) ** 2
     lags = np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1)
-    sums, counts = (scipy.fft.irfft2(each, shape)[np.ix_(lags, lags)] for each in (products, pairs))
+    sums, counts = (_by_lag(quiet * image, shape) for image in (noise, np.float32(1.0)))
     lag = np.minimum(np.hypot(lags[:, None], lags) / LONGEST_LAG_PX, 1.0)
     parzen = np.where(lag <= 0.5, 1.0 - 6.0 * lag**2 * (1.0 - lag), 2.0 * (1.0 - lag) ** 3)
     return np.asarray(parzen * sums / np.maximum(counts, 1.0), np.float32)
+
+
+def _by_lag(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the sums of products of an image's pairs of pixels by lag, up to `LONGEST_LAG_PX`."""
+    whole, reach = np.zeros(shape, np.float32), np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1)
+    whole[: image.shape[0], : image.shape[1]] = image
+    cv2.dft(whole, dst=whole)
+    cv2.mulSpectrums(whole, whole, 0, c=whole, conjB=True)
+    return np.asarray(cv2.dft(whole, dst=whole, flags=cv2.DFT_INVERSE | cv2.DFT_SCALE))[np.ix_(reach, reach)]
 
 
 def spectrum(covariance: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -81,99 +91,130 @@ def _centred(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return np.roll(padded, (-(image.shape[0] // 2), -(image.shape[1] // 2)), (0, 1))
 
 
-def inverse_times(
-    values: np.ndarray, known: np.ndarray, power: np.ndarray, shape: tuple[int, ...], start: np.ndarray | None = None
-) -> np.ndarray:
-    """Return C^-1 r (r, c) over the known pixels, 0 elsewhere, for the covariance with this power spectrum, by
-    conjugate gradients from ``start`` (r, c) or the preconditioner. The preconditioner fills unknown pixels from their
-    neighbours, applies the stationary inverse, and then the transpose of the filling: with zeros instead, ragged
-    outlines and missing pixels take up to four times the steps."""
-    (h, w), mask, target = values.shape, np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    mask[:h, :w], target[:h, :w] = known, values * known
-    power, inverse = (packed(each * np.complex64(1 + 1j)) / np.float32(mask.size) for each in (power, 1.0 / power))
-    share = (1.0 - mask) / (_blurred(mask) + FADED)
+def filters(covariance: np.ndarray, shape: tuple[int, ...]) -> Filters:
+    """Return the power spectrum of noise with this covariance on the grid of pictures of this ``shape``, and its
+    inverse on a smaller grid, where what wraps around costs no steps. Both are packed as by `cv2.dft`, over sizes."""
+    powers = []
+    for each in (grid_of(shape), grid_of(shape, 2 * LONGEST_LAG_PX, 4)):
+        power = cv2.dft(_centred(covariance, each))
+        # a real spectrum: the real factor of each number takes the imaginary one's place too
+        power[:, 2::2], power[2::2, :: each[1] - 1] = power[:, 1:-1:2], power[1:-1:2, :: each[1] - 1]
+        powers.append(np.maximum(power, np.float32(max(LEAST_POWER * float(covariance.max()), 1e-12))))
+    return powers[0] / np.float32(powers[0].size), np.float32(1.0 / powers[1].size) / powers[1]
 
-    def filtered(image: np.ndarray, by: np.ndarray) -> np.ndarray:
-        whole = cv2.dft(image)
-        whole *= by
-        return np.asarray(cv2.dft(whole, dst=whole, flags=cv2.DFT_INVERSE))
+
+def inverse_times(
+    values: np.ndarray, known: np.ndarray, by: Filters, start: np.ndarray | None = None, error: float = CONVERGED
+) -> np.ndarray:
+    """Return C^-1 r (r, c) over the known pixels, 0 elsewhere, for the `filters` of C. Conjugate gradients go on from
+    ``start`` (r, c) until scores near unknown pixels, where errors gather, err by some ``error`` deviations. The
+    preconditioner fills unknown pixels from their neighbours, applies the stationary inverse, and then the transpose of
+    the filling: with zeros instead, ragged outlines and missing pixels take up to four times the steps. It would still
+    be too large along outlines: damping it the more, the less is known around a pixel, saves a fifth of the steps."""
+    (h, w), mask, (power, inverse) = values.shape, known.astype(np.float32), by
+    wide, whole, onward = np.zeros_like(power), np.empty_like(power), np.empty_like(mask)
+    tight, share, towards = np.zeros_like(inverse), np.empty_like(inverse), np.empty_like(mask)
+    tight[:h, :w] = mask
+    near = cv2.GaussianBlur(tight, (13, 13), 2.0, borderType=cv2.BORDER_CONSTANT)[:h, :w]
+    damp, unknown = mask * np.sqrt(near), float(mask.sum() - np.vdot(mask, near))
+    enough = error**2 * min(EDGE_PX * unknown, float(mask.sum()))
+    _spread(mask, mask, np.ones_like(share), False, share)
+    share = (1.0 - tight) / (share + FADED)
+
+    def filtered(image: np.ndarray, factors: np.ndarray, out: np.ndarray) -> np.ndarray:
+        np.multiply(cv2.dft(image, dst=out), factors, out=out)
+        return np.asarray(cv2.dft(out, dst=out, flags=cv2.DFT_INVERSE))
+
+    def covered(image: np.ndarray) -> np.ndarray:
+        wide[:h, :w] = image
+        return np.multiply(filtered(wide, power, whole)[:h, :w], mask, out=onward)
 
     def conditioned(image: np.ndarray) -> np.ndarray:
-        filled = _blurred(image)
-        filled *= share
-        filled += image
-        whole = filtered(filled, inverse)
-        back = _blurred(np.multiply(share, whole, out=filled))
-        back += whole
-        back *= mask
-        return back
+        filled = filtered(_spread(image, damp, share, False, tight), inverse, tight)
+        return _spread(filled, share, damp, True, towards)
 
-    solution = conditioned(target) if start is None else np.zeros_like(mask)
+    solution, rest = np.zeros_like(mask), values * mask
     if start is not None:
-        solution[:h, :w] = mask[:h, :w] * start
-    rest = target - mask * filtered(solution, power)
-    direction = towards = conditioned(rest)
-    product, enough = float(np.vdot(rest, towards)), CONVERGED**2 * float(np.vdot(target, target))
+        solution = mask * start
+        rest -= covered(solution)
+    direction = conditioned(rest).copy()
+    product = float(np.vdot(rest, towards))
     for _ in range(MOST_ITERATIONS):
-        if float(np.vdot(rest, rest)) <= enough or product <= 0:
+        if product <= enough:
             break
-        onward = filtered(direction, power)
-        onward *= mask
-        step = product / float(np.vdot(direction, onward))
+        step = product / float(np.vdot(direction, covered(direction)))
         cv2.scaleAdd(direction, step, solution, dst=solution)
         cv2.scaleAdd(onward, -step, rest, dst=rest)
-        towards = conditioned(rest)
-        before, product = product, float(np.vdot(rest, towards))
+        before, product = product, float(np.vdot(rest, conditioned(rest)))
         cv2.scaleAdd(direction, product / before, towards, dst=direction)
-    return solution[:h, :w]
+    return solution
 
 
-def _blurred(image: np.ndarray) -> np.ndarray:
-    return np.asarray(cv2.GaussianBlur(image, (7, 7), 1.0, borderType=cv2.BORDER_CONSTANT))
+@numba.njit(**PLAIN)
+def _spread(image: np.ndarray, inner: np.ndarray, outer: np.ndarray, back: bool, out: np.ndarray) -> np.ndarray:
+    """Write s = ``image`` x ``inner``, on a grid that is 0 elsewhere, plus ``outer`` x s blurred by `TAPS`, into the
+    grid ``out``; or if ``back``, the transpose: the image plus s blurred, times ``outer``. Grids share a corner."""
+    (height, width), (h, w) = out.shape, image.shape
+    columns, (one, two, three) = max(width, w), (TAPS[0], TAPS[1], TAPS[2])
+    lines, down = np.zeros((5, columns), np.float32), np.zeros(columns + 4, np.float32)
+    # views instead of offsets, so that the compiler uses vectors
+    left, beside, middle, next_to, right = down, down[1:], down[2 : 2 + columns], down[3:], down[4:]
+    for i in range(height + 2):
+        line = lines[i % 5]
+        if i < h:
+            seen, by = image[i], inner[i]
+            for j in range(w):
+                line[j] = seen[j] * by[j]
+        else:
+            for j in range(w):
+                line[j] = 0
+        row = i - 2
+        if row >= 0:
+            above, over, own = lines[(i + 1) % 5], lines[(i + 2) % 5], lines[(i + 3) % 5]
+            under, to, times = lines[(i + 4) % 5], out[row], outer[row]
+            for j in range(columns):
+                middle[j] = one * (above[j] + line[j]) + two * (over[j] + under[j]) + three * own[j]
+            add = image[row] if back else own
+            for j in range(width):
+                sides = one * (left[j] + right[j]) + two * (beside[j] + next_to[j])
+                blurred = sides + three * middle[j]
+                to[j] = (add[j] + blurred) * times[j] if back else add[j] + blurred * times[j]
+    return out
 
 
 def transformed(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the spectrum of an image (r, c), padded with zeros to a grid of even sides, packed as by `cv2.dft`."""
-    padded = np.zeros(shape, np.float32)
-    padded[: image.shape[0], : image.shape[1]] = image
-    return np.asarray(cv2.dft(padded))
+    """Return the spectrum, complex (r, c), of an image padded with zeros to a grid of this shape."""
+    padded = np.zeros((*shape, 2), np.float32)
+    padded[: image.shape[0], : image.shape[1], 0] = image
+    return np.asarray(cv2.dft(padded, dst=padded)).view(np.complex64)[..., 0]
 
 
-def packed(half: np.ndarray) -> np.ndarray:
-    """Return a spectrum of `scipy.fft.rfft2` (r, c / 2 + 1), r and c even, packed as by `cv2.dft` (r, c)."""
-    rows = len(half)
-    found = np.empty((rows, 2 * half.shape[1] - 2), np.float32)
-    found[:, 1:-1:2], found[:, 2::2] = half[:, 1:-1].real, half[:, 1:-1].imag
-    for column in (0, -1):
-        found[0, column], found[-1, column] = half[0, column].real, half[rows // 2, column].real
-        found[1:-1:2, column] = half[1 : rows // 2, column].real
-        found[2:-1:2, column] = half[1 : rows // 2, column].imag
-    return found
+def responses(spectrum_of: np.ndarray, pair: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+    """Return the correlations (r, c, 2) of a picture with two templates, from its spectrum and theirs (`spectra`). For
+    a `halved` picture, they are those in the middles of 2 x 2 pixels."""
+    whole = np.multiply(spectrum_of, pair, out=out).view(np.float32).reshape(*pair.shape, 2)
+    return np.asarray(cv2.dft(whole, dst=whole, flags=cv2.DFT_INVERSE))
 
 
-def response(spectrum_of: np.ndarray, template: np.ndarray, shape: tuple[int, ...], symmetric: bool) -> np.ndarray:
-    """Return the correlation (r, c) of a picture with a template, both packed (`spectra`). For a `halved` picture and a
-    ``shape`` half as large, it is that in the middles of 2 x 2 pixels."""
-    whole = spectrum_of * template if symmetric else cv2.mulSpectrums(spectrum_of, template, 0, conjB=True)
-    return np.asarray(cv2.dft(whole, dst=whole, flags=cv2.DFT_INVERSE | cv2.DFT_SCALE))[: shape[0], : shape[1]]
-
-
-def halved(picture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def halved(spectrum_of: np.ndarray) -> np.ndarray:
     """Return the spectrum of a picture sampled in the middles of 2 x 2 pixels, without higher frequencies."""
-    return packed(_low(scipy.fft.rfft2(picture, shape)) * _middles(shape))
+    return _low(spectrum_of) * _middles(spectrum_of.shape)
 
 
 @lru_cache(maxsize=4)
 def _middles(shape: tuple[int, ...]) -> np.ndarray:
     """Return the factors that shift a spectrum's lower half by half a pixel and scale it to a quarter of the pixels."""
-    cycles = np.add.outer(np.fft.fftfreq(shape[0] // 2) / 2, np.arange(shape[1] // 4 + 1) / shape[1])
-    return np.asarray(np.exp(1j * np.pi * cycles) / 4.0, np.complex64)
+    cycles = np.add.outer(*(np.fft.fftfreq(side // 2) / 2 for side in shape))
+    factors = np.asarray(np.exp(1j * np.pi * cycles) / 4.0, np.complex64)
+    # the highest frequency has no sign, so that half a pixel of it is not real
+    factors[shape[0] // 4], factors[:, shape[1] // 4] = 0.0, 0.0
+    return factors
 
 
 def _low(spectrum_of: np.ndarray) -> np.ndarray:
-    """Return the lower half of a spectrum's frequencies along both axes, ordered as by `scipy.fft.rfft2`."""
-    rows, columns = spectrum_of.shape[0] // 4, spectrum_of.shape[1] // 2 + 1
-    return np.concatenate((spectrum_of[:rows, :columns], spectrum_of[-rows:, :columns]))
+    """Return the lower half of a spectrum's frequencies along both axes."""
+    rows, columns = (np.r_[: side // 4, -(side // 4) : 0] for side in spectrum_of.shape)
+    return spectrum_of[np.ix_(rows, columns)]
 
 
 class Template(NamedTuple):
@@ -199,21 +240,16 @@ class Worth(NamedTuple):
 
 def worths(power: np.ndarray, window_px: int) -> tuple[Worth, ...]:
     """Return each template's `Worth` under noise with this spectrum on `GRID`."""
-    found, crowds, white = [], [], 1.0 / np.sqrt(power)
-    for sizes, seen_by in zip(_sizes(window_px), (white, _low(white)), strict=True):
-        values = sizes * seen_by
+    found, crowds = [], []
+    for cut, squares, beside, weights in _energies(window_px):
+        white = 1.0 / np.sqrt(power[cut])
+        side, pairs = len(white), (white * np.roll(white, 1, axis=0), white * np.roll(white, -1, axis=1))
+        energy, of_rows, of_columns = (squares @ (weights * np.square(white).ravel()).T).T
         # Parseval's theorem: a second moment over space is the energy of a derivative over frequency
-        side, half = values.shape[1], np.full(values.shape[2], 2.0, np.float32)
-        half[[0, -1]] = 1.0
-        energies, turned = values**2 * half, np.roll(values, 1, axis=1)
-        energy = energies.sum(axis=(1, 2))
-        down = 2.0 * (energy - np.einsum("kij,kij,j->k", values, turned, half))
-        along = 2.0 * (np.diff(values, axis=2) ** 2).sum(axis=(1, 2))
-        reach = np.sqrt(3.0 * np.stack((along, down), axis=1) / energy[:, None]) * side / (2.0 * math.pi)
+        spread = [2.0 * (energy - of @ each.ravel()) for of, each in zip(beside, pairs, strict=True)]
+        reach = np.sqrt(3.0 * np.stack(spread[::-1], axis=1) / energy[:, None]) * side / (2.0 * math.pi)
         halves = np.array(SIDES_PX)[np.abs(np.array(SIDES_PX) - reach[..., None]).argmin(axis=2)]
         # the density of maxima is the root of the score's second spectral moments (Adler 1981)
-        of_rows = energies.sum(axis=2) @ np.fft.fftfreq(side) ** 2
-        of_columns = energies.sum(axis=1) @ (np.arange(values.shape[2]) / side) ** 2
         crowds += (np.sqrt(of_rows * of_columns) / energy * side**2).tolist()
         found += [
             Worth(each / GRID**2, (2 * across + 1, 2 * along + 1), 0.0)
@@ -223,27 +259,42 @@ def worths(power: np.ndarray, window_px: int) -> tuple[Worth, ...]:
     return tuple(worth._replace(raised=math.log(most / crowd)) for worth, crowd in zip(found, crowds, strict=True))
 
 
-@lru_cache(maxsize=6)
-def spectra(shape: tuple[int, ...], window_px: int) -> tuple[np.ndarray, ...]:
-    """Return the templates' spectra, `packed`, on a grid that holds them, for an undisturbed damage of height 1. Coarse
-    templates have only the lower half, symmetric ones the real factor of each number."""
-    drawn = zip(bank(window_px), _drawn(shape, window_px), strict=True)
-    return tuple(packed(each if any(template.halves) else each.real * (1 + 1j)) for template, each in drawn)
-
-
-def _drawn(shape: tuple[int, ...], window_px: int) -> list[np.ndarray]:
-    """Return the spectra in the order of `scipy.fft.rfft2`."""
-    kinds = bank(window_px)
-    drawn = (scipy.fft.rfft2(_centred(template.image, shape)) for template in kinds)
-    return [_low(each) if template.coarse else each for template, each in zip(kinds, drawn, strict=True)]
-
-
 @lru_cache(maxsize=3)
-def _sizes(window_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the magnitudes (t, r, c) of the spectra on `GRID`; coarse templates, the last ones, separately."""
-    sizes = list(map(np.abs, _drawn((GRID, GRID), window_px)))
-    fine = sum(not template.coarse for template in bank(window_px))
-    return np.stack(sizes[:fine]), np.stack(sizes[fine:])
+def _energies(window_px: int) -> list[tuple[tuple[np.ndarray, ...], np.ndarray, list[np.ndarray], np.ndarray]]:
+    """Return what `worths` sums over half of the spectra (r, c) on `GRID`, of fine and coarse templates: where these
+    frequencies lie, the squares (t, r c) of the magnitudes, their products (t, r c) with those of the frequencies above
+    and to the right, and the weights (3, r c) of the squares: 1, and the squares of both frequencies."""
+    sizes = [np.abs(scipy.fft.rfft2(_centred(template.image, (GRID, GRID)))) for template in bank(window_px)]
+    found = []
+    for coarse, side in ((False, GRID), (True, GRID // 2)):
+        cut = np.ix_(np.r_[: side // 2, GRID - side // 2 : GRID], np.arange(side // 2 + 1))
+        values = np.stack(
+            [size[cut] for size, each in zip(sizes, bank(window_px), strict=True) if each.coarse == coarse]
+        )
+        half = np.full(side // 2 + 1, 2.0, np.float32)
+        half[[0, -1]] = 1.0
+        beside = [half * values * np.roll(values, 1, axis=1), 2.0 * values * np.roll(values, -1, axis=2)]
+        beside[1][..., -1] = 0.0
+        rows, columns = np.fft.fftfreq(side)[:, None] ** 2, (np.arange(side // 2 + 1) / side) ** 2
+        weights = np.stack([half + 0.0 * rows, half * rows, half * columns + 0.0 * rows]).reshape(3, -1)
+        flat = [np.asarray(each.reshape(len(values), -1), np.float32) for each in (values**2, *beside)]
+        found.append((cut, flat[0], flat[1:], weights.astype(np.float32)))
+    return found
+
+
+@lru_cache(maxsize=6)
+def spectra(shape: tuple[int, ...], window_px: int) -> tuple[tuple[np.ndarray, tuple[int, ...]], ...]:
+    """Return the spectra of pairs of templates (an odd one alone) of undisturbed damage of height 1 on a grid, and
+    their numbers in the `bank`: one complex transform correlates a real picture with both. They are divided by the size
+    of the inverse transform. Coarse templates have only the lower half."""
+    pairs = []
+    for coarse in (False, True):
+        numbers = [number for number, template in enumerate(bank(window_px)) if template.coarse == coarse]
+        for pair in (tuple(numbers[at : at + 2]) for at in range(0, len(numbers), 2)):
+            drawn = [transformed(_centred(bank(window_px)[number].image, shape), shape) for number in pair]
+            both = sum(np.conj(_low(each) if coarse else each) * 1j**at for at, each in enumerate(drawn))
+            pairs.append((np.asarray(both / drawn[0].size * (4 if coarse else 1), np.complex64), pair))
+    return tuple(pairs)
 
 
 @lru_cache(maxsize=3)
