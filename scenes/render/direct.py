@@ -9,7 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from scenes.optics import COARSE, FINE, Quadrilaterals, wave_numbers
-from scenes.render.scene import LitScene
+from scenes.render.scene import LitScene, on_device
 
 FINEST = 2048  # sub-rays where fewer leave an error in a hole: a dark wall beside a strip of what lies behind it
 RAYS_AT_ONCE = 1 << 22  # sub-rays cast at once: 4 million need 0.6 GB
@@ -129,7 +129,7 @@ class DirectLight(NamedTuple):
 def cast(lit: LitScene, slopes: np.ndarray) -> Hits:
     """Cast rays from the lens along ``slopes`` (n, 2) = x/z, y/z."""
     mi, dr = lit.mi, lit.dr
-    x, y = (mi.Float(np.ascontiguousarray(each, np.float32)) for each in slopes.T)
+    x, y = (on_device(mi.Float, each) for each in slopes.T)
     met = lit.meet(mi.Point3f(0.0), dr.normalize(mi.Vector3f(x, y, 1.0)))
     arriving, leg = lit.arriving(met, met.valid)
     albedo, uv = lit.albedo(met), lit.uv(met.place)
@@ -137,9 +137,11 @@ def cast(lit: LitScene, slopes: np.ndarray) -> Hits:
     path_m, amplitude = dr.select(met.valid, met.distance + leg, 0), albedo * arriving
     surface = dr.select(met.valid, mi.Int32(met.surface), -1)
     on_face = dr.gather(mi.Bool, lit.on_face, met.triangle, met.valid)
-    found = range_m, path_m, amplitude, albedo, surface, uv, on_face, met.normal
+    found = range_m, path_m, amplitude, albedo, surface, *uv, on_face, *met.normal
     dr.eval(*found)
-    return Hits(*(each.numpy().T for each in found))
+    # one by one: to interleave them, Dr.Jit would compile a kernel for each number of rays
+    far, path, light, own, which, u, v, face, nx, ny, nz = (each.numpy() for each in found)
+    return Hits(far, path, light, own, which, np.column_stack([u, v]), face, np.column_stack([nx, ny, nz]))
 
 
 @numba.njit(**FAST)

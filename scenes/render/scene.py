@@ -77,6 +77,18 @@ def _point_to_llvm() -> UserError | None:
     return UserError("no LLVM was found that Dr.Jit can use", legal=LEGAL, fix=FIX)
 
 
+ALIGNED_BYTES = 64  # of inputs: Dr.Jit uses memory of NumPy as it is, and compiles a kernel anew for other alignments
+
+
+def on_device(kind: Any, values: np.ndarray) -> Any:
+    """Return values (n,) as a Dr.Jit array of ``kind``, aligned, so that kernels are compiled once for all boards."""
+    dtype = np.dtype(np.uint32 if kind.__name__.startswith("UInt") else np.float32)
+    room = np.empty(values.size + ALIGNED_BYTES // dtype.itemsize, dtype)
+    placed = room[-room.ctypes.data % ALIGNED_BYTES // dtype.itemsize :][: values.size]
+    placed[:] = values
+    return kind(placed)
+
+
 LIFT_M = 1e-5  # of a ray's start from a surface: float32 places hits within 1e-6 m; Mitsuba's default is 0.15 mm
 
 

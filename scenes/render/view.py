@@ -19,7 +19,7 @@ from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR, Region, invert, 
 from scenes.optics import NoiseFreeView, Optics, RenderConfig, footprint_of, wave_numbers
 from scenes.perspectives import seen_region
 from scenes.render.direct import DirectLight, OffFace, comb_step, direct_light
-from scenes.render.scene import LIFT_M, LitScene, lit_scene, load_mitsuba
+from scenes.render.scene import LIFT_M, LitScene, lit_scene, load_mitsuba, on_device
 from scenes.target.mesh import Target
 from scenes.target.truth import face_of
 
@@ -54,7 +54,7 @@ def gather_at_points(
     a rectangle, -1..1 in x and y of this frame: a lit board, which they would seldom meet by chance. First directions
     are drawn mostly from those cells of the hemisphere in which a probe met something."""
     mi, dr = lit.mi, lit.dr
-    columns = [mi.Float(np.ascontiguousarray(each, np.float32)) for each in (*points_m.T, *normals.T)]
+    columns = [on_device(mi.Float, each) for each in (*points_m.T, *normals.T)]
     board = next((k for k, part in enumerate(lit.parts) if part.name == "board"), 0)
 
     def drawn(place: Any, u1: Any, u2: Any) -> tuple[Any, Any, Any, Any]:
@@ -66,13 +66,13 @@ def gather_at_points(
 
     side, cells = CELLS * PROBES, CELLS**2
     places, down, across = (each.ravel() for each in np.indices((len(points_m), side, side)))
-    probe = [mi.Float(((each + 0.5) / side).astype(np.float32)) for each in (across, down)]
-    _, origin, direction, _ = drawn(mi.UInt32(places.astype(np.uint32)), *probe)
+    probe = [on_device(mi.Float, (each + 0.5) / side) for each in (across, down)]
+    _, origin, direction, _ = drawn(on_device(mi.UInt32, places), *probe)
     met = lit.meet(origin, direction).valid.numpy().reshape(-1, CELLS, PROBES, CELLS, PROBES).any(axis=(0, 2, 4))
     chosen = np.flatnonzero(met if met.any() else ~met)
     shares = np.full(cells, 1 - OFTEN)
     shares[chosen] += OFTEN * cells / chosen.size
-    table, density = mi.UInt32(chosen.astype(np.uint32)), mi.Float(shares.astype(np.float32))
+    table, density = on_device(mi.UInt32, chosen), on_device(mi.Float, shares)
 
     count = dr.opaque(mi.UInt32, chosen.size)
 
@@ -92,9 +92,8 @@ def gather_at_points(
 def gather_in_pixels(lit: LitScene, rays: OffFace, work: PathWork, samples: int | np.ndarray) -> np.ndarray:
     """Gather indirect light, the mean over the listed sub-rays of each pixel, with ``samples`` paths, (p,) or one."""
     mi, dr = lit.mi, lit.dr
-    across, down = (mi.Float(np.ascontiguousarray(each, np.float32)) for each in rays.slopes.T)
-    firsts = mi.UInt32((np.cumsum(rays.counts) - rays.counts).astype(np.uint32))
-    counts = mi.UInt32(rays.counts.astype(np.uint32))
+    across, down = (on_device(mi.Float, each) for each in rays.slopes.T)
+    firsts, counts = (on_device(mi.UInt32, each) for each in (np.cumsum(rays.counts) - rays.counts, rays.counts))
 
     def start(place: Any, u1: Any, u2: Any) -> tuple[Any, Any, Any, Any]:
         first, count = (dr.gather(mi.UInt32, a, place) for a in (firsts, counts))
@@ -175,6 +174,7 @@ class _Walk:
         self.dimensions = START_DIMENSIONS + PER_VERTEX * (work.bounces + 1)
         self.table = mi.Float(_sobol(self.dimensions, longest, work.seed))
         self.batch_points, self.aim = dr.opaque(mi.UInt32, longest), None
+        self.stream = dr.opaque(mi.UInt32, work.seed * 1024)
         if bright is not None:
             self.aim = tuple(mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in bright[:3, k])) for k in (0, 1, 3))
 
@@ -182,7 +182,7 @@ class _Walk:
         """Return sums over the paths of lanes: (f + 1, n) complex64, intensity last. ``lanes`` (4, n) uint32: each
         follows ``count`` paths of a place and batch, starting at number ``first``."""
         mi, dr, lines = self.lit.mi, self.lit.dr, len(self.work.frequencies_hz)
-        self.place, self.batch, self.first, self.count = map(mi.UInt32, lanes)
+        self.place, self.batch, self.first, self.count = (on_device(mi.UInt32, each) for each in lanes)
         n, kinds = lanes.shape[1], (mi.UInt32, mi.UInt32, mi.Point3f, mi.Normal3f, mi.Vector3f, mi.Float)
         zeros = [dr.zeros(mi.Float, n) for _ in range(2 * lines + 1)]
         state = (*(dr.zeros(kind, n) for kind in kinds), dr.ones(mi.Float, n), zeros)
@@ -242,7 +242,7 @@ class _Walk:
         number = self.batch * self.batch_points + self.first + sample
         u = dr.gather(mi.Float, self.table, number * self.dimensions + dimension)
         rotation = self.batch + BATCHES * (0 if self.on_surface else self.place)
-        u += mi.sample_tea_float32(rotation, dimension + self.work.seed * 1024, 4)
+        u += mi.sample_tea_float32(rotation, dimension + self.stream, 4)
         return u - dr.floor(u)
 
 
