@@ -130,8 +130,8 @@ def cast(lit: LitScene, slopes: np.ndarray) -> Hits:
     """Cast rays from the lens along ``slopes`` (n, 2) = x/z, y/z."""
     mi, dr = lit.mi, lit.dr
     x, y = (on_device(mi.Float, each) for each in slopes.T)
-    met = lit.meet(mi.Point3f(0.0), dr.normalize(mi.Vector3f(x, y, 1.0)))
-    arriving, leg = lit.arriving(met, met.valid)
+    met = lit.meet(mi.Point3f(0.0), dr.normalize(mi.Vector3f(x, y, 1.0)), coherent=True)
+    arriving, leg = lit.arriving(met, coherent=True)
     albedo, uv = lit.albedo(met), lit.uv(met.place)
     range_m = dr.select(met.valid, met.distance, dr.nan)
     path_m, amplitude = dr.select(met.valid, met.distance + leg, 0), albedo * arriving

@@ -27,7 +27,7 @@ BATCHES = 8
 PATHS_A_LANE = 64  # enough that lanes end together, few enough that a small job fills the machine
 NOISE_LINES = 4  # lines of a long comb from which noise of range is estimated: paths are the same for all lines
 PER_VERTEX = 2  # low-discrepancy dimensions for each vertex: a direction
-START_DIMENSIONS = 2
+START_DIMENSIONS = 3  # the first direction, and which of a pixel's sub-rays
 CELLS, PROBES, OFTEN = 16, 2, 0.9
 """Cells along each side of the square of first directions from the face, probes along each side of a cell, and the
 share of paths that begin in cells where a probe met something; the others begin anywhere."""
@@ -62,13 +62,13 @@ def gather_at_points(
         point, normal = mi.Point3f(x, y, z), mi.Normal3f(nx, ny, nz)
         direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2)))
         seen = lit.lobe(mi.UInt32(board), normal, -dr.normalize(mi.Vector3f(point)), direction)
-        return point, point + LIFT_M * normal, direction, seen
+        return point, normal, direction, seen
 
     side, cells = CELLS * PROBES, CELLS**2
     places, down, across = (each.ravel() for each in np.indices((len(points_m), side, side)))
     probe = [on_device(mi.Float, (each + 0.5) / side) for each in (across, down)]
-    _, origin, direction, _ = drawn(on_device(mi.UInt32, places), *probe)
-    met = lit.meet(origin, direction).valid.numpy().reshape(-1, CELLS, PROBES, CELLS, PROBES).any(axis=(0, 2, 4))
+    point, normal, direction, _ = drawn(on_device(mi.UInt32, places), *probe)
+    met = lit.meet(point + LIFT_M * normal, direction).valid.numpy().reshape(-1, CELLS, PROBES, CELLS, PROBES).any(axis=(0, 2, 4))
     chosen = np.flatnonzero(met if met.any() else ~met)
     shares = np.full(cells, 1 - OFTEN)
     shares[chosen] += OFTEN * cells / chosen.size
@@ -76,32 +76,43 @@ def gather_at_points(
 
     count = dr.opaque(mi.UInt32, chosen.size)
 
-    def start(place: Any, u1: Any, u2: Any) -> tuple[Any, Any, Any, Any]:
+    def start(place: Any, u1: Any, u2: Any, _: Any) -> tuple[Any, ...]:
         often = u1 < OFTEN
         number = dr.select(often, u1 * mi.Float(count) / OFTEN, (u1 - OFTEN) * (cells / (1 - OFTEN)))
         whole = dr.minimum(mi.UInt32(number), dr.select(often, count - 1, mi.UInt32(cells - 1)))
         cell = dr.select(often, dr.gather(mi.UInt32, table, whole, often), whole)
         u1 = (mi.Float(cell % CELLS) + dr.minimum(number - mi.Float(whole), 1.0)) / CELLS
         u2 = (mi.Float(cell // CELLS) + u2) / CELLS
-        point, origin, direction, seen = drawn(place, u1, u2)
-        return point, origin, direction, seen / dr.gather(mi.Float, density, cell)
+        return *drawn(place, u1, u2), 1 / dr.gather(mi.Float, density, cell), mi.Float(0.0)
 
-    return _gather(lit, start, work, np.full(len(points_m), samples), True, bright)
+    none = np.zeros(len(points_m), int)
+    return _gather(lit, start, work, none + samples, none, bright)
 
 
-def gather_in_pixels(lit: LitScene, rays: OffFace, work: PathWork, samples: int | np.ndarray) -> np.ndarray:
-    """Gather indirect light, the mean over the listed sub-rays of each pixel, with ``samples`` paths, (p,) or one."""
+def gather_in_pixels(
+    lit: LitScene, rays: OffFace, work: PathWork, samples: int | np.ndarray, after: int = 0
+) -> np.ndarray:
+    """Gather indirect light, the mean over the listed sub-rays of each pixel, with ``samples`` paths, (p,) or one, that
+    follow the first ``after``. All begin where a sub-ray ends, which is found once."""
     mi, dr = lit.mi, lit.dr
-    across, down = (on_device(mi.Float, each) for each in rays.slopes.T)
+    ray = dr.normalize(mi.Vector3f(*(on_device(mi.Float, each) for each in rays.slopes.T), 1.0))
+    hit = lit.meet(mi.Point3f(0.0), ray, coherent=True)
+    ends = (*hit.place, *hit.normal, hit.distance, lit.albedo(hit))
+    dr.eval(ends, hit.surface)
     firsts, counts = (on_device(mi.UInt32, each) for each in (np.cumsum(rays.counts) - rays.counts, rays.counts))
 
-    def start(place: Any, u1: Any, u2: Any) -> tuple[Any, Any, Any, Any]:
+    def start(place: Any, u1: Any, u2: Any, u3: Any) -> tuple[Any, ...]:
         first, count = (dr.gather(mi.UInt32, a, place) for a in (firsts, counts))
-        which = first + dr.minimum(mi.UInt32(u1 * mi.Float(count)), count - 1)
-        slopes = (dr.gather(mi.Float, each, which) for each in (across, down))
-        return mi.Point3f(0.0), mi.Point3f(0.0), dr.normalize(mi.Vector3f(*slopes, 1.0)), 1.0
+        which = first + dr.minimum(mi.UInt32(u3 * mi.Float(count)), count - 1)
+        x, y, z, nx, ny, nz, distance, albedo = (dr.gather(mi.Float, each, which) for each in ends)
+        point, normal = mi.Point3f(x, y, z), mi.Normal3f(nx, ny, nz)
+        direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2)))
+        surface = dr.gather(mi.UInt32, hit.surface, which)
+        seen = lit.lobe(surface, normal, -mi.Vector3f(point) / distance, direction)
+        return point, normal, direction, seen, albedo, distance
 
-    return _gather(lit, start, work, np.broadcast_to(np.asarray(samples), rays.pixel.shape), False)
+    work = work._replace(bounces=work.bounces - 1)
+    return _gather(lit, start, work, np.broadcast_to(np.asarray(samples), rays.pixel.shape), rays.pixel, None, after)
 
 
 def range_noise_m(batches: np.ndarray, total: np.ndarray, frequencies_hz: tuple[float, ...]) -> np.ndarray:
@@ -163,14 +174,17 @@ def _towards(
 
 
 class _Walk:
-    """Paths that are followed backwards from places. ``start`` (place, u1, u2): point from which the path's length
-    counts, origin, direction and weight of the first ray. ``on_surface``: light that reaches the first hit directly
-    counts (for a start at the lens it is the direct part), and all places share one rotation of the low-discrepancy
-    points (modulo 1). ``longest``: most points in a batch. What differs between boards is data, not constants."""
+    """Paths that are followed backwards from places. ``start`` (place, u1, u2, u3): a point, its normal, the direction
+    of the first ray, two factors of its weight, and the path's length up to there. ``turns`` (places,): places of the
+    same number share one rotation of the low-discrepancy points (modulo 1). ``longest``: most points in a batch. What
+    differs between boards is data, not constants."""
 
-    def __init__(self, lit: LitScene, start: Any, work: PathWork, on_surface: bool, bright: Any, longest: int) -> None:
-        self.lit, self.start, self.work, self.on_surface = lit, start, work, on_surface
+    def __init__(
+        self, lit: LitScene, start: Any, work: PathWork, turns: np.ndarray, bright: Any, longest: int
+    ) -> None:
+        self.lit, self.start, self.work = lit, start, work
         mi, dr = lit.mi, lit.dr
+        self.turns = on_device(mi.UInt32, turns)
         self.dimensions = START_DIMENSIONS + PER_VERTEX * (work.bounces + 1)
         self.table = mi.Float(_sobol(self.dimensions, longest, work.seed))
         self.batch_points, self.aim = dr.opaque(mi.UInt32, longest), None
@@ -179,7 +193,7 @@ class _Walk:
             self.aim = tuple(mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in bright[:3, k])) for k in (0, 1, 3))
 
     def sums(self, lanes: np.ndarray) -> np.ndarray:
-        """Return sums over the paths of lanes: (f + 1, n) complex64, intensity last. ``lanes`` (4, n) uint32: each
+        """Return sums over the paths of lanes: (f + 1, n) complex64, intensity last. ``lanes`` (4, n): each
         follows ``count`` paths of a place and batch, starting at number ``first``."""
         mi, dr, lines = self.lit.mi, self.lit.dr, len(self.work.frequencies_hz)
         self.place, self.batch, self.first, self.count = (on_device(mi.UInt32, each) for each in lanes)
@@ -205,18 +219,16 @@ class _Walk:
     ) -> tuple[Any, ...]:
         """Continue at the next vertex, or begin the next path. ``length``: that up to ``before``, the ray's start."""
         lit, mi, dr, fresh = self.lit, self.lit.mi, self.lit.dr, vertex == 0
-        first = self._uniform(sample, 0), self._uniform(sample, 1)
-        start_point, origin, start_direction, weight = self.start(self.place, *first)
-        before = dr.select(fresh, start_point, before)
-        origin = dr.select(fresh, origin, before + LIFT_M * before_normal)
-        direction = dr.select(fresh, start_direction, direction)
-        length, throughput = dr.select(fresh, 0, length), dr.select(fresh, weight, throughput)
+        point, normal, first, seen, weight, way = self.start(self.place, *(self._uniform(sample, k) for k in range(3)))
+        before, before_normal = dr.select(fresh, point, before), dr.select(fresh, normal, before_normal)
+        direction = dr.select(fresh, first, direction)
+        length, throughput = dr.select(fresh, way, length), dr.select(fresh, seen * weight, throughput)
 
-        hit = lit.meet(origin, direction)
+        hit = lit.meet(before + LIFT_M * before_normal, direction)
         met = hit.valid
         length = length + dr.select(met, dr.norm(hit.place - before), 0)
         throughput = throughput * lit.albedo(hit)
-        arriving, leg = lit.arriving(hit, met if self.on_surface else met & ~fresh)
+        arriving, leg = lit.arriving(hit)
         light = dr.select(met, throughput * arriving, 0)
         totals = _added(totals, light, length + leg, self.work.frequencies_hz)
 
@@ -241,20 +253,20 @@ class _Walk:
         mi, dr = self.lit.mi, self.lit.dr
         number = self.batch * self.batch_points + self.first + sample
         u = dr.gather(mi.Float, self.table, number * self.dimensions + dimension)
-        rotation = self.batch + BATCHES * (0 if self.on_surface else self.place)
+        rotation = self.batch + BATCHES * dr.gather(mi.UInt32, self.turns, self.place)
         u += mi.sample_tea_float32(rotation, dimension + self.stream, 4)
         return u - dr.floor(u)
 
 
 def _gather(
-    lit: LitScene, start: Any, work: PathWork, samples: np.ndarray, on_surface: bool, bright: Any = None
+    lit: LitScene, start: Any, work: PathWork, samples: np.ndarray, turns: np.ndarray, bright: Any, after: int = 0
 ) -> np.ndarray:
-    """Follow ``samples`` (n,) paths from each place (other arguments: `_Walk`). Return the light (BATCHES, f + 1, n)
-    complex64 of each batch, frequency 0 (intensity) last. Phase counts from where the light is gathered. Units as in
-    `NoiseFreeView`, with the place's albedo if the start was the lens. Cosine-weighted directions cancel cos/pi of a
-    Lambertian surface, so each bounce multiplies by its albedo and, if it is glossy, by `LitScene.lobe`."""
-    per_batch = np.maximum(samples // BATCHES, 1)
-    walked = _Walk(lit, start, work, on_surface, bright, int(per_batch.max()))
+    """Follow ``samples`` (n,) paths from each place, after the first ``after`` (other arguments: `_Walk`). Return the
+    light (BATCHES, f + 1, n) complex64 of each batch, frequency 0 (intensity) last. Units as in `NoiseFreeView`, but
+    per unit albedo of a point. Cosine-weighted directions cancel cos/pi of a Lambertian surface, so each bounce
+    multiplies by its albedo and, if it is glossy, by `LitScene.lobe`."""
+    per_batch, earlier = np.maximum(samples // BATCHES, 1), after // BATCHES
+    walked = _Walk(lit, start, work, turns, bright, int(per_batch.max()) + earlier)
     lines = len(work.frequencies_hz)
     # lanes for so many paths a batch at each place; the first lane of each place and batch
     per_pair = np.repeat(-(-per_batch // PATHS_A_LANE), BATCHES)
@@ -262,7 +274,7 @@ def _gather(
     pair = np.repeat(np.arange(len(per_pair)), per_pair)
     place, batch = np.divmod(pair, BATCHES)
     first = (np.arange(len(pair)) - begins[pair]) * PATHS_A_LANE
-    lanes = np.stack([place, batch, first, np.minimum(per_batch[place] - first, PATHS_A_LANE)]).astype(np.uint32)
+    lanes = np.stack([place, batch, earlier + first, np.minimum(per_batch[place] - first, PATHS_A_LANE)])
     at_once = max(FLOATS_AT_ONCE // (2 * lines + 1), 1)
     chunks = (lanes[:, begin : begin + at_once] for begin in range(0, lanes.shape[1], at_once))
     sums = np.concatenate([walked.sums(chunk) for chunk in chunks], axis=1)
@@ -348,8 +360,8 @@ RIM_PX = 3  # rendered surroundings of the board's outline, so that its rim look
 NEAR_PX = 3  # beyond the outline, edges behind the board are finely sampled: the camera's filter mixes these pixels in
 HOLE_RIM_PX = 1
 NARROW = ("through", "blind", "slot", "gouge", "chip")  # damage that may lie between a pixel's corners and its centre
-PILOT_SAMPLES = 128  # paths that show a pixel's noise within a third; fewer miss rare bright paths behind a hole
-PILOT_SEED = 1 << 20  # offset that separates these from the paths that count
+FIRST_SAMPLES = 32  # paths of each pixel inside the outline before it is known how many are needed
+AROUND = 1.0 - np.eye(25)[12].reshape(5, 5)  # pixels whose first paths show how many: 24 times 32 seldom miss bright ones
 
 
 def target_region(target: Target, optics: Optics) -> Region:
@@ -427,10 +439,7 @@ def indirect_light(
     work, rays = PathWork(frequencies, config.bounces, config.seed), direct.off_face
     here, share, within = rays.pixel, rays.share, inside.ravel()[rays.pixel]
     if here.size:
-        many = np.full(here.size, config.rest_samples)
-        if within.any():
-            many[within] = _samples_inside(lit, rays.chosen(within), total[:, here[within]], work, config)
-        light = gather_in_pixels(lit, rays, work, many)
+        light = _light_in_pixels(lit, rays, total[:, here], within, shape, work, config)
         mean = share * light.mean(axis=0, dtype=complex)
         indirect[:, here] += mean
         total[:, here] += mean[:-1]
@@ -438,19 +447,35 @@ def indirect_light(
     return indirect.reshape(-1, *shape), np.sqrt(variance).reshape(shape)
 
 
-def _samples_inside(
-    lit: LitScene, rays: OffFace, total: np.ndarray, work: PathWork, config: RenderConfig
-) -> int | np.ndarray:
-    """Return how many paths reduce a pixel's noise to ``hole_noise_mm``, from a pilot run, which does not count."""
-    if config.hole_samples <= PILOT_SAMPLES:
-        return config.hole_samples
-    pilot = gather_in_pixels(lit, rays, work._replace(seed=work.seed + PILOT_SEED), PILOT_SAMPLES)
-    batches = rays.share * pilot[:, noise_lines(work.frequencies_hz)]
-    total = total + rays.share * pilot.mean(axis=0, dtype=complex)[:-1]
-    noise_m = range_noise_m(batches, total, work.frequencies_hz)
-    wanted = PILOT_SAMPLES * (noise_m / (config.hole_noise_mm * MM)) ** 2
-    doublings = np.ceil(np.log2(np.maximum(wanted / PILOT_SAMPLES, 1)) - 0.5)
-    return np.minimum(PILOT_SAMPLES * 2**doublings, config.hole_samples).astype(np.int64)
+def _light_in_pixels(
+    lit: LitScene,
+    rays: OffFace,
+    total: np.ndarray,
+    within: np.ndarray,
+    shape: tuple[int, ...],
+    work: PathWork,
+    config: RenderConfig,
+) -> np.ndarray:
+    """Return the light (B, f + 1, p) of paths; ``total`` (f, p): all other light. In the pixels ``within`` (p,), the
+    first paths of the pixels around show how many reduce the noise of range to ``hole_noise_mm``. A pixel's own do not
+    decide: those that missed rare bright light would end too soon, and the mean would be biased."""
+    first, share, f = min(FIRST_SAMPLES, config.hole_samples), rays.share, work.frequencies_hz
+    light = gather_in_pixels(lit, rays, work, np.where(within, first, config.rest_samples))
+    mean = light.mean(axis=0, dtype=complex)
+    noise_m = range_noise_m(share * light[:, noise_lines(f)], total + share * mean[:-1], f)
+    spread = (noise_m * np.abs(total[0] / share + mean[0])) ** 2
+    around = np.zeros((*shape, 4))
+    around.reshape(-1, 4)[rays.pixel[within]] = np.stack([within, spread, mean[0].real, mean[0].imag], -1)[within]
+    summed = cv2.filter2D(around, -1, AROUND, borderType=cv2.BORDER_CONSTANT).reshape(-1, 4)[rays.pixel]
+    count, spread, re, im = (summed / np.maximum(summed[:, :1], 1)).T
+    expected_m = np.sqrt(spread) / np.maximum(np.abs(total[0] / share + re + 1j * im), 1e-30)
+    wanted = (np.where(count > 0, expected_m, noise_m) / (config.hole_noise_mm * MM)) ** 2
+    doublings = np.ceil(np.log2(np.clip(wanted, 1, config.hole_samples)) - 0.5)
+    many = np.where(within, np.clip(first * 2**doublings, first, config.hole_samples), 0).astype(np.int64)
+    if (more := many > first).any():
+        further = gather_in_pixels(lit, rays.chosen(more), work, (many - first)[more], after=first)
+        light[..., more] += (1 - first / many[more]) * (further - light[..., more])
+    return light
 
 
 def _at_holes(target: Target, optics: Optics, slopes: np.ndarray) -> np.ndarray:
