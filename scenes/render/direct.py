@@ -12,7 +12,9 @@ from scenes.optics import COARSE, FINE, Quadrilaterals, wave_numbers
 from scenes.render.scene import LitScene, on_device
 
 FINEST = 2048  # sub-rays where fewer leave an error in a hole: a dark wall beside a strip of what lies behind it
-RAYS_AT_ONCE = 1 << 22  # sub-rays cast at once: 4 million need 0.6 GB
+RAYS_AT_ONCE = 1 << 22  # sub-rays cast at once
+A_LANE = 16  # sub-rays of one lane: a divisor of all numbers of sub-rays, at most 32 bits
+KEPT = 32  # at least so many of a pixel's sub-rays off the face, or all, are starts of paths
 KINK_M, BENT_M = 2e-5, 2e-6
 """If a pixel's corners lie farther than the first off the plane at its centre, there is an edge in it, such as that of
 a strip of tape. Up to the second, its light follows from that plane without casting sub-rays."""
@@ -33,51 +35,24 @@ def comb_step(frequencies_hz: tuple[float, ...]) -> float | None:
     return float(steps.mean()) if even else None
 
 
-def phasor_sums(amplitude: np.ndarray, path_m: np.ndarray, frequencies_hz: tuple[float, ...]) -> np.ndarray:
-    """Return the mean over sub-rays of a exp(i 2 pi f L / c), (f, n) complex128, from amplitudes and paths (n, m). For
-    a comb, each phasor is the previous one times that of the spacing; rounding grows to 1e-14 over 100 lines."""
-    waves = wave_numbers(frequencies_hz)
-    out = np.empty((len(waves), len(path_m)), np.complex128)
-    amplitude, path_m = np.ascontiguousarray(amplitude), np.ascontiguousarray(path_m)
-    step = comb_step(frequencies_hz)
-    if step is None:
-        _sum_list(amplitude, path_m, waves, out)
+def added(totals: list[Any], light: Any, length: Any, frequencies_hz: Frequencies) -> list[Any]:
+    """Add light after a path's length to real and imaginary sums by frequency, intensity last; for a comb, each phasor
+    is the previous one times that of the spacing."""
+    import drjit as dr
+
+    out, waves, step_hz = [], wave_numbers(frequencies_hz), comb_step(frequencies_hz)
+    if step_hz is None:
+        for number in waves:
+            sine, cosine = dr.sincos(float(number) * length)
+            out += [light * cosine, light * sine]
     else:
-        _sum_comb(amplitude, path_m, float(waves[0]), float(wave_numbers((step,))[0]), out)
-    return out
-
-
-@numba.njit(**FAST)
-def _sum_list(amplitude: np.ndarray, path_m: np.ndarray, waves: np.ndarray, out: np.ndarray) -> None:
-    n, m = path_m.shape
-    for i in range(n):
-        for k in range(waves.size):
-            re = im = 0.0
-            for j in range(m):
-                phase = waves[k] * path_m[i, j]
-                re += amplitude[i, j] * np.cos(phase)
-                im += amplitude[i, j] * np.sin(phase)
-            out[k, i] = complex(re / m, im / m)
-
-
-@numba.njit(**FAST)
-def _sum_comb(amplitude: np.ndarray, path_m: np.ndarray, first: float, step: float, out: np.ndarray) -> None:
-    n, m = path_m.shape
-    re, im, cosine, sine = np.empty(m), np.empty(m), np.empty(m), np.empty(m)
-    for i in range(n):
-        for j in range(m):
-            re[j] = amplitude[i, j] * np.cos(first * path_m[i, j])
-            im[j] = amplitude[i, j] * np.sin(first * path_m[i, j])
-            cosine[j], sine[j] = np.cos(step * path_m[i, j]), np.sin(step * path_m[i, j])
-        for k in range(out.shape[0]):
-            sum_re = sum_im = 0.0
-            for j in range(m):
-                sum_re += re[j]
-                sum_im += im[j]
-                turned = re[j] * cosine[j] - im[j] * sine[j]
-                im[j] = re[j] * sine[j] + im[j] * cosine[j]
-                re[j] = turned
-            out[k, i] = complex(sum_re / m, sum_im / m)
+        sine, cosine = dr.sincos(float(waves[0]) * length)
+        turn_sine, turn_cosine = dr.sincos(float(wave_numbers((step_hz,))[0]) * length)
+        re, im = light * cosine, light * sine
+        for _ in waves:
+            out += [re, im]
+            re, im = re * turn_cosine - im * turn_sine, re * turn_sine + im * turn_cosine
+    return [total + part for total, part in zip(totals, [*out, light], strict=True)]
 
 
 class Hits(NamedTuple):
@@ -96,7 +71,8 @@ class Hits(NamedTuple):
 
 class OffFace(NamedTuple):
     """Sub-rays that met something other than the undamaged face. ``pixel`` (p,): flat indices of pixels that have any,
-    ``counts`` (p,): their number, ``share`` (p,): of the footprint; ``slopes`` (sum of counts, 2) float32, by pixel."""
+    ``share`` (p,): theirs of the footprint, ``counts`` (p,): the number of those that stand for all (every second if
+    there are twice KEPT, and so on), ``slopes`` (sum of counts, 2) float32: these, by pixel."""
 
     pixel: np.ndarray
     counts: np.ndarray
@@ -144,15 +120,84 @@ def cast(lit: LitScene, slopes: np.ndarray) -> Hits:
     return Hits(far, path, light, own, which, np.column_stack([u, v]), face, np.column_stack([nx, ny, nz]))
 
 
+class Summed(NamedTuple):
+    """Sums over the sub-rays of n footprints: phasors (f, n), intensity and coverage (n,) as in `DirectLight`; of those
+    on the face ``face`` (f + 1, n) and ``face_range_m`` (n,); which of them (n, m) met something else; and
+    ``error_m`` (n,), the approximate error of range."""
+
+    phasor: np.ndarray
+    intensity: np.ndarray
+    coverage: np.ndarray
+    face: np.ndarray
+    face_range_m: np.ndarray
+    off: np.ndarray
+    error_m: np.ndarray
+
+
+def summed(
+    lit: LitScene, axes: np.ndarray, weights: np.ndarray, surface: np.ndarray, about_m: np.ndarray, f: Frequencies
+) -> Summed:
+    """Cast the sub-rays ``axes`` (n, 3, k) @ ``weights`` (k, m) of footprints and sum their light. ``surface`` (n,) and
+    ``about_m`` (n,): surface and path of the central ray. A lane casts A_LANE of them."""
+    mi, dr, (n, _, k), m, lines = lit.mi, lit.dr, axes.shape, weights.shape[1], len(f)
+    parts = m // A_LANE
+    columns = [on_device(mi.Float, each) for each in axes.reshape(n, -1).T]
+    table, own = [on_device(mi.Float, each) for each in weights], on_device(mi.UInt32, surface)
+    lanes = [on_device(mi.UInt32, each) for each in np.divmod(np.arange(n * parts), parts)]
+    middle, begin = on_device(mi.Float, np.repeat(about_m, parts)), lanes[1] * A_LANE
+    axis = [dr.gather(mi.Float, column, lanes[0]) for column in columns]
+    surface_there = dr.gather(mi.UInt32, own, lanes[0])
+
+    def step(j: Any, off: Any, light: list[Any], face: list[Any], others: list[Any]) -> tuple[Any, ...]:
+        weight = [dr.gather(mi.Float, row, begin + j) for row in table]
+        ray = mi.Vector3f(*(sum(axis[c * k + i] * weight[i] for i in range(k)) for c in range(3)))
+        met = lit.meet(mi.Point3f(0.0), dr.normalize(ray), coherent=True)
+        arriving, leg = lit.arriving(met, coherent=True)
+        albedo = lit.albedo(met)
+        amplitude, longer = albedo * arriving, dr.select(met.valid, met.distance + leg - middle, 0)
+        on_face = dr.gather(mi.Bool, lit.on_face, met.triangle, met.valid)
+        light = added(light, amplitude, longer + middle, f)
+        face = added(face, dr.select(on_face, albedo, 0), met.distance, f)
+        count, same, far, first, second, most = others
+        same = same + dr.select(dr.select(met.valid, met.surface, mi.UInt32(0xFFFFFFFF)) == surface_there, 1.0, 0.0)
+        far, count = far + dr.select(on_face, met.distance, 0), count + dr.select(on_face, 1.0, 0.0)
+        first, second = first + amplitude * longer, second + amplitude * dr.square(longer)
+        off = off | dr.select(met.valid & ~on_face, mi.UInt32(1) << j, 0)
+        return j + 1, off, light, face, [count, same, far, first, second, dr.maximum(most, amplitude)]
+
+    size = n * parts
+    zeros = [[dr.zeros(mi.Float, size) for _ in range(number)] for number in (2 * lines + 1, 2 * lines + 1, 6)]
+    state = (dr.zeros(mi.UInt32, size), dr.zeros(mi.UInt32, size), *zeros)
+    _, off, *found = dr.while_loop(state, lambda j, *_: j < A_LANE, step, label="footprints")
+    dr.eval(off, *found)
+    light, face, others = (np.stack([e.numpy() for e in each]).reshape(-1, n, parts) for each in found)
+    count, same, far, first, second, _ = others.sum(axis=2, dtype=float)
+    light, face = (each.sum(axis=2, dtype=float) for each in (light, face))
+    strongest, total = np.maximum(others[5].max(axis=1), 1e-30), np.maximum(light[-1], 1e-30)
+    # an edge is misplaced by one or two of m sub-rays; holes of 1/16 to 1 in before a backing showed this error
+    spread = np.sqrt(np.maximum(second / total - (first / total) ** 2, 0.0))
+    return Summed(
+        phasor=(light[:-1:2] + 1j * light[1::2]) / m,
+        intensity=light[-1] / m,
+        coverage=same / m,
+        face=np.concatenate([face[:-1:2] + 1j * face[1::2], face[-1:]]) / m,
+        face_range_m=far / np.maximum(count, 1),
+        off=(off.numpy()[:, None] >> np.arange(A_LANE) & 1).astype(bool).reshape(n, m),
+        error_m=1.5 * spread / (m * np.sqrt(np.maximum(light[-1] / m / strongest, 1 / m))),
+    )
+
+
 @numba.njit(**FAST)
-def _even_moments(  # type: ignore[no-untyped-def]
-    slopes, centre, normal, emitter, albedo, texture, uv_of, to_light, to_face
+def _plane_light(  # type: ignore[no-untyped-def]
+    axes, weights, centre, normal, emitter, albedo, texture, uv_of, waves, light, face
 ):
-    """Sum a pixel's light over sub-rays ``slopes`` (n, m, 2) on the plane of its ``centre`` and ``normal`` (n, 3). The
-    moments (4, n) have orders 0 to 3: of amplitude (1 at the centre, times the albedo) about the centre's path, and of
-    the albedo about its range. ``albedo`` (n,): negative where ``texture`` gives it."""
+    """Sum a pixel's light over the sub-rays ``axes`` (n, 3, k) @ ``weights`` (k, m) on the plane of its ``centre`` and
+    ``normal`` (n, 3): ``light`` (f + 1, n), whose amplitude is the albedo at the centre, and ``face``, the albedo at
+    its range; frequency 0 last. ``albedo`` (n,): negative where ``texture`` gives it. Phases about the centre's are a
+    series of moments, 1e-6 off at 0.07 rad."""
     rows, columns = texture.shape
-    n, m, _ = slopes.shape
+    n, _, terms = axes.shape
+    lit, own = np.empty(4), np.empty(4)
     for i in range(n):
         x0, y0, z0 = centre[i]
         nx, ny, nz = normal[i]
@@ -161,12 +206,20 @@ def _even_moments(  # type: ignore[no-untyped-def]
         leg0 = np.sqrt(ex * ex + ey * ey + ez * ez)
         range0 = np.sqrt(x0 * x0 + y0 * y0 + z0 * z0)
         facing0 = (nx * ex + ny * ey + nz * ez) / leg0**3
-        for j in range(m):
-            z = height / (nx * slopes[i, j, 0] + ny * slopes[i, j, 1] + nz)
-            x, y = slopes[i, j, 0] * z, slopes[i, j, 1] * z
+        lit[:] = 0.0
+        own[:] = 0.0
+        for j in range(weights.shape[1]):
+            x = y = z = 0.0
+            for k in range(terms):
+                x += axes[i, 0, k] * weights[k, j]
+                y += axes[i, 1, k] * weights[k, j]
+                z += axes[i, 2, k] * weights[k, j]
+            scale = height / (nx * x + ny * y + nz * z)
+            x, y, z = x * scale, y * scale, z * scale
             range_m = np.sqrt(x * x + y * y + z * z)
             dx, dy, dz = emitter[0] - x, emitter[1] - y, emitter[2] - z
-            leg = np.sqrt(dx * dx + dy * dy + dz * dz)
+            squared = dx * dx + dy * dy + dz * dz
+            leg = np.sqrt(squared)
             a = albedo[i]
             if a < 0.0:
                 u = uv_of[0, 0] * x + uv_of[0, 1] * y + uv_of[0, 2] * z + uv_of[0, 3]
@@ -177,21 +230,21 @@ def _even_moments(  # type: ignore[no-untyped-def]
                 p, q = across - c, down - r
                 above = (1.0 - p) * texture[r, c] + p * texture[r, c + 1]
                 a = (1.0 - q) * above + q * ((1.0 - p) * texture[r + 1, c] + p * texture[r + 1, c + 1])
-            light = a * (nx * dx + ny * dy + nz * dz) / leg**3 / facing0 if facing0 > 0.0 else 0.0
+            amplitude = a * (nx * dx + ny * dy + nz * dz) / (squared * leg * facing0) if facing0 > 0.0 else 0.0
             longer, farther = range_m + leg - range0 - leg0, range_m - range0
             for order in range(4):
-                to_light[order, i] += light / m
-                to_face[order, i] += a / m
-                light *= longer
+                lit[order] += amplitude
+                own[order] += a
+                amplitude *= longer
                 a *= farther
-
-
-def _of_moments(moments: np.ndarray, about_m: np.ndarray, frequencies_hz: tuple[float, ...]) -> np.ndarray:
-    """Return phasors (f, n) from moments (4, n) of lengths about ``about_m`` (n,): a series, 1e-6 off at 0.07 rad."""
-    waves = wave_numbers(frequencies_hz)[:, None]
-    zeroth, first, second, third = moments
-    series = zeroth - waves**2 * second / 2 + 1j * (waves * first - waves**3 * third / 6)
-    return np.asarray(series * np.exp(1j * waves * about_m))
+        m = weights.shape[1]
+        for k in range(waves.size):
+            w = waves[k]
+            series = complex(lit[0] - w * w * lit[2] / 2, w * lit[1] - w**3 * lit[3] / 6)
+            light[k, i] = series * np.exp(1j * w * (range0 + leg0)) / m
+            series = complex(own[0] - w * w * own[2] / 2, w * own[1] - w**3 * own[3] / 6)
+            face[k, i] = series * np.exp(1j * w * range0) / m
+        light[waves.size, i], face[waves.size, i] = lit[0] / m, own[0] / m
 
 
 class _Sums:
@@ -210,50 +263,41 @@ class _Sums:
 
     def add_plane(self, here: np.ndarray) -> None:
         """Add the light of pixels that see a single plane, from the hits of their centres."""
-        lit, central, frequencies = self.lit, self.central, self.frequencies_hz
-        rays, range_m = self.footprint.coarse(self.rows[here], self.cols[here]), central.range_m[here].astype(float)
+        lit, central, waves = self.lit, self.central, wave_numbers(self.frequencies_hz)
+        axes, weights = self.footprint.axes(self.rows[here], self.cols[here]), self.footprint.grid()
         ray = np.column_stack([self.slopes[here], np.ones(len(here))])
+        range_m, albedo = (each[here].astype(float) for each in (central.range_m, central.albedo))
         centre = ray * (range_m / np.linalg.norm(ray, axis=1))[:, None]
-        albedo, to_light, to_face = central.albedo[here].astype(float), *np.zeros((2, 4, len(here)))
+        light, face = np.empty((2, len(waves) + 1, len(here)), complex)
         plain = np.where(central.surface[here] == lit.textured, -1.0, albedo)
         texture = np.zeros((2, 2), np.float32) if lit.texture is None else lit.parts[lit.textured].texture_850
         normal = central.normal[here].astype(float)
-        _even_moments(rays, centre, normal, lit.emitter_m, plain, texture, lit.uv_of, to_light, to_face)
-        to_light *= np.divide(central.amplitude[here], albedo, out=np.zeros(len(here)), where=albedo > 0)
-        self.phasor[:, here] = _of_moments(to_light, central.path_m[here].astype(float), frequencies)
-        self.intensity[here] = to_light[0]
+        _plane_light(axes, weights, centre, normal, lit.emitter_m, plain, texture, lit.uv_of, waves, light, face)
+        light *= np.divide(central.amplitude[here], albedo, out=np.zeros(len(here)), where=albedo > 0)
+        self.phasor[:, here], self.intensity[here] = light[:-1], light[-1].real
         on = central.on_face[here]
-        self.face[:-1, here[on]] = _of_moments(to_face[:, on], range_m[on], frequencies)
-        self.face[-1, here[on]], self.face_range_m[here[on]] = to_face[0, on], range_m[on]
-        self._keep_off_face(here[~on], np.ones((int((~on).sum()), rays.shape[1]), bool), rays[~on])
+        self.face[:, here[on]], self.face_range_m[here[on]] = face[:, on], range_m[on]
+        self._keep_off_face(here[~on], np.ones((int((~on).sum()), weights.shape[1]), bool), axes[~on], weights)
 
-    def add_rays(self, here: np.ndarray, rays: np.ndarray, again: np.ndarray | None = None) -> np.ndarray:
-        """Add the light of sub-rays (n, m, 2) of pixels. Return those of ``again`` (h w,) that need finer sampling."""
-        m = rays.shape[1]
-        hits = cast(self.lit, rays.reshape(-1, 2))
-        range_m, path_m, amplitude, albedo, surface = (each.reshape(-1, m) for each in hits[:5])
-        on_face = hits.on_face.reshape(-1, m)
-        self.phasor[:, here] = phasor_sums(amplitude, path_m, self.frequencies_hz)
-        self.intensity[here] = amplitude.mean(axis=1, dtype=float)
-        self.coverage[here] = (surface == self.central.surface[here, None]).mean(axis=1)
-        some = on_face.any(axis=1)
-        chosen = here[some]
-        lit_albedo, to_face = (np.where(on_face[some], each[some], 0.0) for each in (albedo, range_m))
-        self.face[:, here], self.face_range_m[here] = 0, 0
-        self.face[:-1, chosen] = phasor_sums(lit_albedo, to_face, self.frequencies_hz)
-        self.face[-1, chosen] = lit_albedo.mean(axis=1)
-        self.face_range_m[chosen] = to_face.sum(axis=1) / on_face[some].sum(axis=1)
-        unsure = np.zeros(len(here), bool)
-        if again is not None:
-            unsure = again[here]
-            unsure[unsure] = _error_m(amplitude[unsure], path_m[unsure]) > UNSURE_M
-        self._keep_off_face(here[~unsure], (~on_face & (surface >= 0))[~unsure], rays[~unsure])
+    def add_rays(self, here: np.ndarray, weights: np.ndarray, again: np.ndarray | None = None) -> np.ndarray:
+        """Add the light of sub-rays of pixels. Return those of ``again`` (h w,) that need finer sampling."""
+        axes, central = self.footprint.axes(self.rows[here], self.cols[here]), self.central
+        found = summed(self.lit, axes, weights, central.surface[here], central.path_m[here], self.frequencies_hz)
+        self.phasor[:, here], self.intensity[here], self.coverage[here] = found[:3]
+        self.face[:, here], self.face_range_m[here] = found.face, found.face_range_m
+        unsure = np.zeros(len(here), bool) if again is None else again[here] & (found.error_m > UNSURE_M)
+        self._keep_off_face(here[~unsure], found.off[~unsure], axes[~unsure], weights)
         return here[unsure]
 
-    def _keep_off_face(self, here: np.ndarray, off: np.ndarray, rays: np.ndarray) -> None:
+    def _keep_off_face(self, here: np.ndarray, off: np.ndarray, axes: np.ndarray, weights: np.ndarray) -> None:
         counts, (row, column) = off.sum(axis=1), np.nonzero(off)
-        some, kept = counts > 0, np.stack([rays[row, column, k].astype(np.float32) for k in (0, 1)], axis=1)
-        self.off_face.append(OffFace(here[some], counts[some], counts[some] / off.shape[1], kept))
+        step = np.maximum(counts // KEPT, 1)
+        # each pixel's sub-rays off the face are numbered from 0
+        kept = (np.arange(len(row)) - (np.cumsum(counts) - counts)[row]) % step[row] == 0
+        row, column, some = row[kept], column[kept], counts > 0
+        rays = np.einsum("nck,kn->nc", axes[row], weights[:, column])
+        slopes = (rays[:, :2] / rays[:, 2:]).astype(np.float32)
+        self.off_face.append(OffFace(here[some], -(-counts // step)[some], counts[some] / off.shape[1], slopes))
 
 
 def direct_light(
@@ -269,7 +313,7 @@ def direct_light(
     sub-rays: a few on a curved surface, many where the footprint meets an edge or the edge of a shadow and in the
     pixels ``closely`` (h, w), where more follow if that leaves an error; a few at edges in the pixels ``roughly``."""
     shape, sums = slopes.shape[:2], _Sums(lit, slopes, footprint, frequencies_hz)
-    central, rows, cols = sums.central, sums.rows, sums.cols
+    central = sums.central
     bend_m, edge = _corners(lit, footprint.corner, slopes, central)
     edge |= False if closely is None else closely
     reach = 2 * footprint.reach_px + 1
@@ -278,12 +322,11 @@ def direct_light(
     rest, bent = ~fine.ravel(), ((bend_m > BENT_M) | edge).ravel()
     sums.add_plane(np.flatnonzero(rest & ~bent & (central.surface >= 0)))
     for here in _chunks(np.flatnonzero(rest & bent), COARSE**2):
-        sums.add_rays(here, footprint.coarse(rows[here], cols[here]))
+        sums.add_rays(here, footprint.grid())
     again = None if closely is None else closely.ravel()
-    edges = _chunks(np.flatnonzero(fine), FINE)
-    unsure = [sums.add_rays(here, footprint.fine(rows[here], cols[here]), again) for here in edges]
+    unsure = [sums.add_rays(here, footprint.lattice(), again) for here in _chunks(np.flatnonzero(fine), FINE)]
     for here in _chunks(np.concatenate([np.zeros(0, int), *unsure]), FINEST):
-        sums.add_rays(here, footprint.fine(rows[here], cols[here], FINEST))
+        sums.add_rays(here, footprint.lattice(FINEST))
     return DirectLight(
         phasor=sums.phasor.reshape(-1, *shape),
         intensity=sums.intensity.reshape(shape),
@@ -324,14 +367,3 @@ def _corners(lit: LitScene, corner: np.ndarray, slopes: np.ndarray, central: Hit
         edge |= other != surface
         most, least = np.maximum(most, light), np.minimum(least, light)
     return bend_m, edge | (bend_m > KINK_M) | (most - least > UNEVEN * most)
-
-
-def _error_m(amplitude: np.ndarray, path_m: np.ndarray) -> np.ndarray:
-    """Return the approximate error of range (n,) that m sub-rays (n, m) of a pixel leave: an edge is misplaced by one
-    or two of m sub-rays. Holes of 1/16 to 1 in before a backing showed 3 spread / (2 m sqrt(lit share))."""
-    light = np.maximum(amplitude.sum(axis=1), 1e-30)
-    mean = (amplitude * path_m).sum(axis=1) / light
-    spread = np.sqrt((amplitude * (path_m - mean[:, None]) ** 2).sum(axis=1) / light)
-    strongest = np.maximum(amplitude.max(axis=1), 1e-30)
-    lit_share = np.maximum(amplitude.mean(axis=1) / strongest, 1 / amplitude.shape[1])
-    return np.asarray(1.5 * spread / (amplitude.shape[1] * np.sqrt(lit_share)))

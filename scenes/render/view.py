@@ -16,9 +16,9 @@ from scipy import ndimage, sparse
 from scipy.stats import qmc
 
 from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR, Region, invert, rotate_vectors, transform_points
-from scenes.optics import NoiseFreeView, Optics, RenderConfig, footprint_of, wave_numbers
+from scenes.optics import NoiseFreeView, Optics, RenderConfig, footprint_of
 from scenes.perspectives import seen_region
-from scenes.render.direct import DirectLight, OffFace, comb_step, direct_light
+from scenes.render.direct import DirectLight, OffFace, added, direct_light
 from scenes.render.scene import LIFT_M, LitScene, lit_scene, load_mitsuba, on_device
 from scenes.target.mesh import Target
 from scenes.target.truth import face_of
@@ -68,7 +68,12 @@ def gather_at_points(
     places, down, across = (each.ravel() for each in np.indices((len(points_m), side, side)))
     probe = [on_device(mi.Float, (each + 0.5) / side) for each in (across, down)]
     point, normal, direction, _ = drawn(on_device(mi.UInt32, places), *probe)
-    met = lit.meet(point + LIFT_M * normal, direction).valid.numpy().reshape(-1, CELLS, PROBES, CELLS, PROBES).any(axis=(0, 2, 4))
+    met = (
+        lit.meet(point + LIFT_M * normal, direction)
+        .valid.numpy()
+        .reshape(-1, CELLS, PROBES, CELLS, PROBES)
+        .any(axis=(0, 2, 4))
+    )
     chosen = np.flatnonzero(met if met.any() else ~met)
     shares = np.full(cells, 1 - OFTEN)
     shares[chosen] += OFTEN * cells / chosen.size
@@ -179,9 +184,7 @@ class _Walk:
     same number share one rotation of the low-discrepancy points (modulo 1). ``longest``: most points in a batch. What
     differs between boards is data, not constants."""
 
-    def __init__(
-        self, lit: LitScene, start: Any, work: PathWork, turns: np.ndarray, bright: Any, longest: int
-    ) -> None:
+    def __init__(self, lit: LitScene, start: Any, work: PathWork, turns: np.ndarray, bright: Any, longest: int) -> None:
         self.lit, self.start, self.work = lit, start, work
         mi, dr = lit.mi, lit.dr
         self.turns = on_device(mi.UInt32, turns)
@@ -230,7 +233,7 @@ class _Walk:
         throughput = throughput * lit.albedo(hit)
         arriving, leg = lit.arriving(hit)
         light = dr.select(met, throughput * arriving, 0)
-        totals = _added(totals, light, length + leg, self.work.frequencies_hz)
+        totals = added(totals, light, length + leg, self.work.frequencies_hz)
 
         more = met & (vertex < self.work.bounces) & (throughput > 0)
         dimension = START_DIMENSIONS + PER_VERTEX * vertex
@@ -280,25 +283,6 @@ def _gather(
     sums = np.concatenate([walked.sums(chunk) for chunk in chunks], axis=1)
     by_batch = np.add.reduceat(sums, begins, axis=1).reshape(lines + 1, len(samples), BATCHES) / per_batch[:, None]
     return np.ascontiguousarray(np.moveaxis(by_batch, 2, 0), np.complex64)
-
-
-def _added(totals: list[Any], light: Any, length: Any, frequencies_hz: tuple[float, ...]) -> list[Any]:
-    """Add the light of a path to real and imaginary sums by frequency, intensity last; for a comb by recurrence."""
-    import drjit as dr
-
-    out, waves, step_hz = [], wave_numbers(frequencies_hz), comb_step(frequencies_hz)
-    if step_hz is None:
-        for number in waves:
-            sine, cosine = dr.sincos(float(number) * length)
-            out += [light * cosine, light * sine]
-    else:
-        sine, cosine = dr.sincos(float(waves[0]) * length)
-        turn_sine, turn_cosine = dr.sincos(float(wave_numbers((step_hz,))[0]) * length)
-        re, im = light * cosine, light * sine
-        for _ in waves:
-            out += [re, im]
-            re, im = re * turn_cosine - im * turn_sine, re * turn_sine + im * turn_cosine
-    return [total + part for total, part in zip(totals, [*out, light], strict=True)]
 
 
 def face_triangles(target: Target) -> list[np.ndarray]:
@@ -361,7 +345,9 @@ NEAR_PX = 3  # beyond the outline, edges behind the board are finely sampled: th
 HOLE_RIM_PX = 1
 NARROW = ("through", "blind", "slot", "gouge", "chip")  # damage that may lie between a pixel's corners and its centre
 FIRST_SAMPLES = 32  # paths of each pixel inside the outline before it is known how many are needed
-AROUND = 1.0 - np.eye(25)[12].reshape(5, 5)  # pixels whose first paths show how many: 24 times 32 seldom miss bright ones
+AROUND = 1.0 - np.eye(25)[12].reshape(
+    5, 5
+)  # pixels whose first paths show how many: 768 seldom miss bright ones
 
 
 def target_region(target: Target, optics: Optics) -> Region:
