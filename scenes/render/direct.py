@@ -310,12 +310,14 @@ def direct_light(
 ) -> DirectLight:
     """Return the direct light of every pixel of a region with central rays ``slopes`` (h, w, 2). If the rays to a
     pixel's centre and corners meet one evenly lit plane, its light follows from these. Other pixels are sampled by
-    sub-rays: a few on a curved surface, many where the footprint meets an edge or the edge of a shadow and in the
-    pixels ``closely`` (h, w), where more follow if that leaves an error; a few at edges in the pixels ``roughly``."""
+    sub-rays: a few on a curved surface, many where the footprint meets an edge or the edge of a shadow, in the pixels
+    that are 2 in ``closely`` (h, w), and in those that are 1 beside such edges; where that is not 0, more follow if an
+    error is left. There are a few at edges in the pixels ``roughly``."""
     shape, sums = slopes.shape[:2], _Sums(lit, slopes, footprint, frequencies_hz)
     central = sums.central
     bend_m, edge = _corners(lit, footprint.corner, slopes, central)
-    edge |= False if closely is None else closely
+    if closely is not None:
+        edge |= (closely > 1) | ((closely > 0) & ndimage.binary_dilation(edge, np.ones((3, 3), bool)))
     reach = 2 * footprint.reach_px + 1
     edge = ndimage.binary_dilation(edge, np.ones((reach, reach), bool))
     fine = edge if roughly is None else edge & ~roughly
@@ -323,7 +325,7 @@ def direct_light(
     sums.add_plane(np.flatnonzero(rest & ~bent & (central.surface >= 0)))
     for here in _chunks(np.flatnonzero(rest & bent), COARSE**2):
         sums.add_rays(here, footprint.grid())
-    again = None if closely is None else closely.ravel()
+    again = None if closely is None else closely.ravel() > 0
     unsure = [sums.add_rays(here, footprint.lattice(), again) for here in _chunks(np.flatnonzero(fine), FINE)]
     for here in _chunks(np.concatenate([np.zeros(0, int), *unsure]), FINEST):
         sums.add_rays(here, footprint.lattice(FINEST))

@@ -11,14 +11,15 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import cv2
+import numba
 import numpy as np
-from scipy import ndimage, sparse
+from scipy import ndimage
 from scipy.stats import qmc
 
 from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR, Region, invert, rotate_vectors, transform_points
 from scenes.optics import NoiseFreeView, Optics, RenderConfig, footprint_of
 from scenes.perspectives import seen_region
-from scenes.render.direct import DirectLight, OffFace, added, direct_light
+from scenes.render.direct import FAST, DirectLight, OffFace, added, direct_light
 from scenes.render.scene import LIFT_M, LitScene, lit_scene, load_mitsuba, on_device
 from scenes.target.mesh import Target
 from scenes.target.truth import face_of
@@ -131,11 +132,16 @@ def range_noise_m(batches: np.ndarray, total: np.ndarray, frequencies_hz: tuple[
 
 def range_change_m(change: np.ndarray, total: np.ndarray, frequencies_hz: tuple[float, ...]) -> np.ndarray:
     """Return the change of range (..., n) by a small change (..., f, n) of phasors ``total`` (f, n); 0 without light.
-    Phases turn by Im(dH / H) and are combined with the least-squares weights c f_k / (4 pi sum f^2)."""
-    f = np.array(frequencies_hz)[:, None]
-    weights = SPEED_OF_LIGHT_AIR * f / (4 * np.pi * (f**2).sum())
+    Phases turn by Im(dH / H) and are combined with the `range_weights`."""
+    weights = range_weights(frequencies_hz)[:, None]
     by_light = np.divide(weights, total, out=np.zeros(total.shape, complex), where=np.abs(total) > 0)
     return np.asarray((change.real * by_light.imag + change.imag * by_light.real).sum(axis=-2))
+
+
+def range_weights(frequencies_hz: tuple[float, ...]) -> np.ndarray:
+    """Return the least-squares weights (f,) of phases in a range: c f_k / (4 pi sum f^2), in metres per radian."""
+    f = np.array(frequencies_hz)
+    return np.asarray(SPEED_OF_LIGHT_AIR * f / (4 * np.pi * (f**2).sum()))
 
 
 def noise_lines(frequencies_hz: tuple[float, ...]) -> list[int]:
@@ -298,9 +304,10 @@ def face_triangles(target: Target) -> list[np.ndarray]:
 def face_light(
     lit: LitScene, target: Target, direct: DirectLight, slopes: np.ndarray, work: PathWork, config: RenderConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indirect light by way of the face (without its holes) in the pixels that see any of it, in the order
-    of `numpy.nonzero` of ``direct.face[-1]``: mean (f + 1, n); batches (B, l, n) at the frequencies `noise_lines`."""
+    """Return the indirect light (f + 1, n) by way of the face (without its holes) in the pixels that see any of it, in
+    the order of `numpy.nonzero` of ``direct.face[-1]``, and its noise of range (n,) in metres."""
     seen = direct.face[-1].real > 0
+    total = direct.phasor[:, seen]
     rays = np.concatenate([slopes[seen], np.ones((int(seen.sum()), 1))], axis=-1)
     rays *= (direct.face_range_m[seen] / np.linalg.norm(rays, axis=-1))[..., None]
     x_seen, y_seen, _ = transform_points(invert(target.T_camera_board), rays).T
@@ -318,26 +325,48 @@ def face_light(
     bright[:3, 3] = transform_points(T_camera_board, np.append((low + high) / 2, 0.0))
     bright[:3, :2] *= (high - low) / 2
     light = gather_at_points(lit, position, normals, work, config.face_samples, bright)
-    few, share = noise_lines(work.frequencies_hz), direct.face[:, seen]
-    at_nodes = np.concatenate([light.mean(axis=0, dtype=complex), *light[:, few]])
-    everywhere = (between_nodes(xs, ys, x_seen, y_seen) @ at_nodes.T).T
-    batches = everywhere[len(share) :].reshape(len(light), len(few), -1)
-    return share * everywhere[: len(share)], share[few] * batches
+    few, share, count = noise_lines(work.frequencies_hz), direct.face[:, seen], int(seen.sum())
+    mean, off = light.mean(axis=0, dtype=complex), light[:, few] - light[:, few].mean(axis=0)
+    place = np.stack([(x_seen - xs[0]) / (xs[1] - xs[0]), (y_seen - ys[0]) / (ys[1] - ys[0])])
+    weights = range_weights(tuple(work.frequencies_hz[k] for k in few))
+    found, noise_m = np.empty((len(share), count), complex), np.empty(count)
+    of_nodes = np.ascontiguousarray(mean.T), np.ascontiguousarray(np.moveaxis(off, 2, 0), complex)
+    _between_nodes(place, (len(xs), len(ys)), *of_nodes, np.array(few), weights, share, total, found, noise_m)
+    return found, noise_m
 
 
-def between_nodes(nodes_x: np.ndarray, nodes_y: np.ndarray, x: np.ndarray, y: np.ndarray) -> sparse.csr_array:
-    """Return bilinear weights (n, len(nodes_y) len(nodes_x)) of evenly spaced nodes, row by row, at n places. The error
-    is (s/D)^2/8 for a spacing s and a distance D of the light source: 2e-3 at 80 mm and 0.7 m."""
-    columns, parts = len(nodes_x), []
-    for nodes, values in ((nodes_x, x), (nodes_y, y)):
-        place = (values - nodes[0]) / (nodes[1] - nodes[0])
-        cell = np.clip(place.astype(np.int64), 0, len(nodes) - 2)
-        parts.append((cell, place - cell))
-    (i, right), (j, down) = parts
-    index = np.stack([(j + b) * columns + i + a for b in (0, 1) for a in (0, 1)], axis=1)
-    weight = np.stack([(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right], axis=1)
-    starts = np.arange(len(x) + 1) * 4
-    return sparse.csr_array((weight.ravel(), index.ravel(), starts), shape=(len(x), columns * len(nodes_y)))
+@numba.njit(**FAST)
+def _between_nodes(place, size, mean, off, few, weights, share, total, found, noise_m):  # type: ignore[no-untyped-def]
+    """Interpolate light between nodes, bilinearly, at places (2, n) in steps of the nodes (``size``: their columns and
+    rows): ``mean`` (nodes, f + 1), and its batches' deviations ``off`` (nodes, B, l) at lines ``few``. Write light
+    times ``share`` (f + 1, n), and its noise of range when added to ``total`` (f, n). The error is (s/D)^2/8 for a
+    spacing s and a distance D of the light source: 2e-3 at 80 mm and 0.7 m."""
+    batches, lines = off.shape[1:]
+    turn = np.zeros(lines, np.complex128)
+    for i in range(place.shape[1]):
+        c, r = min(max(int(place[0, i]), 0), size[0] - 2), min(max(int(place[1, i]), 0), size[1] - 2)
+        p, q = place[0, i] - c, place[1, i] - r
+        index = (r * size[0] + c, r * size[0] + c + 1, (r + 1) * size[0] + c, (r + 1) * size[0] + c + 1)
+        weight = ((1 - q) * (1 - p), (1 - q) * p, q * (1 - p), q * p)
+        for k in range(mean.shape[1]):
+            value = 0j
+            for n in range(4):
+                value += weight[n] * mean[index[n], k]
+            found[k, i] = share[k, i] * value
+        for line in range(lines):
+            k = few[line]
+            whole = total[k, i] + found[k, i]
+            turn[line] = weights[line] * share[k, i] / whole if whole != 0 else 0j
+        square = 0.0
+        for b in range(batches):
+            change = 0.0
+            for line in range(lines):
+                value = 0j
+                for n in range(4):
+                    value += weight[n] * off[index[n], b, line]
+                change += (turn[line] * value).imag
+            square += change * change
+        noise_m[i] = np.sqrt(square / (batches - 1) / batches)
 
 
 RIM_PX = 3  # rendered surroundings of the board's outline, so that its rim looks as on the whole sensor
@@ -345,9 +374,7 @@ NEAR_PX = 3  # beyond the outline, edges behind the board are finely sampled: th
 HOLE_RIM_PX = 1
 NARROW = ("through", "blind", "slot", "gouge", "chip")  # damage that may lie between a pixel's corners and its centre
 FIRST_SAMPLES = 32  # paths of each pixel inside the outline before it is known how many are needed
-AROUND = 1.0 - np.eye(25)[12].reshape(
-    5, 5
-)  # pixels whose first paths show how many: 768 seldom miss bright ones
+AROUND = 1.0 - np.eye(25)[12].reshape(5, 5)  # pixels whose first paths show how many: 768 seldom miss bright ones
 
 
 def target_region(target: Target, optics: Optics) -> Region:
@@ -418,10 +445,9 @@ def indirect_light(
     seen = np.flatnonzero(direct.face[-1].real)
     if seen.size:
         work = PathWork(frequencies, config.bounces - 1, config.seed)
-        mean, batches = face_light(lit, target, direct, slopes, work, config)
-        indirect[:, seen] = mean
-        total[:, seen] += mean[:-1]
-        variance[seen] = range_noise_m(batches, total[:, seen], frequencies) ** 2
+        indirect[:, seen], noise_m = face_light(lit, target, direct, slopes, work, config)
+        total[:, seen] += indirect[:-1, seen]
+        variance[seen] = noise_m**2
     work, rays = PathWork(frequencies, config.bounces, config.seed), direct.off_face
     here, share, within = rays.pixel, rays.share, inside.ravel()[rays.pixel]
     if here.size:
@@ -465,9 +491,10 @@ def _light_in_pixels(
 
 
 def _at_holes(target: Target, optics: Optics, slopes: np.ndarray) -> np.ndarray:
-    """Return the pixels (h, w) bool whose central ray passes the mouth of `NARROW` damage, or HOLE_RIM_PX beside it."""
+    """Return 1 in pixels (h, w) whose central ray passes the mouth of `NARROW` damage, 2 within HOLE_RIM_PX of its rim
+    on both sides, 0 elsewhere."""
     rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
-    found, T_board_camera = np.zeros(slopes.shape[:2], bool), invert(target.T_camera_board)
+    found, T_board_camera = np.zeros(slopes.shape[:2], np.int8), invert(target.T_camera_board)
     for hole, declared in zip(target.truth, target.config.damages, strict=True):
         if hole.kind in NARROW:
             centre, axis = hole.centre_camera_m, hole.axis_camera
@@ -475,5 +502,6 @@ def _at_holes(target: Target, optics: Optics, slopes: np.ndarray) -> np.ndarray:
             with np.errstate(divide="ignore", invalid="ignore"):
                 on_plane = rays * ((centre @ axis) / (rays @ axis))[..., None]
             x, y, _ = np.moveaxis(transform_points(T_board_camera, on_plane), -1, 0)
-            found |= hole.within(x, y, rim_m + declared.reach_mm * MM - hole.reach_m)
+            about = hole.within(x, y, rim_m + declared.reach_mm * MM - hole.reach_m)
+            found[about] = np.maximum(found[about], 2 - hole.within(x[about], y[about], -rim_m))
     return found

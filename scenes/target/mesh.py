@@ -44,7 +44,9 @@ def grain(material: MaterialConfig, width_mm: float, height_mm: float) -> np.nda
     # coarse noise through a cubic spline
     knots = [2 + round(n * texel_mm / s) for n, s in zip(shape, (WANDER_ACROSS_MM, WANDER_ALONG_MM), strict=True)]
     coarse, finer = stream.standard_normal(knots), [n / k for n, k in zip(shape, knots, strict=True)]
-    wander = _normalised(zoom(coarse, finer, order=3, mode="nearest"))
+    # along each axis in turn, by the spline's weights of the knots: zooming the array itself takes five times as long
+    down, across = (zoom(np.eye(k), (s, 1), order=3, mode="nearest") for k, s in zip(knots, finer, strict=True))
+    wander = _normalised(down @ coarse @ across.T)
     across_mm = (np.arange(shape[0])[:, None] + 0.5) * texel_mm + WANDER_MM * wander
     turns = across_mm / material.grain_period_mm + stream.uniform()
     # late wood: a thin dark line at the end of each ring, after a slow fall
