@@ -14,6 +14,7 @@ from scenes.render.scene import LitScene, on_device
 FINEST = 2048  # sub-rays where fewer leave an error in a hole: a dark wall beside a strip of what lies behind it
 RAYS_AT_ONCE = 1 << 22  # sub-rays cast at once
 A_LANE = 16  # sub-rays of one lane: a divisor of all numbers of sub-rays, at most 32 bits
+ALL_OF_A_LANE = (1 << A_LANE) - 1
 KEPT = 32  # at least so many of a pixel's sub-rays off the face, or all, are starts of paths
 KINK_M, BENT_M = 2e-5, 2e-6
 """If a pixel's corners lie farther than the first off the plane at its centre, there is an edge in it, such as that of
@@ -122,8 +123,8 @@ def cast(lit: LitScene, slopes: np.ndarray) -> Hits:
 
 class Summed(NamedTuple):
     """Sums over the sub-rays of n footprints: phasors (f, n), intensity and coverage (n,) as in `DirectLight`; of those
-    on the face ``face`` (f + 1, n) and ``face_range_m`` (n,); which of them (n, m) met something else; and
-    ``error_m`` (n,), the approximate error of range."""
+    on the face ``face`` (f + 1, n) and ``face_range_m`` (n,); ``off`` (n, m / A_LANE), a bit for each that met another
+    surface; and ``error_m`` (n,), the approximate error of range."""
 
     phasor: np.ndarray
     intensity: np.ndarray
@@ -182,7 +183,7 @@ def summed(
         coverage=same / m,
         face=np.concatenate([face[:-1:2] + 1j * face[1::2], face[-1:]]) / m,
         face_range_m=far / np.maximum(count, 1),
-        off=(off.numpy()[:, None] >> np.arange(A_LANE) & 1).astype(bool).reshape(n, m),
+        off=off.numpy().reshape(n, parts),
         error_m=1.5 * spread / (m * np.sqrt(np.maximum(light[-1] / m / strongest, 1 / m))),
     )
 
@@ -197,7 +198,9 @@ def _plane_light(  # type: ignore[no-untyped-def]
     series of moments, 1e-6 off at 0.07 rad."""
     rows, columns = texture.shape
     n, _, terms = axes.shape
+    m = weights.shape[1]
     lit, own = np.empty(4), np.empty(4)
+    px, py, pz, longer, farther, facing = np.empty((6, m))
     for i in range(n):
         x0, y0, z0 = centre[i]
         nx, ny, nz = normal[i]
@@ -206,38 +209,44 @@ def _plane_light(  # type: ignore[no-untyped-def]
         leg0 = np.sqrt(ex * ex + ey * ey + ez * ez)
         range0 = np.sqrt(x0 * x0 + y0 * y0 + z0 * z0)
         facing0 = (nx * ex + ny * ey + nz * ez) / leg0**3
+        bright = 1.0 / facing0 if facing0 > 0.0 else 0.0
         lit[:] = 0.0
         own[:] = 0.0
-        for j in range(weights.shape[1]):
-            x = y = z = 0.0
-            for k in range(terms):
-                x += axes[i, 0, k] * weights[k, j]
-                y += axes[i, 1, k] * weights[k, j]
-                z += axes[i, 2, k] * weights[k, j]
-            scale = height / (nx * x + ny * y + nz * z)
-            x, y, z = x * scale, y * scale, z * scale
-            range_m = np.sqrt(x * x + y * y + z * z)
+        px[:] = 0.0
+        py[:] = 0.0
+        pz[:] = 0.0
+        for k in range(terms):
+            ax, ay, az = axes[i, 0, k], axes[i, 1, k], axes[i, 2, k]
+            for j in range(m):
+                px[j] += ax * weights[k, j]
+                py[j] += ay * weights[k, j]
+                pz[j] += az * weights[k, j]
+        for j in range(m):
+            scale = height / (nx * px[j] + ny * py[j] + nz * pz[j])
+            x, y, z = px[j] * scale, py[j] * scale, pz[j] * scale
             dx, dy, dz = emitter[0] - x, emitter[1] - y, emitter[2] - z
             squared = dx * dx + dy * dy + dz * dz
-            leg = np.sqrt(squared)
+            leg, range_m = np.sqrt(squared), np.sqrt(x * x + y * y + z * z)
+            facing[j] = (nx * dx + ny * dy + nz * dz) / (squared * leg) * bright
+            longer[j], farther[j] = range_m + leg - range0 - leg0, range_m - range0
+            px[j], py[j], pz[j] = x, y, z
+        for j in range(m):
             a = albedo[i]
             if a < 0.0:
-                u = uv_of[0, 0] * x + uv_of[0, 1] * y + uv_of[0, 2] * z + uv_of[0, 3]
-                v = uv_of[1, 0] * x + uv_of[1, 1] * y + uv_of[1, 2] * z + uv_of[1, 3]
+                u = uv_of[0, 0] * px[j] + uv_of[0, 1] * py[j] + uv_of[0, 2] * pz[j] + uv_of[0, 3]
+                v = uv_of[1, 0] * px[j] + uv_of[1, 1] * py[j] + uv_of[1, 2] * pz[j] + uv_of[1, 3]
                 across = min(max(u * columns - 0.5, 0.0), columns - 1.0)
                 down = min(max(v * rows - 0.5, 0.0), rows - 1.0)
                 c, r = min(int(across), columns - 2), min(int(down), rows - 2)
                 p, q = across - c, down - r
                 above = (1.0 - p) * texture[r, c] + p * texture[r, c + 1]
                 a = (1.0 - q) * above + q * ((1.0 - p) * texture[r + 1, c] + p * texture[r + 1, c + 1])
-            amplitude = a * (nx * dx + ny * dy + nz * dz) / (squared * leg * facing0) if facing0 > 0.0 else 0.0
-            longer, farther = range_m + leg - range0 - leg0, range_m - range0
+            amplitude = a * facing[j]
             for order in range(4):
                 lit[order] += amplitude
                 own[order] += a
-                amplitude *= longer
-                a *= farther
-        m = weights.shape[1]
+                amplitude *= longer[j]
+                a *= farther[j]
         for k in range(waves.size):
             w = waves[k]
             series = complex(lit[0] - w * w * lit[2] / 2, w * lit[1] - w**3 * lit[3] / 6)
@@ -277,7 +286,7 @@ class _Sums:
         self.phasor[:, here], self.intensity[here] = light[:-1], light[-1].real
         on = central.on_face[here]
         self.face[:, here[on]], self.face_range_m[here[on]] = face[:, on], range_m[on]
-        self._keep_off_face(here[~on], np.ones((int((~on).sum()), weights.shape[1]), bool), axes[~on], weights)
+        self._keep_off_face(here[~on], np.full((int((~on).sum()), 1), ALL_OF_A_LANE, np.uint32), axes[~on], weights)
 
     def add_rays(self, here: np.ndarray, weights: np.ndarray, again: np.ndarray | None = None) -> np.ndarray:
         """Add the light of sub-rays of pixels. Return those of ``again`` (h w,) that need finer sampling."""
@@ -290,14 +299,31 @@ class _Sums:
         return here[unsure]
 
     def _keep_off_face(self, here: np.ndarray, off: np.ndarray, axes: np.ndarray, weights: np.ndarray) -> None:
-        counts, (row, column) = off.sum(axis=1), np.nonzero(off)
-        step = np.maximum(counts // KEPT, 1)
-        # each pixel's sub-rays off the face are numbered from 0
-        kept = (np.arange(len(row)) - (np.cumsum(counts) - counts)[row]) % step[row] == 0
-        row, column, some = row[kept], column[kept], counts > 0
-        rays = np.einsum("nck,kn->nc", axes[row], weights[:, column])
-        slopes = (rays[:, :2] / rays[:, 2:]).astype(np.float32)
-        self.off_face.append(OffFace(here[some], -(-counts // step)[some], counts[some] / off.shape[1], slopes))
+        counts = np.bitwise_count(off).sum(axis=1, dtype=int)
+        steps, some = np.maximum(counts // KEPT, 1), counts > 0
+        kept = -(-counts // steps)
+        slopes = np.empty((kept.sum(), 2), np.float32)
+        _slopes_kept(off, steps, axes, weights, slopes)
+        self.off_face.append(OffFace(here[some], kept[some], counts[some] / weights.shape[1], slopes))
+
+
+@numba.njit(**FAST)
+def _slopes_kept(off, steps, axes, weights, slopes):  # type: ignore[no-untyped-def]
+    """Write the slopes of every ``steps`` (n,)-th of a pixel's sub-rays whose bit is set in ``off`` (n, m / A_LANE)."""
+    at = 0
+    for i in range(off.shape[0]):
+        number = 0
+        for j in range(weights.shape[1]):
+            if off[i, j // A_LANE] >> (j % A_LANE) & 1:
+                if number % steps[i] == 0:
+                    x = y = z = 0.0
+                    for k in range(weights.shape[0]):
+                        x += axes[i, 0, k] * weights[k, j]
+                        y += axes[i, 1, k] * weights[k, j]
+                        z += axes[i, 2, k] * weights[k, j]
+                    slopes[at, 0], slopes[at, 1] = x / z, y / z
+                    at += 1
+                number += 1
 
 
 def direct_light(

@@ -28,7 +28,7 @@ BATCHES = 8
 PATHS_A_LANE = 64  # enough that lanes end together, few enough that a small job fills the machine
 NOISE_LINES = 4  # lines of a long comb from which noise of range is estimated: paths are the same for all lines
 PER_VERTEX = 2  # low-discrepancy dimensions for each vertex: a direction
-START_DIMENSIONS = 3  # the first direction, and which of a pixel's sub-rays
+START_DIMENSIONS = 4  # the first direction; which of a pixel's sub-rays, and one to spare
 CELLS, PROBES, OFTEN = 16, 2, 0.9
 """Cells along each side of the square of first directions from the face, probes along each side of a cell, and the
 share of paths that begin in cells where a probe met something; the others begin anywhere."""
@@ -228,7 +228,8 @@ class _Walk:
     ) -> tuple[Any, ...]:
         """Continue at the next vertex, or begin the next path. ``length``: that up to ``before``, the ray's start."""
         lit, mi, dr, fresh = self.lit, self.lit.mi, self.lit.dr, vertex == 0
-        point, normal, first, seen, weight, way = self.start(self.place, *(self._uniform(sample, k) for k in range(3)))
+        which = *self._uniform(sample, 0), self._uniform(sample, 2)[0]
+        point, normal, first, seen, weight, way = self.start(self.place, *which)
         before, before_normal = dr.select(fresh, point, before), dr.select(fresh, normal, before_normal)
         direction = dr.select(fresh, first, direction)
         length, throughput = dr.select(fresh, way, length), dr.select(fresh, seen * weight, throughput)
@@ -242,8 +243,7 @@ class _Walk:
         totals = added(totals, light, length + leg, self.work.frequencies_hz)
 
         more = met & (vertex < self.work.bounces) & (throughput > 0)
-        dimension = START_DIMENSIONS + PER_VERTEX * vertex
-        u1, u2 = self._uniform(sample, dimension), self._uniform(sample, dimension + 1)
+        u1, u2 = self._uniform(sample, START_DIMENSIONS + PER_VERTEX * vertex)
         direction = mi.Frame3f(hit.normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2)))
         if self.aim is not None:
             # the half of the square left by the other choice is a square too
@@ -257,14 +257,14 @@ class _Walk:
         sample, vertex = sample + dr.select(more, mi.UInt32(0), 1), dr.select(more, vertex + 1, 0)
         return sample, vertex, hit.place, hit.normal, direction, length, throughput, totals
 
-    def _uniform(self, sample: Any, dimension: Any) -> Any:
-        """Return a co-ordinate of the low-discrepancy point of each lane's path, shifted by its place's rotation."""
+    def _uniform(self, sample: Any, dimension: Any) -> tuple[Any, Any]:
+        """Return two co-ordinates of the low-discrepancy point of each lane's path, shifted by its place's rotation."""
         mi, dr = self.lit.mi, self.lit.dr
-        number = self.batch * self.batch_points + self.first + sample
-        u = dr.gather(mi.Float, self.table, number * self.dimensions + dimension)
+        number = (self.batch * self.batch_points + self.first + sample) * self.dimensions + dimension
         rotation = self.batch + BATCHES * dr.gather(mi.UInt32, self.turns, self.place)
-        u += mi.sample_tea_float32(rotation, dimension + self.stream, 4)
-        return u - dr.floor(u)
+        shifts = mi.sample_tea_32(rotation, dimension + self.stream, 4)
+        u = [dr.gather(mi.Float, self.table, number + k) + mi.Float(shifts[k] >> 8) * 2**-24 for k in (0, 1)]
+        return u[0] - dr.floor(u[0]), u[1] - dr.floor(u[1])
 
 
 def _gather(
