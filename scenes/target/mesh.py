@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 import trimesh
-from scipy.ndimage import gaussian_filter, map_coordinates, zoom
+from scipy.ndimage import map_coordinates, zoom
 from scipy.optimize import brentq
 
 from harness.vocabulary.errors import UserError
@@ -50,9 +50,11 @@ def grain(material: MaterialConfig, width_mm: float, height_mm: float) -> np.nda
     across_mm = (np.arange(shape[0])[:, None] + 0.5) * texel_mm + WANDER_MM * wander
     turns = across_mm / material.grain_period_mm + stream.uniform()
     # late wood: a thin dark line at the end of each ring, after a slow fall
-    lines = _normalised(-((turns % 1.0) ** 3))
-    noise, lengths = stream.standard_normal(shape, dtype=np.float32), (FIBRE_WIDTH_MM, FIBRE_LENGTH_MM)
-    fibres = gaussian_filter(noise, [length / texel_mm for length in lengths], mode="reflect", truncate=3.0)
+    rise = turns % 1.0
+    lines, noise = _normalised(-rise * rise * rise), stream.standard_normal(shape, dtype=np.float32)
+    deviations = (length / texel_mm for length in (FIBRE_WIDTH_MM, FIBRE_LENGTH_MM))
+    across, along = (cv2.getGaussianKernel(2 * int(3 * each + 0.5) + 1, each) for each in deviations)
+    fibres = cv2.sepFilter2D(noise, -1, along, across, borderType=cv2.BORDER_REFLECT)
     return _normalised(LINE_WEIGHT * lines + FIBRE_WEIGHT * _normalised(fibres))
 
 
