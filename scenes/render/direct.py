@@ -9,12 +9,11 @@ import numpy as np
 from scipy import ndimage
 
 from scenes.optics import COARSE, FINE, Quadrilaterals, wave_numbers
-from scenes.render.scene import LitScene, on_device
+from scenes.render.scene import LitScene, Met, on_device
 
 FINEST = 2048  # sub-rays where fewer leave an error in a hole: a dark wall beside a strip of what lies behind it
 RAYS_AT_ONCE = 1 << 22  # sub-rays cast at once
 A_LANE = 16  # sub-rays of one lane: a divisor of all numbers of sub-rays, at most 32 bits
-ALL_OF_A_LANE = (1 << A_LANE) - 1
 KEPT = 32  # at least so many of a pixel's sub-rays off the face, or all, are starts of paths
 KINK_M, BENT_M = 2e-5, 2e-6
 """If a pixel's corners lie farther than the first off the plane at its centre, there is an edge in it, such as that of
@@ -121,141 +120,6 @@ def cast(lit: LitScene, slopes: np.ndarray) -> Hits:
     return Hits(far, path, light, own, which, np.column_stack([u, v]), face, np.column_stack([nx, ny, nz]))
 
 
-class Summed(NamedTuple):
-    """Sums over the sub-rays of n footprints: phasors (f, n), intensity and coverage (n,) as in `DirectLight`; of those
-    on the face ``face`` (f + 1, n) and ``face_range_m`` (n,); ``off`` (n, m / A_LANE), a bit for each that met another
-    surface; and ``error_m`` (n,), the approximate error of range."""
-
-    phasor: np.ndarray
-    intensity: np.ndarray
-    coverage: np.ndarray
-    face: np.ndarray
-    face_range_m: np.ndarray
-    off: np.ndarray
-    error_m: np.ndarray
-
-
-def summed(
-    lit: LitScene, axes: np.ndarray, weights: np.ndarray, surface: np.ndarray, about_m: np.ndarray, f: Frequencies
-) -> Summed:
-    """Cast the sub-rays ``axes`` (n, 3, k) @ ``weights`` (k, m) of footprints and sum their light. ``surface`` (n,) and
-    ``about_m`` (n,): surface and path of the central ray. A lane casts A_LANE of them."""
-    mi, dr, (n, _, k), m, lines = lit.mi, lit.dr, axes.shape, weights.shape[1], len(f)
-    parts = m // A_LANE
-    columns = [on_device(mi.Float, each) for each in axes.reshape(n, -1).T]
-    table, own = [on_device(mi.Float, each) for each in weights], on_device(mi.UInt32, surface)
-    lanes = [on_device(mi.UInt32, each) for each in np.divmod(np.arange(n * parts), parts)]
-    middle, begin = on_device(mi.Float, np.repeat(about_m, parts)), lanes[1] * A_LANE
-    axis = [dr.gather(mi.Float, column, lanes[0]) for column in columns]
-    surface_there = dr.gather(mi.UInt32, own, lanes[0])
-
-    def step(j: Any, off: Any, light: list[Any], face: list[Any], others: list[Any]) -> tuple[Any, ...]:
-        weight = [dr.gather(mi.Float, row, begin + j) for row in table]
-        ray = mi.Vector3f(*(sum(axis[c * k + i] * weight[i] for i in range(k)) for c in range(3)))
-        met = lit.meet(mi.Point3f(0.0), dr.normalize(ray), coherent=True)
-        arriving, leg = lit.arriving(met, coherent=True)
-        albedo = lit.albedo(met)
-        amplitude, longer = albedo * arriving, dr.select(met.valid, met.distance + leg - middle, 0)
-        on_face = dr.gather(mi.Bool, lit.on_face, met.triangle, met.valid)
-        light = added(light, amplitude, longer + middle, f)
-        face = added(face, dr.select(on_face, albedo, 0), met.distance, f)
-        count, same, far, first, second, most = others
-        same = same + dr.select(dr.select(met.valid, met.surface, mi.UInt32(0xFFFFFFFF)) == surface_there, 1.0, 0.0)
-        far, count = far + dr.select(on_face, met.distance, 0), count + dr.select(on_face, 1.0, 0.0)
-        first, second = first + amplitude * longer, second + amplitude * dr.square(longer)
-        off = off | dr.select(met.valid & ~on_face, mi.UInt32(1) << j, 0)
-        return j + 1, off, light, face, [count, same, far, first, second, dr.maximum(most, amplitude)]
-
-    size = n * parts
-    zeros = [[dr.zeros(mi.Float, size) for _ in range(number)] for number in (2 * lines + 1, 2 * lines + 1, 6)]
-    state = (dr.zeros(mi.UInt32, size), dr.zeros(mi.UInt32, size), *zeros)
-    _, off, *found = dr.while_loop(state, lambda j, *_: j < A_LANE, step, label="footprints")
-    dr.eval(off, *found)
-    light, face, others = (np.stack([e.numpy() for e in each]).reshape(-1, n, parts) for each in found)
-    count, same, far, first, second, _ = others.sum(axis=2, dtype=float)
-    light, face = (each.sum(axis=2, dtype=float) for each in (light, face))
-    strongest, total = np.maximum(others[5].max(axis=1), 1e-30), np.maximum(light[-1], 1e-30)
-    # an edge is misplaced by one or two of m sub-rays; holes of 1/16 to 1 in before a backing showed this error
-    spread = np.sqrt(np.maximum(second / total - (first / total) ** 2, 0.0))
-    return Summed(
-        phasor=(light[:-1:2] + 1j * light[1::2]) / m,
-        intensity=light[-1] / m,
-        coverage=same / m,
-        face=np.concatenate([face[:-1:2] + 1j * face[1::2], face[-1:]]) / m,
-        face_range_m=far / np.maximum(count, 1),
-        off=off.numpy().reshape(n, parts),
-        error_m=1.5 * spread / (m * np.sqrt(np.maximum(light[-1] / m / strongest, 1 / m))),
-    )
-
-
-@numba.njit(**FAST)
-def _plane_light(  # type: ignore[no-untyped-def]
-    axes, weights, centre, normal, emitter, albedo, texture, uv_of, waves, light, face
-):
-    """Sum a pixel's light over the sub-rays ``axes`` (n, 3, k) @ ``weights`` (k, m) on the plane of its ``centre`` and
-    ``normal`` (n, 3): ``light`` (f + 1, n), whose amplitude is the albedo at the centre, and ``face``, the albedo at
-    its range; frequency 0 last. ``albedo`` (n,): negative where ``texture`` gives it. Phases about the centre's are a
-    series of moments, 1e-6 off at 0.07 rad."""
-    rows, columns = texture.shape
-    n, _, terms = axes.shape
-    m = weights.shape[1]
-    lit, own = np.empty(4), np.empty(4)
-    px, py, pz, longer, farther, facing = np.empty((6, m))
-    for i in range(n):
-        x0, y0, z0 = centre[i]
-        nx, ny, nz = normal[i]
-        height = nx * x0 + ny * y0 + nz * z0
-        ex, ey, ez = emitter[0] - x0, emitter[1] - y0, emitter[2] - z0
-        leg0 = np.sqrt(ex * ex + ey * ey + ez * ez)
-        range0 = np.sqrt(x0 * x0 + y0 * y0 + z0 * z0)
-        facing0 = (nx * ex + ny * ey + nz * ez) / leg0**3
-        bright = 1.0 / facing0 if facing0 > 0.0 else 0.0
-        lit[:] = 0.0
-        own[:] = 0.0
-        px[:] = 0.0
-        py[:] = 0.0
-        pz[:] = 0.0
-        for k in range(terms):
-            ax, ay, az = axes[i, 0, k], axes[i, 1, k], axes[i, 2, k]
-            for j in range(m):
-                px[j] += ax * weights[k, j]
-                py[j] += ay * weights[k, j]
-                pz[j] += az * weights[k, j]
-        for j in range(m):
-            scale = height / (nx * px[j] + ny * py[j] + nz * pz[j])
-            x, y, z = px[j] * scale, py[j] * scale, pz[j] * scale
-            dx, dy, dz = emitter[0] - x, emitter[1] - y, emitter[2] - z
-            squared = dx * dx + dy * dy + dz * dz
-            leg, range_m = np.sqrt(squared), np.sqrt(x * x + y * y + z * z)
-            facing[j] = (nx * dx + ny * dy + nz * dz) / (squared * leg) * bright
-            longer[j], farther[j] = range_m + leg - range0 - leg0, range_m - range0
-            px[j], py[j], pz[j] = x, y, z
-        for j in range(m):
-            a = albedo[i]
-            if a < 0.0:
-                u = uv_of[0, 0] * px[j] + uv_of[0, 1] * py[j] + uv_of[0, 2] * pz[j] + uv_of[0, 3]
-                v = uv_of[1, 0] * px[j] + uv_of[1, 1] * py[j] + uv_of[1, 2] * pz[j] + uv_of[1, 3]
-                across = min(max(u * columns - 0.5, 0.0), columns - 1.0)
-                down = min(max(v * rows - 0.5, 0.0), rows - 1.0)
-                c, r = min(int(across), columns - 2), min(int(down), rows - 2)
-                p, q = across - c, down - r
-                above = (1.0 - p) * texture[r, c] + p * texture[r, c + 1]
-                a = (1.0 - q) * above + q * ((1.0 - p) * texture[r + 1, c] + p * texture[r + 1, c + 1])
-            amplitude = a * facing[j]
-            for order in range(4):
-                lit[order] += amplitude
-                own[order] += a
-                amplitude *= longer[j]
-                a *= farther[j]
-        for k in range(waves.size):
-            w = waves[k]
-            series = complex(lit[0] - w * w * lit[2] / 2, w * lit[1] - w**3 * lit[3] / 6)
-            light[k, i] = series * np.exp(1j * w * (range0 + leg0)) / m
-            series = complex(own[0] - w * w * own[2] / 2, w * own[1] - w**3 * own[3] / 6)
-            face[k, i] = series * np.exp(1j * w * range0) / m
-        light[waves.size, i], face[waves.size, i] = lit[0] / m, own[0] / m
-
-
 class _Sums:
     """Sums of direct light of a region's pixels, flat; fields as in `DirectLight`."""
 
@@ -270,32 +134,70 @@ class _Sums:
         self.intensity, self.coverage, self.face_range_m = np.zeros(h * w), np.ones(h * w), np.zeros(h * w)
         self.off_face: list[OffFace] = []
 
-    def add_plane(self, here: np.ndarray) -> None:
-        """Add the light of pixels that see a single plane, from the hits of their centres."""
-        lit, central, waves = self.lit, self.central, wave_numbers(self.frequencies_hz)
-        axes, weights = self.footprint.axes(self.rows[here], self.cols[here]), self.footprint.grid()
-        ray = np.column_stack([self.slopes[here], np.ones(len(here))])
-        range_m, albedo = (each[here].astype(float) for each in (central.range_m, central.albedo))
-        centre = ray * (range_m / np.linalg.norm(ray, axis=1))[:, None]
-        light, face = np.empty((2, len(waves) + 1, len(here)), complex)
-        plain = np.where(central.surface[here] == lit.textured, -1.0, albedo)
-        texture = np.zeros((2, 2), np.float32) if lit.texture is None else lit.parts[lit.textured].texture_850
-        normal = central.normal[here].astype(float)
-        _plane_light(axes, weights, centre, normal, lit.emitter_m, plain, texture, lit.uv_of, waves, light, face)
-        light *= np.divide(central.amplitude[here], albedo, out=np.zeros(len(here)), where=albedo > 0)
-        self.phasor[:, here], self.intensity[here] = light[:-1], light[-1].real
-        on = central.on_face[here]
-        self.face[:, here[on]], self.face_range_m[here[on]] = face[:, on], range_m[on]
-        self._keep_off_face(here[~on], np.full((int((~on).sum()), 1), ALL_OF_A_LANE, np.uint32), axes[~on], weights)
+    def add(
+        self, here: np.ndarray, weights: np.ndarray, again: np.ndarray | None = None, plane: bool = False
+    ) -> np.ndarray:
+        """Add the light of the footprints' sub-rays axes (n, 3, k) @ ``weights`` (k, m) in pixels; no rays are cast if
+        each pixel sees only the ``plane`` at its centre. Return those of ``again`` (h w,) that need finer sampling."""
+        mi, dr, central, f = self.lit.mi, self.lit.dr, self.central, self.frequencies_hz
+        axes, lines = self.footprint.axes(self.rows[here], self.cols[here]), len(f)
+        (n, _, k), m, parts = axes.shape, weights.shape[1], weights.shape[1] // A_LANE
+        pixel, part = np.divmod(np.arange(n * parts), parts)
+        axis = [on_device(mi.Float, each[pixel]) for each in axes.reshape(n, -1).T]
+        table, begin = [on_device(mi.Float, each) for each in weights], on_device(mi.UInt32, part * A_LANE)
+        middle, own = (on_device(mi.Float, each[here][pixel]) for each in (central.path_m, central.surface))
+        if plane:
+            ray = np.column_stack([self.slopes[here], np.ones(n)])
+            ray *= (central.range_m[here] / np.linalg.norm(ray, axis=1))[:, None]
+            height = on_device(mi.Float, (central.normal[here] * ray).sum(axis=1))
+            normal = mi.Normal3f(*(on_device(mi.Float, each) for each in central.normal[here].T))
+            is_face, clear = (on_device(mi.UInt32, e[here]) > 0 for e in (central.on_face, central.amplitude > 0))
 
-    def add_rays(self, here: np.ndarray, weights: np.ndarray, again: np.ndarray | None = None) -> np.ndarray:
-        """Add the light of sub-rays of pixels. Return those of ``again`` (h w,) that need finer sampling."""
-        axes, central = self.footprint.axes(self.rows[here], self.cols[here]), self.central
-        found = summed(self.lit, axes, weights, central.surface[here], central.path_m[here], self.frequencies_hz)
-        self.phasor[:, here], self.intensity[here], self.coverage[here] = found[:3]
-        self.face[:, here], self.face_range_m[here] = found.face, found.face_range_m
-        unsure = np.zeros(len(here), bool) if again is None else again[here] & (found.error_m > UNSURE_M)
-        self._keep_off_face(here[~unsure], found.off[~unsure], axes[~unsure], weights)
+        def meet(ray: Any) -> tuple[Met, Any, Any, Any]:
+            """Return the hits of rays, their light, the way to the emitter, and whether they are on the face."""
+            if plane:
+                far, there = height / dr.dot(normal, ray), mi.Bool(True)
+                met = Met(there, far, mi.Point3f(far * ray), normal, mi.UInt32(own), mi.UInt32(0), -ray)
+                return met, *self.lit.arriving(met, clear=clear), is_face
+            met = self.lit.meet(mi.Point3f(0.0), ray, coherent=True)
+            on_face = dr.gather(mi.Bool, self.lit.on_face, met.triangle, met.valid)
+            return met, *self.lit.arriving(met, coherent=True), on_face
+
+        def step(j: Any, off: Any, light: list[Any], face: list[Any], others: list[Any]) -> tuple[Any, ...]:
+            weight = [dr.gather(mi.Float, row, begin + j) for row in table]
+            ray = mi.Vector3f(*(sum(axis[c * k + i] * weight[i] for i in range(k)) for c in range(3)))
+            met, arriving, leg, on_face = meet(dr.normalize(ray))
+            albedo, (count, same, far, first, second, most) = self.lit.albedo(met), others
+            amplitude, longer = albedo * arriving, dr.select(met.valid, met.distance + leg - middle, 0)
+            light = added(light, amplitude, longer + middle, f)
+            face = added(face, dr.select(on_face, albedo, 0), met.distance, f)
+            same = same + dr.select(dr.select(met.valid, mi.Float(met.surface), -1) == own, 1.0, 0.0)
+            far, count = far + dr.select(on_face, met.distance, 0), count + dr.select(on_face, 1.0, 0.0)
+            first, second = first + amplitude * longer, second + amplitude * dr.square(longer)
+            off = off | dr.select(met.valid & ~on_face, mi.UInt32(1) << j, 0)
+            return j + 1, off, light, face, [count, same, far, first, second, dr.maximum(most, amplitude)]
+
+        zeros = [[dr.zeros(mi.Float, n * parts) for _ in range(size)] for size in (2 * lines + 1, 2 * lines + 1, 6)]
+        state = (*(dr.zeros(mi.UInt32, n * parts) for _ in range(2)), *zeros)
+        _, off, *found = dr.while_loop(state, lambda j, *_: j < A_LANE, step, label="footprints")
+        dr.eval(off, *found)
+        light, face, others = (np.stack([e.numpy() for e in each]).reshape(-1, n, parts) for each in found)
+        strongest = np.maximum(others[5].max(axis=1), 1e-30)
+        light, face, others = (each.sum(axis=2, dtype=float) / m for each in (light, face, others))
+        count, same, far, first, second, _ = others
+        self.phasor[:, here], self.intensity[here], self.coverage[here] = (
+            light[:-1:2] + 1j * light[1::2],
+            light[-1],
+            same,
+        )
+        self.face[:-1, here], self.face[-1, here] = face[:-1:2] + 1j * face[1::2], face[-1]
+        self.face_range_m[here] = far / np.maximum(count, 1 / m)
+        # an edge is misplaced by one or two of m sub-rays; holes of 1/16 to 1 in before a backing showed this error
+        total = np.maximum(light[-1], 1e-30)
+        spread = np.sqrt(np.maximum(second / total - (first / total) ** 2, 0.0))
+        error_m = 1.5 * spread / (m * np.sqrt(np.maximum(light[-1] / strongest, 1 / m)))
+        unsure = np.zeros(n, bool) if again is None else again[here] & (error_m > UNSURE_M)
+        self._keep_off_face(here[~unsure], off.numpy().reshape(n, parts)[~unsure], axes[~unsure], weights)
         return here[unsure]
 
     def _keep_off_face(self, here: np.ndarray, off: np.ndarray, axes: np.ndarray, weights: np.ndarray) -> None:
@@ -348,13 +250,13 @@ def direct_light(
     edge = ndimage.binary_dilation(edge, np.ones((reach, reach), bool))
     fine = edge if roughly is None else edge & ~roughly
     rest, bent = ~fine.ravel(), ((bend_m > BENT_M) | edge).ravel()
-    sums.add_plane(np.flatnonzero(rest & ~bent & (central.surface >= 0)))
+    sums.add(np.flatnonzero(rest & ~bent & (central.surface >= 0)), footprint.grid(), plane=True)
     for here in _chunks(np.flatnonzero(rest & bent), COARSE**2):
-        sums.add_rays(here, footprint.grid())
+        sums.add(here, footprint.grid())
     again = None if closely is None else closely.ravel() > 0
-    unsure = [sums.add_rays(here, footprint.lattice(), again) for here in _chunks(np.flatnonzero(fine), FINE)]
+    unsure = [sums.add(here, footprint.lattice(), again) for here in _chunks(np.flatnonzero(fine), FINE)]
     for here in _chunks(np.concatenate([np.zeros(0, int), *unsure]), FINEST):
-        sums.add_rays(here, footprint.lattice(FINEST))
+        sums.add(here, footprint.lattice(FINEST))
     return DirectLight(
         phasor=sums.phasor.reshape(-1, *shape),
         intensity=sums.intensity.reshape(shape),

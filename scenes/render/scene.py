@@ -111,9 +111,9 @@ class LitScene:
     Mitsuba only finds the hits of rays: one shape without materials needs no virtual calls, so that all scenes share
     their compiled kernels. ``surface_of`` (index into ``parts``), ``normal_of`` and ``on_face`` are by triangle;
     ``albedos`` and, if any surface is glossy, ``gloss`` (share and exponent of the lobes) by surface. The part
-    ``textured`` has ``texture`` at ``uv_of`` (2, 4), an affine function of position; -1, None and zeros if there is
-    none. ``uv_factors``: the same as data, because constants would compile the kernels anew for each board.
-    ``mi``, ``dr``: Mitsuba and Dr.Jit, loaded."""
+    ``textured`` has ``texture``; -1 and None if there is none. Its coordinates are affine in position, by the eight
+    ``uv_factors``: data, because constants would compile the kernels anew for each board. ``mi``, ``dr``: Mitsuba and
+    Dr.Jit, loaded."""
 
     mi: Any
     dr: Any
@@ -129,7 +129,6 @@ class LitScene:
     gloss: tuple[Any, Any] | None
     textured: int
     texture: Any
-    uv_of: np.ndarray
     uv_factors: list[Any]
 
     def meet(self, origin: Any, direction: Any, coherent: bool = False) -> Met:
@@ -170,9 +169,10 @@ class LitScene:
         cosine = dr.dot(2 * dr.dot(normal, viewer) * normal - viewer, direction)
         return 1 - share + share * (exponent + 2) / 2 * dr.power(dr.maximum(cosine, 1e-6), exponent)
 
-    def arriving(self, met: Met, coherent: bool = False) -> tuple[Any, Any]:
+    def arriving(self, met: Met, coherent: bool = False, clear: Any = None) -> tuple[Any, Any]:
         """Return the light from the emitter at each hit: (irradiance, distance). The irradiance is cone(direction)
-        cos(incidence) / d^2 times the `lobe`: 1 on a facing surface at 1 m, 0 behind an occluder and without a hit."""
+        cos(incidence) / d^2 times the `lobe`: 1 on a facing surface at 1 m, 0 behind an occluder and without a hit.
+        ``clear``: where nothing is between, if that is known."""
         mi, dr = self.mi, self.dr
         emitter = mi.Point3f(*self.emitter_m.tolist())
         towards = emitter - met.place
@@ -189,7 +189,7 @@ class LitScene:
         reach = dr.norm(way)
         ray = mi.Ray3f(origin, way / reach)
         ray.maxt = reach - 2 * LIFT_M
-        lit &= ~self.scene.ray_test(ray, coherent, lit)
+        lit &= ~self.scene.ray_test(ray, coherent, lit) if clear is None else clear
         lobe = self.lobe(met.surface, met.normal, met.viewer, towards)
         return dr.select(lit, cone * cosine / squared * lobe, 0), distance
 
@@ -237,6 +237,5 @@ def lit_scene(
         gloss=(shares, exponents) if any(part.gloss[0] > 0 for part in parts) else None,
         textured=textured,
         texture=texture,
-        uv_of=uv_of,
         uv_factors=[dr.opaque(mi.Float, float(each)) for each in uv_of.ravel()],
     )

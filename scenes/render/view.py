@@ -69,12 +69,8 @@ def gather_at_points(
     places, down, across = (each.ravel() for each in np.indices((len(points_m), side, side)))
     probe = [on_device(mi.Float, (each + 0.5) / side) for each in (across, down)]
     point, normal, direction, _ = drawn(on_device(mi.UInt32, places), *probe)
-    met = (
-        lit.meet(point + LIFT_M * normal, direction)
-        .valid.numpy()
-        .reshape(-1, CELLS, PROBES, CELLS, PROBES)
-        .any(axis=(0, 2, 4))
-    )
+    met = lit.meet(point + LIFT_M * normal, direction).valid.numpy()
+    met = met.reshape(-1, CELLS, PROBES, CELLS, PROBES).any(axis=(0, 2, 4))
     chosen = np.flatnonzero(met if met.any() else ~met)
     shares = np.full(cells, 1 - OFTEN)
     shares[chosen] += OFTEN * cells / chosen.size
