@@ -73,11 +73,6 @@ def footprint_of(lens: Lens, region: Region, beam_fwhm_rad: float | None) -> Qua
     return Beams(lens, region, beam_fwhm_rad / FWHM_PER_DEVIATION) if beam_fwhm_rad else Quadrilaterals(lens, region)
 
 
-def slopes_of(rays: np.ndarray) -> np.ndarray:
-    """Return slopes (n, m, 2) of rays (n, 3, m)."""
-    return np.moveaxis(rays[:, :2] / rays[:, 2:], 1, 2)
-
-
 class Quadrilaterals:
     """An imager's pixels: the areas between their corners, evenly weighted; slopes are linear within, to 1e-7. Fine
     sub-rays form a golden lattice, so that an edge along rows or columns crosses them one by one."""
@@ -106,13 +101,10 @@ class Quadrilaterals:
         fx, fy = number / count, (number * GOLDEN) % 1
         return np.stack([np.ones(count), fx, fy, fx * fy])
 
-    def coarse(self, rows: np.ndarray, cols: np.ndarray, side: int = COARSE) -> np.ndarray:
-        """Return slopes (n, side^2, 2) of the sub-rays of `grid`."""
-        return slopes_of(self.axes(rows, cols) @ self.grid(side))
-
-    def fine(self, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
-        """Return slopes (n, FINE, 2) of the sub-rays of `lattice`."""
-        return slopes_of(self.axes(rows, cols) @ self.lattice())
+    def slopes(self, rows: np.ndarray, cols: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Return slopes (n, m, 2) of the sub-rays of pixels with ``weights`` (k, m)."""
+        rays = self.axes(rows, cols) @ weights
+        return np.moveaxis(rays[:, :2] / rays[:, 2:], 1, 2)
 
 
 class Beams(Quadrilaterals):

@@ -57,7 +57,8 @@ def light_on(lit, lens, region, footprint=CAMERA.optics.beam_fwhm_rad, frequenci
 
 def whole_pixels(lens, region, rows, cols):
     """All sub-rays of pixels, for a path tracer that knows no face."""
-    slopes = Quadrilaterals(lens, region).coarse(rows, cols)
+    footprint = Quadrilaterals(lens, region)
+    slopes = footprint.slopes(rows, cols, footprint.grid())
     count = np.full(len(rows), slopes.shape[1])
     return OffFace(np.arange(len(rows)), count, np.ones(len(rows)), slopes.reshape(-1, 2).astype(np.float32))
 
@@ -351,7 +352,8 @@ def test_direct_light_on_the_face_is_exact_to_ten_micrometres(thesis_view):
     f = np.array(CAMERA.frequencies_hz)[:, None]
     for top in (15, 30, 72):
         rows, cols = (a.ravel() for a in np.meshgrid(np.arange(top, top + 4), np.arange(20, 400), indexing="ij"))
-        hits = cast(lit, Quadrilaterals(lens, region).coarse(rows, cols, 32).reshape(-1, 2))
+        footprint = Quadrilaterals(lens, region)
+        hits = cast(lit, footprint.slopes(rows, cols, footprint.grid(32)).reshape(-1, 2))
         fine = (hits.amplitude * np.exp(1j * WAVE[:, None] * hits.path_m)).reshape(len(f), -1, 32**2).mean(axis=-1)
         turned = np.angle(thesis_view.phasor_direct[:, rows, cols] / fine)
         error_m = (SPEED_OF_LIGHT_AIR * f / (4 * np.pi * (f**2).sum()) * turned).sum(axis=0)

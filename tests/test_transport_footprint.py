@@ -69,7 +69,8 @@ def test_a_knife_edge_takes_the_gaussians_cumulative_shares(angle_deg):
 def test_an_oblique_beam_is_round_in_angle():
     """At the field's corner: the spread of directions is the same in every direction across the beam."""
     region = Region(0, 2, 0, 2)
-    slopes = Beams(LENS, region, DEVIATION_RAD).fine(np.zeros(1, int), np.zeros(1, int))[0]
+    beams = Beams(LENS, region, DEVIATION_RAD)
+    slopes = beams.slopes(np.zeros(1, int), np.zeros(1, int), beams.lattice())[0]
     rays = np.column_stack([slopes, np.ones(len(slopes))])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     centre = np.append(LENS.region_slopes(region)[0, 0], 1.0)

@@ -8,11 +8,11 @@ import numba
 import numpy as np
 from scipy import ndimage
 
-from scenes.optics import COARSE, FINE, Quadrilaterals, wave_numbers
+from scenes.optics import Quadrilaterals, wave_numbers
 from scenes.render.scene import LitScene, Met, on_device
 
 FINEST = 2048  # sub-rays where fewer leave an error in a hole: a dark wall beside a strip of what lies behind it
-RAYS_AT_ONCE = 1 << 22  # sub-rays cast at once
+FLOATS_AT_ONCE = 1 << 24  # sums held on the device at once, and their footprints: 0.07 GB
 A_LANE = 16  # sub-rays of one lane: a divisor of all numbers of sub-rays, at most 32 bits
 KEPT = 32  # at least so many of a pixel's sub-rays off the face, or all, are starts of paths
 KINK_M, BENT_M = 2e-5, 2e-6
@@ -123,25 +123,30 @@ def cast(lit: LitScene, slopes: np.ndarray) -> Hits:
 class _Sums:
     """Sums of direct light of a region's pixels, flat; fields as in `DirectLight`."""
 
-    def __init__(
-        self, lit: LitScene, slopes: np.ndarray, footprint: Quadrilaterals, frequencies_hz: Frequencies
-    ) -> None:
-        self.lit, self.footprint, self.frequencies_hz = lit, footprint, frequencies_hz
-        self.slopes, (h, w), lines = slopes.reshape(-1, 2), slopes.shape[:2], len(frequencies_hz)
+    def __init__(self, lit: LitScene, slopes: np.ndarray, footprint: Quadrilaterals, f: Frequencies) -> None:
+        self.lit, self.footprint, self.frequencies_hz = lit, footprint, f
+        self.slopes, (h, w), lines = slopes.reshape(-1, 2), slopes.shape[:2], len(f)
         self.rows, self.cols = np.divmod(np.arange(h * w), w)
         self.central = cast(lit, self.slopes)
         self.phasor, self.face = np.zeros((lines, h * w), complex), np.zeros((lines + 1, h * w), complex)
         self.intensity, self.coverage, self.face_range_m = np.zeros(h * w), np.ones(h * w), np.zeros(h * w)
-        self.off_face: list[OffFace] = []
+        none = np.zeros(0, int)
+        self.off_face = [OffFace(none, none, np.zeros(0), np.zeros((0, 2), np.float32))]
 
-    def add(
-        self, here: np.ndarray, weights: np.ndarray, again: np.ndarray | None = None, plane: bool = False
-    ) -> np.ndarray:
+    def add_all(self, wanted: np.ndarray, weights: np.ndarray, again: Any = None, plane: bool = False) -> np.ndarray:
+        """Call `add` for the pixels ``wanted`` (h w,), so many at once as memory allows; return a mask as well."""
+        here, unsure = np.flatnonzero(wanted), np.zeros(len(wanted), bool)
+        at_once = max(FLOATS_AT_ONCE * A_LANE // weights.shape[1] // (4 * len(self.frequencies_hz) + 24), 1)
+        for begin in range(0, len(here), at_once):
+            unsure[self.add(here[begin : begin + at_once], weights, again, plane)] = True
+        return unsure
+
+    def add(self, here: np.ndarray, weights: np.ndarray, again: Any = None, plane: bool = False) -> np.ndarray:
         """Add the light of the footprints' sub-rays axes (n, 3, k) @ ``weights`` (k, m) in pixels; no rays are cast if
         each pixel sees only the ``plane`` at its centre. Return those of ``again`` (h w,) that need finer sampling."""
         mi, dr, central, f = self.lit.mi, self.lit.dr, self.central, self.frequencies_hz
-        axes, lines = self.footprint.axes(self.rows[here], self.cols[here]), len(f)
-        (n, _, k), m, parts = axes.shape, weights.shape[1], weights.shape[1] // A_LANE
+        axes, m, lines = self.footprint.axes(self.rows[here], self.cols[here]), weights.shape[1], len(f)
+        (n, _, k), parts = axes.shape, m // A_LANE
         pixel, part = np.divmod(np.arange(n * parts), parts)
         axis = [on_device(mi.Float, each[pixel]) for each in axes.reshape(n, -1).T]
         table, begin = [on_device(mi.Float, each) for each in weights], on_device(mi.UInt32, part * A_LANE)
@@ -185,45 +190,38 @@ class _Sums:
         strongest = np.maximum(others[5].max(axis=1), 1e-30)
         light, face, others = (each.sum(axis=2, dtype=float) / m for each in (light, face, others))
         count, same, far, first, second, _ = others
-        self.phasor[:, here], self.intensity[here], self.coverage[here] = (
-            light[:-1:2] + 1j * light[1::2],
-            light[-1],
-            same,
-        )
+        self.phasor[:, here], self.intensity[here] = light[:-1:2] + 1j * light[1::2], light[-1]
         self.face[:-1, here], self.face[-1, here] = face[:-1:2] + 1j * face[1::2], face[-1]
-        self.face_range_m[here] = far / np.maximum(count, 1 / m)
+        self.coverage[here], self.face_range_m[here] = same, far / np.maximum(count, 1 / m)
         # an edge is misplaced by one or two of m sub-rays; holes of 1/16 to 1 in before a backing showed this error
         total = np.maximum(light[-1], 1e-30)
         spread = np.sqrt(np.maximum(second / total - (first / total) ** 2, 0.0))
         error_m = 1.5 * spread / (m * np.sqrt(np.maximum(light[-1] / strongest, 1 / m)))
         unsure = np.zeros(n, bool) if again is None else again[here] & (error_m > UNSURE_M)
-        self._keep_off_face(here[~unsure], off.numpy().reshape(n, parts)[~unsure], axes[~unsure], weights)
-        return here[unsure]
-
-    def _keep_off_face(self, here: np.ndarray, off: np.ndarray, axes: np.ndarray, weights: np.ndarray) -> None:
-        counts = np.bitwise_count(off).sum(axis=1, dtype=int)
+        off = off.numpy().reshape(n, parts)
+        counts = np.where(unsure, 0, np.bitwise_count(off).sum(axis=1, dtype=int))
         steps, some = np.maximum(counts // KEPT, 1), counts > 0
-        kept = -(-counts // steps)
+        kept = -(-counts // steps)[some]
         slopes = np.empty((kept.sum(), 2), np.float32)
-        _slopes_kept(off, steps, axes, weights, slopes)
-        self.off_face.append(OffFace(here[some], kept[some], counts[some] / weights.shape[1], slopes))
+        _slopes_kept(off[some], steps[some], axes[some], weights, slopes)
+        self.off_face.append(OffFace(here[some], kept, counts[some] / m, slopes))
+        return here[unsure]
 
 
 @numba.njit(**FAST)
 def _slopes_kept(off, steps, axes, weights, slopes):  # type: ignore[no-untyped-def]
     """Write the slopes of every ``steps`` (n,)-th of a pixel's sub-rays whose bit is set in ``off`` (n, m / A_LANE)."""
-    at = 0
+    at, ray = 0, np.zeros(3)
     for i in range(off.shape[0]):
         number = 0
         for j in range(weights.shape[1]):
             if off[i, j // A_LANE] >> (j % A_LANE) & 1:
                 if number % steps[i] == 0:
-                    x = y = z = 0.0
-                    for k in range(weights.shape[0]):
-                        x += axes[i, 0, k] * weights[k, j]
-                        y += axes[i, 1, k] * weights[k, j]
-                        z += axes[i, 2, k] * weights[k, j]
-                    slopes[at, 0], slopes[at, 1] = x / z, y / z
+                    ray[:] = 0.0
+                    for c in range(3):
+                        for k in range(weights.shape[0]):
+                            ray[c] += axes[i, c, k] * weights[k, j]
+                    slopes[at, 0], slopes[at, 1] = ray[0] / ray[2], ray[1] / ray[2]
                     at += 1
                 number += 1
 
@@ -250,13 +248,10 @@ def direct_light(
     edge = ndimage.binary_dilation(edge, np.ones((reach, reach), bool))
     fine = edge if roughly is None else edge & ~roughly
     rest, bent = ~fine.ravel(), ((bend_m > BENT_M) | edge).ravel()
-    sums.add(np.flatnonzero(rest & ~bent & (central.surface >= 0)), footprint.grid(), plane=True)
-    for here in _chunks(np.flatnonzero(rest & bent), COARSE**2):
-        sums.add(here, footprint.grid())
-    again = None if closely is None else closely.ravel() > 0
-    unsure = [sums.add(here, footprint.lattice(), again) for here in _chunks(np.flatnonzero(fine), FINE)]
-    for here in _chunks(np.concatenate([np.zeros(0, int), *unsure]), FINEST):
-        sums.add(here, footprint.lattice(FINEST))
+    sums.add_all(rest & ~bent & (central.surface >= 0), footprint.grid(), plane=True)
+    sums.add_all(rest & bent, footprint.grid())
+    unsure = sums.add_all(fine.ravel(), footprint.lattice(), None if closely is None else closely.ravel() > 0)
+    sums.add_all(unsure, footprint.lattice(FINEST))
     return DirectLight(
         phasor=sums.phasor.reshape(-1, *shape),
         intensity=sums.intensity.reshape(shape),
@@ -269,11 +264,6 @@ def direct_light(
         face_range_m=sums.face_range_m.reshape(shape),
         off_face=OffFace(*map(np.concatenate, zip(*sums.off_face, strict=True))),
     )
-
-
-def _chunks(pixels: np.ndarray, per_pixel: int) -> list[np.ndarray]:
-    at_once = RAYS_AT_ONCE // per_pixel
-    return [pixels[begin : begin + at_once] for begin in range(0, len(pixels), at_once)]
 
 
 def _corners(lit: LitScene, corner: np.ndarray, slopes: np.ndarray, central: Hits) -> tuple[np.ndarray, np.ndarray]:

@@ -82,9 +82,8 @@ ALIGNED_BYTES = 64  # of inputs: Dr.Jit uses memory of NumPy as it is, and compi
 
 def on_device(kind: Any, values: np.ndarray) -> Any:
     """Return values (n,) as a Dr.Jit array of ``kind``, aligned, so that kernels are compiled once for all boards."""
-    dtype = np.dtype(np.uint32 if kind.__name__.startswith("UInt") else np.float32)
-    room = np.empty(values.size + ALIGNED_BYTES // dtype.itemsize, dtype)
-    placed = room[-room.ctypes.data % ALIGNED_BYTES // dtype.itemsize :][: values.size]
+    room = np.empty(values.size + ALIGNED_BYTES // 4, np.uint32 if kind.__name__ == "UInt" else np.float32)
+    placed = room[-room.ctypes.data % ALIGNED_BYTES // 4 :][: values.size]
     placed[:] = values
     return kind(placed)
 

@@ -87,8 +87,7 @@ def gather_at_points(
         u2 = (mi.Float(cell // CELLS) + u2) / CELLS
         return *drawn(place, u1, u2), 1 / dr.gather(mi.Float, density, cell), mi.Float(0.0)
 
-    none = np.zeros(len(points_m), int)
-    return _gather(lit, start, work, none + samples, none, bright)
+    return _gather(lit, start, work, np.full(len(points_m), samples), np.zeros(len(points_m)), bright)
 
 
 def gather_in_pixels(
@@ -303,7 +302,6 @@ def face_light(
     """Return the indirect light (f + 1, n) by way of the face (without its holes) in the pixels that see any of it, in
     the order of `numpy.nonzero` of ``direct.face[-1]``, and its noise of range (n,) in metres."""
     seen = direct.face[-1].real > 0
-    total = direct.phasor[:, seen]
     rays = np.concatenate([slopes[seen], np.ones((int(seen.sum()), 1))], axis=-1)
     rays *= (direct.face_range_m[seen] / np.linalg.norm(rays, axis=-1))[..., None]
     x_seen, y_seen, _ = transform_points(invert(target.T_camera_board), rays).T
@@ -321,24 +319,22 @@ def face_light(
     bright[:3, 3] = transform_points(T_camera_board, np.append((low + high) / 2, 0.0))
     bright[:3, :2] *= (high - low) / 2
     light = gather_at_points(lit, position, normals, work, config.face_samples, bright)
-    few, share, count = noise_lines(work.frequencies_hz), direct.face[:, seen], int(seen.sum())
-    mean, off = light.mean(axis=0, dtype=complex), light[:, few] - light[:, few].mean(axis=0)
+    few, mean = noise_lines(work.frequencies_hz), np.ascontiguousarray(light.mean(axis=0, dtype=complex).T)
+    off = np.ascontiguousarray(np.moveaxis(light[:, few] - light[:, few].mean(axis=0), 2, 0), complex)
     place = np.stack([(x_seen - xs[0]) / (xs[1] - xs[0]), (y_seen - ys[0]) / (ys[1] - ys[0])])
     weights = range_weights(tuple(work.frequencies_hz[k] for k in few))
-    found, noise_m = np.empty((len(share), count), complex), np.empty(count)
-    of_nodes = np.ascontiguousarray(mean.T), np.ascontiguousarray(np.moveaxis(off, 2, 0), complex)
-    _between_nodes(place, (len(xs), len(ys)), *of_nodes, np.array(few), weights, share, total, found, noise_m)
-    return found, noise_m
+    around = place, (len(xs), len(ys)), mean, off, np.array(few), weights
+    return _between_nodes(*around, direct.face[:, seen], direct.phasor[:, seen])
 
 
 @numba.njit(**FAST)
-def _between_nodes(place, size, mean, off, few, weights, share, total, found, noise_m):  # type: ignore[no-untyped-def]
+def _between_nodes(place, size, mean, off, few, weights, share, total):  # type: ignore[no-untyped-def]
     """Interpolate light between nodes, bilinearly, at places (2, n) in steps of the nodes (``size``: their columns and
-    rows): ``mean`` (nodes, f + 1), and its batches' deviations ``off`` (nodes, B, l) at lines ``few``. Write light
+    rows): ``mean`` (nodes, f + 1), and its batches' deviations ``off`` (nodes, B, l) at lines ``few``. Return light
     times ``share`` (f + 1, n), and its noise of range when added to ``total`` (f, n). The error is (s/D)^2/8 for a
     spacing s and a distance D of the light source: 2e-3 at 80 mm and 0.7 m."""
     batches, lines = off.shape[1:]
-    turn = np.zeros(lines, np.complex128)
+    found, noise_m, turn = np.empty_like(share), np.empty(place.shape[1]), np.zeros(lines, np.complex128)
     for i in range(place.shape[1]):
         c, r = min(max(int(place[0, i]), 0), size[0] - 2), min(max(int(place[1, i]), 0), size[1] - 2)
         p, q = place[0, i] - c, place[1, i] - r
@@ -363,6 +359,7 @@ def _between_nodes(place, size, mean, off, few, weights, share, total, found, no
                 change += (turn[line] * value).imag
             square += change * change
         noise_m[i] = np.sqrt(square / (batches - 1) / batches)
+    return found, noise_m
 
 
 RIM_PX = 3  # rendered surroundings of the board's outline, so that its rim looks as on the whole sensor
@@ -447,7 +444,7 @@ def indirect_light(
     work, rays = PathWork(frequencies, config.bounces, config.seed), direct.off_face
     here, share, within = rays.pixel, rays.share, inside.ravel()[rays.pixel]
     if here.size:
-        light = _light_in_pixels(lit, rays, total[:, here], within, shape, work, config)
+        light = _light_in_pixels(lit, direct, total[:, here], within, work, config)
         mean = share * light.mean(axis=0, dtype=complex)
         indirect[:, here] += mean
         total[:, here] += mean[:-1]
@@ -456,18 +453,13 @@ def indirect_light(
 
 
 def _light_in_pixels(
-    lit: LitScene,
-    rays: OffFace,
-    total: np.ndarray,
-    within: np.ndarray,
-    shape: tuple[int, ...],
-    work: PathWork,
-    config: RenderConfig,
+    lit: LitScene, direct: DirectLight, total: np.ndarray, within: np.ndarray, work: PathWork, config: RenderConfig
 ) -> np.ndarray:
     """Return the light (B, f + 1, p) of paths; ``total`` (f, p): all other light. In the pixels ``within`` (p,), the
     first paths of the pixels around show how many reduce the noise of range to ``hole_noise_mm``. A pixel's own do not
     decide: those that missed rare bright light would end too soon, and the mean would be biased."""
-    first, share, f = min(FIRST_SAMPLES, config.hole_samples), rays.share, work.frequencies_hz
+    first, rays, f = min(FIRST_SAMPLES, config.hole_samples), direct.off_face, work.frequencies_hz
+    share, shape = rays.share, direct.range_m.shape
     light = gather_in_pixels(lit, rays, work, np.where(within, first, config.rest_samples))
     mean = light.mean(axis=0, dtype=complex)
     noise_m = range_noise_m(share * light[:, noise_lines(f)], total + share * mean[:-1], f)

@@ -94,7 +94,8 @@ def compared(scene: Scene, title: str, here: np.ndarray, paths: int, most: int) 
     picked = slice(None, None, max(len(rows) // most, 1))
     rows, cols = rows[picked], cols[picked]
     frequencies = scene.optics.frequencies_hz
-    slopes = Quadrilaterals(scene.optics.lens, scene.view.region).coarse(rows, cols, SIDE)
+    footprint = Quadrilaterals(scene.optics.lens, scene.view.region)
+    slopes = footprint.slopes(rows, cols, footprint.grid(SIDE))
     hits = cast(scene.lit, slopes.reshape(-1, 2))
     turned = hits.amplitude * np.exp(1j * wave_numbers(frequencies)[:, None] * hits.path_m)
     direct = turned.reshape(len(frequencies), -1, SIDE**2).mean(axis=-1)
