@@ -20,8 +20,7 @@ KINK_M, BENT_M = 2e-5, 2e-6
 a strip of tape. Up to the second, its light follows from that plane without casting sub-rays."""
 UNSURE_M = 1e-4  # pixels whose direct light may be wrong by more are sampled once more, finely
 UNEVEN = 0.2  # relative spread of direct light in a footprint that indicates the edge of a shadow
-FAST: Any = {"cache": True, "fastmath": {"contract", "reassoc", "nsz"}, "nogil": True}
-"""Options for compilation. Sums are in float64; their order changes a range by 1e-14 m."""
+FAST: Any = {"cache": True, "fastmath": {"contract", "reassoc", "nsz"}, "nogil": True}  # options for compilation
 COMB_TOLERANCE = 1e-9  # largest deviation from even spacing, relative to the highest frequency, for the recurrence
 Frequencies = tuple[float, ...]
 
@@ -159,7 +158,6 @@ class _Sums:
             is_face, clear = (on_device(mi.UInt32, e[here]) > 0 for e in (central.on_face, central.amplitude > 0))
 
         def meet(ray: Any) -> tuple[Met, Any, Any, Any]:
-            """Return the hits of rays, their light, the way to the emitter, and whether they are on the face."""
             if plane:
                 far, there = height / dr.dot(normal, ray), mi.Bool(True)
                 met = Met(there, far, mi.Point3f(far * ray), normal, mi.UInt32(own), mi.UInt32(0), -ray)

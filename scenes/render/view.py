@@ -90,9 +90,7 @@ def gather_at_points(
     return _gather(lit, start, work, np.full(len(points_m), samples), np.zeros(len(points_m)), bright)
 
 
-def gather_in_pixels(
-    lit: LitScene, rays: OffFace, work: PathWork, samples: int | np.ndarray, after: int = 0
-) -> np.ndarray:
+def gather_in_pixels(lit: LitScene, rays: OffFace, work: PathWork, samples: Any, after: int = 0) -> np.ndarray:
     """Gather indirect light, the mean over the listed sub-rays of each pixel, with ``samples`` paths, (p,) or one, that
     follow the first ``after``. All begin where a sub-ray ends, which is found once."""
     mi, dr = lit.mi, lit.dr
@@ -188,11 +186,10 @@ class _Walk:
     def __init__(self, lit: LitScene, start: Any, work: PathWork, turns: np.ndarray, bright: Any, longest: int) -> None:
         self.lit, self.start, self.work = lit, start, work
         mi, dr = lit.mi, lit.dr
-        self.turns = on_device(mi.UInt32, turns)
+        self.turns, self.stream = on_device(mi.UInt32, turns), dr.opaque(mi.UInt32, work.seed * 1024)
         self.dimensions = START_DIMENSIONS + PER_VERTEX * (work.bounces + 1)
         self.table = mi.Float(_sobol(self.dimensions, longest, work.seed))
         self.batch_points, self.aim = dr.opaque(mi.UInt32, longest), None
-        self.stream = dr.opaque(mi.UInt32, work.seed * 1024)
         if bright is not None:
             self.aim = tuple(mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in bright[:3, k])) for k in (0, 1, 3))
 

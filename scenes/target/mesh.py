@@ -33,7 +33,7 @@ MAX_TEXELS = 4096  # along a side: a board of metres gets coarser texels instead
 MOST_IMAGE_BYTES = 1 << 28
 LINE_WEIGHT, FIBRE_WEIGHT = 0.8, 0.6  # of growth lines and fibres in the pattern: guesses, as are the lengths below
 WANDER_MM, WANDER_ACROSS_MM, WANDER_ALONG_MM = 6.0, 60.0, 240.0  # of growth lines: deviation, lengths across, along x
-FIBRE_LENGTH_MM, FIBRE_WIDTH_MM = 12.0, 0.5  # correlation lengths of the fibres along and across x
+FIBRE_MM = 0.5, 12.0  # correlation lengths of the fibres across and along x
 
 
 def grain(material: MaterialConfig, width_mm: float, height_mm: float) -> np.ndarray:
@@ -52,8 +52,7 @@ def grain(material: MaterialConfig, width_mm: float, height_mm: float) -> np.nda
     # late wood: a thin dark line at the end of each ring, after a slow fall
     rise = turns % 1.0
     lines, noise = _normalised(-rise * rise * rise), stream.standard_normal(shape, dtype=np.float32)
-    deviations = (length / texel_mm for length in (FIBRE_WIDTH_MM, FIBRE_LENGTH_MM))
-    across, along = (cv2.getGaussianKernel(2 * int(3 * each + 0.5) + 1, each) for each in deviations)
+    across, along = (cv2.getGaussianKernel(2 * int(3 * s + 0.5) + 1, s) for s in np.divide(FIBRE_MM, texel_mm))
     fibres = cv2.sepFilter2D(noise, -1, along, across, borderType=cv2.BORDER_REFLECT)
     return _normalised(LINE_WEIGHT * lines + FIBRE_WEIGHT * _normalised(fibres))
 
