@@ -89,9 +89,9 @@ def layered_view(
 
     phasor, (intensity, share) = np.zeros((len(waves), *region.shape), complex), np.zeros((2, *region.shape))
     pixels = np.ones(region.shape, bool)
-    for sub_rays in (footprint.coarse, footprint.fine):  # fine where a pixel's or a neighbour's footprint meets an edge
+    for weights in (footprint.grid(), footprint.lattice()):  # where a pixel's or a neighbour's footprint meets an edge
         rows, cols = np.nonzero(pixels)
-        on_front, _, light, path_m, shadowed = meet(sub_rays(rows, cols))
+        on_front, _, light, path_m, shadowed = meet(footprint.slopes(rows, cols, weights))
         for line, wave in enumerate(waves):
             phasor[line, pixels] = (light * np.exp(1j * wave * path_m)).mean(axis=-1)
         intensity[pixels], share[pixels] = light.mean(axis=-1), on_front.mean(axis=-1)

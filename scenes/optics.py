@@ -84,22 +84,27 @@ class Quadrilaterals:
         v, u = np.mgrid[region.row0 : region.row1 + 1, region.col0 : region.col1 + 1] - 0.5
         self.corner = lens.slopes(u, v)
 
-    def coarse(self, rows: np.ndarray, cols: np.ndarray, side: int = COARSE) -> np.ndarray:
-        """Return slopes (n, side^2, 2) of the centres of side x side cells of each pixel, row by row."""
-        place = (np.arange(side) + 0.5) / side
-        fy, fx = np.meshgrid(place, place, indexing="ij")
-        return self._placed(rows, cols, fx.ravel(), fy.ravel())
+    def axes(self, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
+        """Return (n, 3, k): a pixel's sub-rays are these vectors, weighted by `grid` or `lattice`; z is 1."""
+        c00, c01, c10, c11 = (self.corner[rows + i, cols + j] for i in (0, 1) for j in (0, 1))
+        axes = np.stack([c00, c01 - c00, c10 - c00, c00 - c01 - c10 + c11], axis=-1)
+        return np.concatenate([axes, np.broadcast_to([1.0, 0.0, 0.0, 0.0], (len(axes), 1, 4))], axis=1)
 
-    def fine(self, rows: np.ndarray, cols: np.ndarray, count: int = FINE) -> np.ndarray:
-        """Return slopes (n, count, 2) of sub-rays where a footprint meets an edge."""
+    def grid(self, side: int = COARSE) -> np.ndarray:
+        """Return weights (k, side^2) of the centres of side x side cells of a pixel, row by row."""
+        fy, fx = ((each.ravel() + 0.5) / side for each in np.indices((side, side)))
+        return np.stack([np.ones(side**2), fx, fy, fx * fy])
+
+    def lattice(self, count: int = FINE) -> np.ndarray:
+        """Return weights (k, count) of sub-rays where a footprint meets an edge."""
         number = np.arange(count) + 0.5
-        return self._placed(rows, cols, number / count, (number * GOLDEN) % 1)
+        fx, fy = number / count, (number * GOLDEN) % 1
+        return np.stack([np.ones(count), fx, fy, fx * fy])
 
-    def _placed(self, rows: np.ndarray, cols: np.ndarray, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
-        """Return slopes (n, m, 2) at fractions (m,) of pixels' widths and heights, bilinear."""
-        c00, c01, c10, c11 = (self.corner[rows + i, cols + j].T for i in (0, 1) for j in (0, 1))
-        factors = np.stack([c00, c01 - c00, c10 - c00, c00 - c01 - c10 + c11], axis=-1)
-        return np.moveaxis(factors @ np.stack([np.ones(len(fx)), fx, fy, fx * fy]), 0, -1)
+    def slopes(self, rows: np.ndarray, cols: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Return slopes (n, m, 2) of the sub-rays of pixels with ``weights`` (k, m)."""
+        rays = self.axes(rows, cols) @ weights
+        return np.moveaxis(rays[:, :2] / rays[:, 2:], 1, 2)
 
 
 class Beams(Quadrilaterals):
@@ -114,31 +119,28 @@ class Beams(Quadrilaterals):
         widest = 1 + float((self._slopes**2).sum(axis=-1).max())
         self.reach_px = 1 + int(np.ceil(BEAM_REACH * deviation_rad * widest * max(lens.fx, lens.fy)))
 
-    def coarse(self, rows: np.ndarray, cols: np.ndarray, side: int = COARSE) -> np.ndarray:
-        """Return slopes (n, side^2, 2) of pixels, a grid by rows."""
-        quantile = ndtri((np.arange(side) + 0.5) / side)
-        quantile /= np.sqrt((quantile**2).mean())
-        y, x = np.meshgrid(quantile, quantile, indexing="ij")
-        return self.turned(rows, cols, self._deviation_rad * np.column_stack([x.ravel(), y.ravel()]))
-
-    def fine(self, rows: np.ndarray, cols: np.ndarray, count: int = FINE) -> np.ndarray:
-        """Return slopes (n, count, 2) of sub-rays where a footprint meets an edge."""
-        number = np.arange(count) + 0.5
-        radius = self._deviation_rad * np.sqrt(-2 * np.log1p(-number / count))
-        angle = np.pi * (3 - np.sqrt(5)) * number
-        spiral = radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
-        return self.turned(rows, cols, spiral - spiral.mean(axis=0))
-
-    def turned(self, rows: np.ndarray, cols: np.ndarray, angles: np.ndarray) -> np.ndarray:
-        """Return slopes (n, m, 2) of directions at angles (m, 2) from the central rays, across the beam."""
+    def axes(self, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
+        """Return (n, 3, k): the central ray and two axes across it, for angles."""
         centre = np.concatenate([self._slopes[rows, cols], np.ones((len(rows), 1))], axis=-1)
         centre /= np.linalg.norm(centre, axis=-1, keepdims=True)
         across = np.cross([0.0, 1.0, 0.0], centre)
         across /= np.linalg.norm(across, axis=-1, keepdims=True)
-        down = np.cross(centre, across)
-        aside, below = angles.T
-        x, y, z = (centre[:, k, None] + across[:, k, None] * aside + down[:, k, None] * below for k in range(3))
-        return np.stack([x / z, y / z], axis=-1)
+        return np.stack([centre, across, np.cross(centre, across)], axis=-1)
+
+    def grid(self, side: int = COARSE) -> np.ndarray:
+        """Return weights (k, side^2) of a grid by rows."""
+        quantile = ndtri((np.arange(side) + 0.5) / side)
+        quantile *= self._deviation_rad / np.sqrt((quantile**2).mean())
+        y, x = np.meshgrid(quantile, quantile, indexing="ij")
+        return np.stack([np.ones(side**2), x.ravel(), y.ravel()])
+
+    def lattice(self, count: int = FINE) -> np.ndarray:
+        """Return weights (k, count) of sub-rays where a footprint meets an edge."""
+        number = np.arange(count) + 0.5
+        radius = self._deviation_rad * np.sqrt(-2 * np.log1p(-number / count))
+        angle = np.pi * (3 - np.sqrt(5)) * number
+        spiral = radius * np.stack([np.cos(angle), np.sin(angle)])
+        return np.concatenate([np.ones((1, count)), spiral - spiral.mean(axis=1, keepdims=True)])
 
 
 @dataclass(frozen=True)

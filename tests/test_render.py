@@ -16,7 +16,7 @@ from scenes.closed_form import plane_view
 from scenes.optics import Quadrilaterals, RenderConfig, footprint_of
 from scenes.render import scene as variant
 from scenes.render.cache import cached_view, render_key
-from scenes.render.direct import OffFace, cast, direct_light, phasor_sums
+from scenes.render.direct import OffFace, cast, direct_light
 from scenes.render.scene import lit_scene, load_mitsuba
 from scenes.render.view import (
     PathWork,
@@ -57,7 +57,8 @@ def light_on(lit, lens, region, footprint=CAMERA.optics.beam_fwhm_rad, frequenci
 
 def whole_pixels(lens, region, rows, cols):
     """All sub-rays of pixels, for a path tracer that knows no face."""
-    slopes = Quadrilaterals(lens, region).coarse(rows, cols)
+    footprint = Quadrilaterals(lens, region)
+    slopes = footprint.slopes(rows, cols, footprint.grid())
     count = np.full(len(rows), slopes.shape[1])
     return OffFace(np.arange(len(rows)), count, np.ones(len(rows)), slopes.reshape(-1, 2).astype(np.float32))
 
@@ -351,9 +352,9 @@ def test_direct_light_on_the_face_is_exact_to_ten_micrometres(thesis_view):
     f = np.array(CAMERA.frequencies_hz)[:, None]
     for top in (15, 30, 72):
         rows, cols = (a.ravel() for a in np.meshgrid(np.arange(top, top + 4), np.arange(20, 400), indexing="ij"))
-        hits = cast(lit, Quadrilaterals(lens, region).coarse(rows, cols, 32).reshape(-1, 2))
-        sub = (hits.amplitude.reshape(-1, 32**2), hits.path_m.reshape(-1, 32**2))
-        fine = phasor_sums(*sub, CAMERA.frequencies_hz)
+        footprint = Quadrilaterals(lens, region)
+        hits = cast(lit, footprint.slopes(rows, cols, footprint.grid(32)).reshape(-1, 2))
+        fine = (hits.amplitude * np.exp(1j * WAVE[:, None] * hits.path_m)).reshape(len(f), -1, 32**2).mean(axis=-1)
         turned = np.angle(thesis_view.phasor_direct[:, rows, cols] / fine)
         error_m = (SPEED_OF_LIGHT_AIR * f / (4 * np.pi * (f**2).sum()) * turned).sum(axis=0)
         away = np.abs(thesis_view.range_m[rows, cols] - np.median(thesis_view.range_m[rows, cols])) < 0.2

@@ -41,7 +41,8 @@ def test_direct_light_of_a_glossy_plane_is_that_of_the_closed_form():
     lit = lit_scene(load_mitsuba(), [wall], CAMERA.optics)
     lens = CAMERA.nominal_lens
     rows, cols = (each.ravel() for each in np.mgrid[150:430:7, 150:490:7])
-    slopes = Quadrilaterals(lens, lens.whole).coarse(rows, cols)[:, COARSE]
+    footprint = Quadrilaterals(lens, lens.whole)
+    slopes = footprint.slopes(rows, cols, footprint.grid())[:, COARSE]
     hits = cast(lit, slopes)
     points = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=-1)
     to_light = EMITTER - points

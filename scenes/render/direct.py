@@ -8,18 +8,19 @@ import numba
 import numpy as np
 from scipy import ndimage
 
-from scenes.optics import COARSE, FINE, Quadrilaterals, wave_numbers
-from scenes.render.scene import LitScene
+from scenes.optics import Quadrilaterals, wave_numbers
+from scenes.render.scene import LitScene, Met, on_device
 
 FINEST = 2048  # sub-rays where fewer leave an error in a hole: a dark wall beside a strip of what lies behind it
-RAYS_AT_ONCE = 1 << 22  # sub-rays cast at once: 4 million need 0.6 GB
+FLOATS_AT_ONCE = 1 << 24  # sums held on the device at once, and their footprints: 0.07 GB
+A_LANE = 16  # sub-rays of one lane: a divisor of all numbers of sub-rays, at most 32 bits
+KEPT = 32  # at least so many of a pixel's sub-rays off the face, or all, are starts of paths
 KINK_M, BENT_M = 2e-5, 2e-6
 """If a pixel's corners lie farther than the first off the plane at its centre, there is an edge in it, such as that of
 a strip of tape. Up to the second, its light follows from that plane without casting sub-rays."""
 UNSURE_M = 1e-4  # pixels whose direct light may be wrong by more are sampled once more, finely
 UNEVEN = 0.2  # relative spread of direct light in a footprint that indicates the edge of a shadow
-FAST: Any = {"cache": True, "fastmath": {"contract", "reassoc", "nsz"}, "nogil": True}
-"""Options for compilation. Sums are in float64; their order changes a range by 1e-14 m."""
+FAST: Any = {"cache": True, "fastmath": {"contract", "reassoc", "nsz"}, "nogil": True}  # options for compilation
 COMB_TOLERANCE = 1e-9  # largest deviation from even spacing, relative to the highest frequency, for the recurrence
 Frequencies = tuple[float, ...]
 
@@ -33,51 +34,24 @@ def comb_step(frequencies_hz: tuple[float, ...]) -> float | None:
     return float(steps.mean()) if even else None
 
 
-def phasor_sums(amplitude: np.ndarray, path_m: np.ndarray, frequencies_hz: tuple[float, ...]) -> np.ndarray:
-    """Return the mean over sub-rays of a exp(i 2 pi f L / c), (f, n) complex128, from amplitudes and paths (n, m). For
-    a comb, each phasor is the previous one times that of the spacing; rounding grows to 1e-14 over 100 lines."""
-    waves = wave_numbers(frequencies_hz)
-    out = np.empty((len(waves), len(path_m)), np.complex128)
-    amplitude, path_m = np.ascontiguousarray(amplitude), np.ascontiguousarray(path_m)
-    step = comb_step(frequencies_hz)
-    if step is None:
-        _sum_list(amplitude, path_m, waves, out)
+def added(totals: list[Any], light: Any, length: Any, frequencies_hz: Frequencies) -> list[Any]:
+    """Add light after a path's length to real and imaginary sums by frequency, intensity last; for a comb, each phasor
+    is the previous one times that of the spacing."""
+    import drjit as dr
+
+    out, waves, step_hz = [], wave_numbers(frequencies_hz), comb_step(frequencies_hz)
+    if step_hz is None:
+        for number in waves:
+            sine, cosine = dr.sincos(float(number) * length)
+            out += [light * cosine, light * sine]
     else:
-        _sum_comb(amplitude, path_m, float(waves[0]), float(wave_numbers((step,))[0]), out)
-    return out
-
-
-@numba.njit(**FAST)
-def _sum_list(amplitude: np.ndarray, path_m: np.ndarray, waves: np.ndarray, out: np.ndarray) -> None:
-    n, m = path_m.shape
-    for i in range(n):
-        for k in range(waves.size):
-            re = im = 0.0
-            for j in range(m):
-                phase = waves[k] * path_m[i, j]
-                re += amplitude[i, j] * np.cos(phase)
-                im += amplitude[i, j] * np.sin(phase)
-            out[k, i] = complex(re / m, im / m)
-
-
-@numba.njit(**FAST)
-def _sum_comb(amplitude: np.ndarray, path_m: np.ndarray, first: float, step: float, out: np.ndarray) -> None:
-    n, m = path_m.shape
-    re, im, cosine, sine = np.empty(m), np.empty(m), np.empty(m), np.empty(m)
-    for i in range(n):
-        for j in range(m):
-            re[j] = amplitude[i, j] * np.cos(first * path_m[i, j])
-            im[j] = amplitude[i, j] * np.sin(first * path_m[i, j])
-            cosine[j], sine[j] = np.cos(step * path_m[i, j]), np.sin(step * path_m[i, j])
-        for k in range(out.shape[0]):
-            sum_re = sum_im = 0.0
-            for j in range(m):
-                sum_re += re[j]
-                sum_im += im[j]
-                turned = re[j] * cosine[j] - im[j] * sine[j]
-                im[j] = re[j] * sine[j] + im[j] * cosine[j]
-                re[j] = turned
-            out[k, i] = complex(sum_re / m, sum_im / m)
+        sine, cosine = dr.sincos(float(waves[0]) * length)
+        turn_sine, turn_cosine = dr.sincos(float(wave_numbers((step_hz,))[0]) * length)
+        re, im = light * cosine, light * sine
+        for _ in waves:
+            out += [re, im]
+            re, im = re * turn_cosine - im * turn_sine, re * turn_sine + im * turn_cosine
+    return [total + part for total, part in zip(totals, [*out, light], strict=True)]
 
 
 class Hits(NamedTuple):
@@ -96,7 +70,8 @@ class Hits(NamedTuple):
 
 class OffFace(NamedTuple):
     """Sub-rays that met something other than the undamaged face. ``pixel`` (p,): flat indices of pixels that have any,
-    ``counts`` (p,): their number, ``share`` (p,): of the footprint; ``slopes`` (sum of counts, 2) float32, by pixel."""
+    ``share`` (p,): theirs of the footprint, ``counts`` (p,): the number of those that stand for all (every second if
+    there are twice KEPT, and so on), ``slopes`` (sum of counts, 2) float32: these, by pixel."""
 
     pixel: np.ndarray
     counts: np.ndarray
@@ -129,129 +104,124 @@ class DirectLight(NamedTuple):
 def cast(lit: LitScene, slopes: np.ndarray) -> Hits:
     """Cast rays from the lens along ``slopes`` (n, 2) = x/z, y/z."""
     mi, dr = lit.mi, lit.dr
-    x, y = (mi.Float(np.ascontiguousarray(each, np.float32)) for each in slopes.T)
-    met = lit.meet(mi.Point3f(0.0), dr.normalize(mi.Vector3f(x, y, 1.0)))
-    arriving, leg = lit.arriving(met, met.valid)
+    x, y = (on_device(mi.Float, each) for each in slopes.T)
+    met = lit.meet(mi.Point3f(0.0), dr.normalize(mi.Vector3f(x, y, 1.0)), coherent=True)
+    arriving, leg = lit.arriving(met, coherent=True)
     albedo, uv = lit.albedo(met), lit.uv(met.place)
     range_m = dr.select(met.valid, met.distance, dr.nan)
     path_m, amplitude = dr.select(met.valid, met.distance + leg, 0), albedo * arriving
     surface = dr.select(met.valid, mi.Int32(met.surface), -1)
     on_face = dr.gather(mi.Bool, lit.on_face, met.triangle, met.valid)
-    found = range_m, path_m, amplitude, albedo, surface, uv, on_face, met.normal
+    found = range_m, path_m, amplitude, albedo, surface, *uv, on_face, *met.normal
     dr.eval(*found)
-    return Hits(*(each.numpy().T for each in found))
-
-
-@numba.njit(**FAST)
-def _even_moments(  # type: ignore[no-untyped-def]
-    slopes, centre, normal, emitter, albedo, texture, uv_of, to_light, to_face
-):
-    """Sum a pixel's light over sub-rays ``slopes`` (n, m, 2) on the plane of its ``centre`` and ``normal`` (n, 3). The
-    moments (4, n) have orders 0 to 3: of amplitude (1 at the centre, times the albedo) about the centre's path, and of
-    the albedo about its range. ``albedo`` (n,): negative where ``texture`` gives it."""
-    rows, columns = texture.shape
-    n, m, _ = slopes.shape
-    for i in range(n):
-        x0, y0, z0 = centre[i]
-        nx, ny, nz = normal[i]
-        height = nx * x0 + ny * y0 + nz * z0
-        ex, ey, ez = emitter[0] - x0, emitter[1] - y0, emitter[2] - z0
-        leg0 = np.sqrt(ex * ex + ey * ey + ez * ez)
-        range0 = np.sqrt(x0 * x0 + y0 * y0 + z0 * z0)
-        facing0 = (nx * ex + ny * ey + nz * ez) / leg0**3
-        for j in range(m):
-            z = height / (nx * slopes[i, j, 0] + ny * slopes[i, j, 1] + nz)
-            x, y = slopes[i, j, 0] * z, slopes[i, j, 1] * z
-            range_m = np.sqrt(x * x + y * y + z * z)
-            dx, dy, dz = emitter[0] - x, emitter[1] - y, emitter[2] - z
-            leg = np.sqrt(dx * dx + dy * dy + dz * dz)
-            a = albedo[i]
-            if a < 0.0:
-                u = uv_of[0, 0] * x + uv_of[0, 1] * y + uv_of[0, 2] * z + uv_of[0, 3]
-                v = uv_of[1, 0] * x + uv_of[1, 1] * y + uv_of[1, 2] * z + uv_of[1, 3]
-                across = min(max(u * columns - 0.5, 0.0), columns - 1.0)
-                down = min(max(v * rows - 0.5, 0.0), rows - 1.0)
-                c, r = min(int(across), columns - 2), min(int(down), rows - 2)
-                p, q = across - c, down - r
-                above = (1.0 - p) * texture[r, c] + p * texture[r, c + 1]
-                a = (1.0 - q) * above + q * ((1.0 - p) * texture[r + 1, c] + p * texture[r + 1, c + 1])
-            light = a * (nx * dx + ny * dy + nz * dz) / leg**3 / facing0 if facing0 > 0.0 else 0.0
-            longer, farther = range_m + leg - range0 - leg0, range_m - range0
-            for order in range(4):
-                to_light[order, i] += light / m
-                to_face[order, i] += a / m
-                light *= longer
-                a *= farther
-
-
-def _of_moments(moments: np.ndarray, about_m: np.ndarray, frequencies_hz: tuple[float, ...]) -> np.ndarray:
-    """Return phasors (f, n) from moments (4, n) of lengths about ``about_m`` (n,): a series, 1e-6 off at 0.07 rad."""
-    waves = wave_numbers(frequencies_hz)[:, None]
-    zeroth, first, second, third = moments
-    series = zeroth - waves**2 * second / 2 + 1j * (waves * first - waves**3 * third / 6)
-    return np.asarray(series * np.exp(1j * waves * about_m))
+    # one by one: to interleave them, Dr.Jit would compile a kernel for each number of rays
+    far, path, light, own, which, u, v, face, nx, ny, nz = (each.numpy() for each in found)
+    return Hits(far, path, light, own, which, np.column_stack([u, v]), face, np.column_stack([nx, ny, nz]))
 
 
 class _Sums:
     """Sums of direct light of a region's pixels, flat; fields as in `DirectLight`."""
 
-    def __init__(
-        self, lit: LitScene, slopes: np.ndarray, footprint: Quadrilaterals, frequencies_hz: Frequencies
-    ) -> None:
-        self.lit, self.footprint, self.frequencies_hz = lit, footprint, frequencies_hz
-        self.slopes, (h, w), lines = slopes.reshape(-1, 2), slopes.shape[:2], len(frequencies_hz)
+    def __init__(self, lit: LitScene, slopes: np.ndarray, footprint: Quadrilaterals, f: Frequencies) -> None:
+        self.lit, self.footprint, self.frequencies_hz = lit, footprint, f
+        self.slopes, (h, w), lines = slopes.reshape(-1, 2), slopes.shape[:2], len(f)
         self.rows, self.cols = np.divmod(np.arange(h * w), w)
         self.central = cast(lit, self.slopes)
         self.phasor, self.face = np.zeros((lines, h * w), complex), np.zeros((lines + 1, h * w), complex)
         self.intensity, self.coverage, self.face_range_m = np.zeros(h * w), np.ones(h * w), np.zeros(h * w)
-        self.off_face: list[OffFace] = []
+        none = np.zeros(0, int)
+        self.off_face = [OffFace(none, none, np.zeros(0), np.zeros((0, 2), np.float32))]
 
-    def add_plane(self, here: np.ndarray) -> None:
-        """Add the light of pixels that see a single plane, from the hits of their centres."""
-        lit, central, frequencies = self.lit, self.central, self.frequencies_hz
-        rays, range_m = self.footprint.coarse(self.rows[here], self.cols[here]), central.range_m[here].astype(float)
-        ray = np.column_stack([self.slopes[here], np.ones(len(here))])
-        centre = ray * (range_m / np.linalg.norm(ray, axis=1))[:, None]
-        albedo, to_light, to_face = central.albedo[here].astype(float), *np.zeros((2, 4, len(here)))
-        plain = np.where(central.surface[here] == lit.textured, -1.0, albedo)
-        texture = np.zeros((2, 2), np.float32) if lit.texture is None else lit.parts[lit.textured].texture_850
-        normal = central.normal[here].astype(float)
-        _even_moments(rays, centre, normal, lit.emitter_m, plain, texture, lit.uv_of, to_light, to_face)
-        to_light *= np.divide(central.amplitude[here], albedo, out=np.zeros(len(here)), where=albedo > 0)
-        self.phasor[:, here] = _of_moments(to_light, central.path_m[here].astype(float), frequencies)
-        self.intensity[here] = to_light[0]
-        on = central.on_face[here]
-        self.face[:-1, here[on]] = _of_moments(to_face[:, on], range_m[on], frequencies)
-        self.face[-1, here[on]], self.face_range_m[here[on]] = to_face[0, on], range_m[on]
-        self._keep_off_face(here[~on], np.ones((int((~on).sum()), rays.shape[1]), bool), rays[~on])
+    def add_all(self, wanted: np.ndarray, weights: np.ndarray, again: Any = None, plane: bool = False) -> np.ndarray:
+        """Call `add` for the pixels ``wanted`` (h w,), so many at once as memory allows; return a mask as well."""
+        here, unsure = np.flatnonzero(wanted), np.zeros(len(wanted), bool)
+        at_once = max(FLOATS_AT_ONCE * A_LANE // weights.shape[1] // (4 * len(self.frequencies_hz) + 24), 1)
+        for begin in range(0, len(here), at_once):
+            unsure[self.add(here[begin : begin + at_once], weights, again, plane)] = True
+        return unsure
 
-    def add_rays(self, here: np.ndarray, rays: np.ndarray, again: np.ndarray | None = None) -> np.ndarray:
-        """Add the light of sub-rays (n, m, 2) of pixels. Return those of ``again`` (h w,) that need finer sampling."""
-        m = rays.shape[1]
-        hits = cast(self.lit, rays.reshape(-1, 2))
-        range_m, path_m, amplitude, albedo, surface = (each.reshape(-1, m) for each in hits[:5])
-        on_face = hits.on_face.reshape(-1, m)
-        self.phasor[:, here] = phasor_sums(amplitude, path_m, self.frequencies_hz)
-        self.intensity[here] = amplitude.mean(axis=1, dtype=float)
-        self.coverage[here] = (surface == self.central.surface[here, None]).mean(axis=1)
-        some = on_face.any(axis=1)
-        chosen = here[some]
-        lit_albedo, to_face = (np.where(on_face[some], each[some], 0.0) for each in (albedo, range_m))
-        self.face[:, here], self.face_range_m[here] = 0, 0
-        self.face[:-1, chosen] = phasor_sums(lit_albedo, to_face, self.frequencies_hz)
-        self.face[-1, chosen] = lit_albedo.mean(axis=1)
-        self.face_range_m[chosen] = to_face.sum(axis=1) / on_face[some].sum(axis=1)
-        unsure = np.zeros(len(here), bool)
-        if again is not None:
-            unsure = again[here]
-            unsure[unsure] = _error_m(amplitude[unsure], path_m[unsure]) > UNSURE_M
-        self._keep_off_face(here[~unsure], (~on_face & (surface >= 0))[~unsure], rays[~unsure])
+    def add(self, here: np.ndarray, weights: np.ndarray, again: Any = None, plane: bool = False) -> np.ndarray:
+        """Add the light of the footprints' sub-rays axes (n, 3, k) @ ``weights`` (k, m) in pixels; no rays are cast if
+        each pixel sees only the ``plane`` at its centre. Return those of ``again`` (h w,) that need finer sampling."""
+        mi, dr, central, f = self.lit.mi, self.lit.dr, self.central, self.frequencies_hz
+        axes, m, lines = self.footprint.axes(self.rows[here], self.cols[here]), weights.shape[1], len(f)
+        (n, _, k), parts = axes.shape, m // A_LANE
+        pixel, part = np.divmod(np.arange(n * parts), parts)
+        axis = [on_device(mi.Float, each[pixel]) for each in axes.reshape(n, -1).T]
+        table, begin = [on_device(mi.Float, each) for each in weights], on_device(mi.UInt32, part * A_LANE)
+        middle, own = (on_device(mi.Float, each[here][pixel]) for each in (central.path_m, central.surface))
+        if plane:
+            ray = np.column_stack([self.slopes[here], np.ones(n)])
+            ray *= (central.range_m[here] / np.linalg.norm(ray, axis=1))[:, None]
+            height = on_device(mi.Float, (central.normal[here] * ray).sum(axis=1))
+            normal = mi.Normal3f(*(on_device(mi.Float, each) for each in central.normal[here].T))
+            is_face, clear = (on_device(mi.UInt32, e[here]) > 0 for e in (central.on_face, central.amplitude > 0))
+
+        def meet(ray: Any) -> tuple[Met, Any, Any, Any]:
+            if plane:
+                far, there = height / dr.dot(normal, ray), mi.Bool(True)
+                met = Met(there, far, mi.Point3f(far * ray), normal, mi.UInt32(own), mi.UInt32(0), -ray)
+                return met, *self.lit.arriving(met, clear=clear), is_face
+            met = self.lit.meet(mi.Point3f(0.0), ray, coherent=True)
+            on_face = dr.gather(mi.Bool, self.lit.on_face, met.triangle, met.valid)
+            return met, *self.lit.arriving(met, coherent=True), on_face
+
+        def step(j: Any, off: Any, light: list[Any], face: list[Any], others: list[Any]) -> tuple[Any, ...]:
+            weight = [dr.gather(mi.Float, row, begin + j) for row in table]
+            ray = mi.Vector3f(*(sum(axis[c * k + i] * weight[i] for i in range(k)) for c in range(3)))
+            met, arriving, leg, on_face = meet(dr.normalize(ray))
+            albedo, (count, same, far, first, second, most) = self.lit.albedo(met), others
+            amplitude, longer = albedo * arriving, dr.select(met.valid, met.distance + leg - middle, 0)
+            light = added(light, amplitude, longer + middle, f)
+            face = added(face, dr.select(on_face, albedo, 0), met.distance, f)
+            same = same + dr.select(dr.select(met.valid, mi.Float(met.surface), -1) == own, 1.0, 0.0)
+            far, count = far + dr.select(on_face, met.distance, 0), count + dr.select(on_face, 1.0, 0.0)
+            first, second = first + amplitude * longer, second + amplitude * dr.square(longer)
+            off = off | dr.select(met.valid & ~on_face, mi.UInt32(1) << j, 0)
+            return j + 1, off, light, face, [count, same, far, first, second, dr.maximum(most, amplitude)]
+
+        zeros = [[dr.zeros(mi.Float, n * parts) for _ in range(size)] for size in (2 * lines + 1, 2 * lines + 1, 6)]
+        state = (*(dr.zeros(mi.UInt32, n * parts) for _ in range(2)), *zeros)
+        _, off, *found = dr.while_loop(state, lambda j, *_: j < A_LANE, step, label="footprints")
+        dr.eval(off, *found)
+        light, face, others = (np.stack([e.numpy() for e in each]).reshape(-1, n, parts) for each in found)
+        strongest = np.maximum(others[5].max(axis=1), 1e-30)
+        light, face, others = (each.sum(axis=2, dtype=float) / m for each in (light, face, others))
+        count, same, far, first, second, _ = others
+        self.phasor[:, here], self.intensity[here] = light[:-1:2] + 1j * light[1::2], light[-1]
+        self.face[:-1, here], self.face[-1, here] = face[:-1:2] + 1j * face[1::2], face[-1]
+        self.coverage[here], self.face_range_m[here] = same, far / np.maximum(count, 1 / m)
+        # an edge is misplaced by one or two of m sub-rays; holes of 1/16 to 1 in before a backing showed this error
+        total = np.maximum(light[-1], 1e-30)
+        spread = np.sqrt(np.maximum(second / total - (first / total) ** 2, 0.0))
+        error_m = 1.5 * spread / (m * np.sqrt(np.maximum(light[-1] / strongest, 1 / m)))
+        unsure = np.zeros(n, bool) if again is None else again[here] & (error_m > UNSURE_M)
+        off = off.numpy().reshape(n, parts)
+        counts = np.where(unsure, 0, np.bitwise_count(off).sum(axis=1, dtype=int))
+        steps, some = np.maximum(counts // KEPT, 1), counts > 0
+        kept = -(-counts // steps)[some]
+        slopes = np.empty((kept.sum(), 2), np.float32)
+        _slopes_kept(off[some], steps[some], axes[some], weights, slopes)
+        self.off_face.append(OffFace(here[some], kept, counts[some] / m, slopes))
         return here[unsure]
 
-    def _keep_off_face(self, here: np.ndarray, off: np.ndarray, rays: np.ndarray) -> None:
-        counts, (row, column) = off.sum(axis=1), np.nonzero(off)
-        some, kept = counts > 0, np.stack([rays[row, column, k].astype(np.float32) for k in (0, 1)], axis=1)
-        self.off_face.append(OffFace(here[some], counts[some], counts[some] / off.shape[1], kept))
+
+@numba.njit(**FAST)
+def _slopes_kept(off, steps, axes, weights, slopes):  # type: ignore[no-untyped-def]
+    """Write the slopes of every ``steps`` (n,)-th of a pixel's sub-rays whose bit is set in ``off`` (n, m / A_LANE)."""
+    at, ray = 0, np.zeros(3)
+    for i in range(off.shape[0]):
+        number = 0
+        for j in range(weights.shape[1]):
+            if off[i, j // A_LANE] >> (j % A_LANE) & 1:
+                if number % steps[i] == 0:
+                    ray[:] = 0.0
+                    for c in range(3):
+                        for k in range(weights.shape[0]):
+                            ray[c] += axes[i, c, k] * weights[k, j]
+                    slopes[at, 0], slopes[at, 1] = ray[0] / ray[2], ray[1] / ray[2]
+                    at += 1
+                number += 1
 
 
 def direct_light(
@@ -264,24 +234,22 @@ def direct_light(
 ) -> DirectLight:
     """Return the direct light of every pixel of a region with central rays ``slopes`` (h, w, 2). If the rays to a
     pixel's centre and corners meet one evenly lit plane, its light follows from these. Other pixels are sampled by
-    sub-rays: a few on a curved surface, many where the footprint meets an edge or the edge of a shadow and in the
-    pixels ``closely`` (h, w), where more follow if that leaves an error; a few at edges in the pixels ``roughly``."""
+    sub-rays: a few on a curved surface, many where the footprint meets an edge or the edge of a shadow, in the pixels
+    that are 2 in ``closely`` (h, w), and in those that are 1 beside such edges; where that is not 0, more follow if an
+    error is left. There are a few at edges in the pixels ``roughly``."""
     shape, sums = slopes.shape[:2], _Sums(lit, slopes, footprint, frequencies_hz)
-    central, rows, cols = sums.central, sums.rows, sums.cols
+    central = sums.central
     bend_m, edge = _corners(lit, footprint.corner, slopes, central)
-    edge |= False if closely is None else closely
+    if closely is not None:
+        edge |= (closely > 1) | ((closely > 0) & ndimage.binary_dilation(edge, np.ones((3, 3), bool)))
     reach = 2 * footprint.reach_px + 1
     edge = ndimage.binary_dilation(edge, np.ones((reach, reach), bool))
     fine = edge if roughly is None else edge & ~roughly
     rest, bent = ~fine.ravel(), ((bend_m > BENT_M) | edge).ravel()
-    sums.add_plane(np.flatnonzero(rest & ~bent & (central.surface >= 0)))
-    for here in _chunks(np.flatnonzero(rest & bent), COARSE**2):
-        sums.add_rays(here, footprint.coarse(rows[here], cols[here]))
-    again = None if closely is None else closely.ravel()
-    edges = _chunks(np.flatnonzero(fine), FINE)
-    unsure = [sums.add_rays(here, footprint.fine(rows[here], cols[here]), again) for here in edges]
-    for here in _chunks(np.concatenate([np.zeros(0, int), *unsure]), FINEST):
-        sums.add_rays(here, footprint.fine(rows[here], cols[here], FINEST))
+    sums.add_all(rest & ~bent & (central.surface >= 0), footprint.grid(), plane=True)
+    sums.add_all(rest & bent, footprint.grid())
+    unsure = sums.add_all(fine.ravel(), footprint.lattice(), None if closely is None else closely.ravel() > 0)
+    sums.add_all(unsure, footprint.lattice(FINEST))
     return DirectLight(
         phasor=sums.phasor.reshape(-1, *shape),
         intensity=sums.intensity.reshape(shape),
@@ -294,11 +262,6 @@ def direct_light(
         face_range_m=sums.face_range_m.reshape(shape),
         off_face=OffFace(*map(np.concatenate, zip(*sums.off_face, strict=True))),
     )
-
-
-def _chunks(pixels: np.ndarray, per_pixel: int) -> list[np.ndarray]:
-    at_once = RAYS_AT_ONCE // per_pixel
-    return [pixels[begin : begin + at_once] for begin in range(0, len(pixels), at_once)]
 
 
 def _corners(lit: LitScene, corner: np.ndarray, slopes: np.ndarray, central: Hits) -> tuple[np.ndarray, np.ndarray]:
@@ -322,14 +285,3 @@ def _corners(lit: LitScene, corner: np.ndarray, slopes: np.ndarray, central: Hit
         edge |= other != surface
         most, least = np.maximum(most, light), np.minimum(least, light)
     return bend_m, edge | (bend_m > KINK_M) | (most - least > UNEVEN * most)
-
-
-def _error_m(amplitude: np.ndarray, path_m: np.ndarray) -> np.ndarray:
-    """Return the approximate error of range (n,) that m sub-rays (n, m) of a pixel leave: an edge is misplaced by one
-    or two of m sub-rays. Holes of 1/16 to 1 in before a backing showed 3 spread / (2 m sqrt(lit share))."""
-    light = np.maximum(amplitude.sum(axis=1), 1e-30)
-    mean = (amplitude * path_m).sum(axis=1) / light
-    spread = np.sqrt((amplitude * (path_m - mean[:, None]) ** 2).sum(axis=1) / light)
-    strongest = np.maximum(amplitude.max(axis=1), 1e-30)
-    lit_share = np.maximum(amplitude.mean(axis=1) / strongest, 1 / amplitude.shape[1])
-    return np.asarray(1.5 * spread / (amplitude.shape[1] * np.sqrt(lit_share)))

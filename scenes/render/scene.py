@@ -77,6 +77,17 @@ def _point_to_llvm() -> UserError | None:
     return UserError("no LLVM was found that Dr.Jit can use", legal=LEGAL, fix=FIX)
 
 
+ALIGNED_BYTES = 64  # of inputs: Dr.Jit uses memory of NumPy as it is, and compiles a kernel anew for other alignments
+
+
+def on_device(kind: Any, values: np.ndarray) -> Any:
+    """Return values (n,) as a Dr.Jit array of ``kind``, aligned, so that kernels are compiled once for all boards."""
+    room = np.empty(values.size + ALIGNED_BYTES // 4, np.uint32 if kind.__name__ == "UInt" else np.float32)
+    placed = room[-room.ctypes.data % ALIGNED_BYTES // 4 :][: values.size]
+    placed[:] = values
+    return kind(placed)
+
+
 LIFT_M = 1e-5  # of a ray's start from a surface: float32 places hits within 1e-6 m; Mitsuba's default is 0.15 mm
 
 
@@ -99,9 +110,9 @@ class LitScene:
     Mitsuba only finds the hits of rays: one shape without materials needs no virtual calls, so that all scenes share
     their compiled kernels. ``surface_of`` (index into ``parts``), ``normal_of`` and ``on_face`` are by triangle;
     ``albedos`` and, if any surface is glossy, ``gloss`` (share and exponent of the lobes) by surface. The part
-    ``textured`` has ``texture`` at ``uv_of`` (2, 4), an affine function of position; -1, None and zeros if there is
-    none. ``uv_factors``: the same as data, because constants would compile the kernels anew for each board.
-    ``mi``, ``dr``: Mitsuba and Dr.Jit, loaded."""
+    ``textured`` has ``texture``; -1 and None if there is none. Its coordinates are affine in position, by the eight
+    ``uv_factors``: data, because constants would compile the kernels anew for each board. ``mi``, ``dr``: Mitsuba and
+    Dr.Jit, loaded."""
 
     mi: Any
     dr: Any
@@ -117,13 +128,13 @@ class LitScene:
     gloss: tuple[Any, Any] | None
     textured: int
     texture: Any
-    uv_of: np.ndarray
     uv_factors: list[Any]
 
-    def meet(self, origin: Any, direction: Any) -> Met:
-        """Return the first hits of rays along unit directions."""
+    def meet(self, origin: Any, direction: Any, coherent: bool = False) -> Met:
+        """Return the first hits of rays along unit directions. ``coherent``: neighbours are alike, which is a third of
+        the time then, and twice the time otherwise, with the same hits."""
         mi, dr = self.mi, self.dr
-        found = self.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction))
+        found = self.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent)
         valid, triangle = found.is_valid(), found.prim_index
         normal = dr.gather(mi.Normal3f, self.normal_of, triangle, valid)
         surface = dr.gather(mi.UInt32, self.surface_of, triangle, valid)
@@ -157,9 +168,10 @@ class LitScene:
         cosine = dr.dot(2 * dr.dot(normal, viewer) * normal - viewer, direction)
         return 1 - share + share * (exponent + 2) / 2 * dr.power(dr.maximum(cosine, 1e-6), exponent)
 
-    def arriving(self, met: Met, active: Any) -> tuple[Any, Any]:
+    def arriving(self, met: Met, coherent: bool = False, clear: Any = None) -> tuple[Any, Any]:
         """Return the light from the emitter at each hit: (irradiance, distance). The irradiance is cone(direction)
-        cos(incidence) / d^2 times the `lobe`: 1 on a facing surface at 1 m, 0 behind an occluder."""
+        cos(incidence) / d^2 times the `lobe`: 1 on a facing surface at 1 m, 0 behind an occluder and without a hit.
+        ``clear``: where nothing is between, if that is known."""
         mi, dr = self.mi, self.dr
         emitter = mi.Point3f(*self.emitter_m.tolist())
         towards = emitter - met.place
@@ -169,14 +181,14 @@ class LitScene:
         cosine = dr.dot(met.normal, towards)
         on_axis = -towards.z
         cone = dr.clip((on_axis - self.cos_cutoff) / (self.cos_full - self.cos_cutoff), 0, 1)
-        lit = active & (cosine > 0) & (cone > 0)
+        lit = met.valid & (cosine > 0) & (cone > 0)
         # occluders between the emitter and the side of the surface from which the ray came
         origin = met.place + LIFT_M * met.normal
         way = emitter - origin
         reach = dr.norm(way)
         ray = mi.Ray3f(origin, way / reach)
         ray.maxt = reach - 2 * LIFT_M
-        lit &= ~self.scene.ray_test(ray, lit)
+        lit &= ~self.scene.ray_test(ray, coherent, lit) if clear is None else clear
         lobe = self.lobe(met.surface, met.normal, met.viewer, towards)
         return dr.select(lit, cone * cosine / squared * lobe, 0), distance
 
@@ -224,6 +236,5 @@ def lit_scene(
         gloss=(shares, exponents) if any(part.gloss[0] > 0 for part in parts) else None,
         textured=textured,
         texture=texture,
-        uv_of=uv_of,
         uv_factors=[dr.opaque(mi.Float, float(each)) for each in uv_of.ravel()],
     )

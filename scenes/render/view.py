@@ -11,15 +11,16 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import cv2
+import numba
 import numpy as np
-from scipy import ndimage, sparse
+from scipy import ndimage
 from scipy.stats import qmc
 
 from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR, Region, invert, rotate_vectors, transform_points
-from scenes.optics import NoiseFreeView, Optics, RenderConfig, footprint_of, wave_numbers
+from scenes.optics import NoiseFreeView, Optics, RenderConfig, footprint_of
 from scenes.perspectives import seen_region
-from scenes.render.direct import DirectLight, OffFace, comb_step, direct_light
-from scenes.render.scene import LIFT_M, LitScene, lit_scene, load_mitsuba
+from scenes.render.direct import FAST, DirectLight, OffFace, added, direct_light
+from scenes.render.scene import LIFT_M, LitScene, lit_scene, load_mitsuba, on_device
 from scenes.target.mesh import Target
 from scenes.target.truth import face_of
 
@@ -27,7 +28,7 @@ BATCHES = 8
 PATHS_A_LANE = 64  # enough that lanes end together, few enough that a small job fills the machine
 NOISE_LINES = 4  # lines of a long comb from which noise of range is estimated: paths are the same for all lines
 PER_VERTEX = 2  # low-discrepancy dimensions for each vertex: a direction
-START_DIMENSIONS = 2
+START_DIMENSIONS = 4  # the first direction; which of a pixel's sub-rays, and one to spare
 CELLS, PROBES, OFTEN = 16, 2, 0.9
 """Cells along each side of the square of first directions from the face, probes along each side of a cell, and the
 share of paths that begin in cells where a probe met something; the others begin anywhere."""
@@ -54,7 +55,7 @@ def gather_at_points(
     a rectangle, -1..1 in x and y of this frame: a lit board, which they would seldom meet by chance. First directions
     are drawn mostly from those cells of the hemisphere in which a probe met something."""
     mi, dr = lit.mi, lit.dr
-    columns = [mi.Float(np.ascontiguousarray(each, np.float32)) for each in (*points_m.T, *normals.T)]
+    columns = [on_device(mi.Float, each) for each in (*points_m.T, *normals.T)]
     board = next((k for k, part in enumerate(lit.parts) if part.name == "board"), 0)
 
     def drawn(place: Any, u1: Any, u2: Any) -> tuple[Any, Any, Any, Any]:
@@ -62,47 +63,55 @@ def gather_at_points(
         point, normal = mi.Point3f(x, y, z), mi.Normal3f(nx, ny, nz)
         direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2)))
         seen = lit.lobe(mi.UInt32(board), normal, -dr.normalize(mi.Vector3f(point)), direction)
-        return point, point + LIFT_M * normal, direction, seen
+        return point, normal, direction, seen
 
     side, cells = CELLS * PROBES, CELLS**2
     places, down, across = (each.ravel() for each in np.indices((len(points_m), side, side)))
-    probe = [mi.Float(((each + 0.5) / side).astype(np.float32)) for each in (across, down)]
-    _, origin, direction, _ = drawn(mi.UInt32(places.astype(np.uint32)), *probe)
-    met = lit.meet(origin, direction).valid.numpy().reshape(-1, CELLS, PROBES, CELLS, PROBES).any(axis=(0, 2, 4))
+    probe = [on_device(mi.Float, (each + 0.5) / side) for each in (across, down)]
+    point, normal, direction, _ = drawn(on_device(mi.UInt32, places), *probe)
+    met = lit.meet(point + LIFT_M * normal, direction).valid.numpy()
+    met = met.reshape(-1, CELLS, PROBES, CELLS, PROBES).any(axis=(0, 2, 4))
     chosen = np.flatnonzero(met if met.any() else ~met)
     shares = np.full(cells, 1 - OFTEN)
     shares[chosen] += OFTEN * cells / chosen.size
-    table, density = mi.UInt32(chosen.astype(np.uint32)), mi.Float(shares.astype(np.float32))
+    table, density = on_device(mi.UInt32, chosen), on_device(mi.Float, shares)
 
     count = dr.opaque(mi.UInt32, chosen.size)
 
-    def start(place: Any, u1: Any, u2: Any) -> tuple[Any, Any, Any, Any]:
+    def start(place: Any, u1: Any, u2: Any, _: Any) -> tuple[Any, ...]:
         often = u1 < OFTEN
         number = dr.select(often, u1 * mi.Float(count) / OFTEN, (u1 - OFTEN) * (cells / (1 - OFTEN)))
         whole = dr.minimum(mi.UInt32(number), dr.select(often, count - 1, mi.UInt32(cells - 1)))
         cell = dr.select(often, dr.gather(mi.UInt32, table, whole, often), whole)
         u1 = (mi.Float(cell % CELLS) + dr.minimum(number - mi.Float(whole), 1.0)) / CELLS
         u2 = (mi.Float(cell // CELLS) + u2) / CELLS
-        point, origin, direction, seen = drawn(place, u1, u2)
-        return point, origin, direction, seen / dr.gather(mi.Float, density, cell)
+        return *drawn(place, u1, u2), 1 / dr.gather(mi.Float, density, cell), mi.Float(0.0)
 
-    return _gather(lit, start, work, np.full(len(points_m), samples), True, bright)
+    return _gather(lit, start, work, np.full(len(points_m), samples), np.zeros(len(points_m)), bright)
 
 
-def gather_in_pixels(lit: LitScene, rays: OffFace, work: PathWork, samples: int | np.ndarray) -> np.ndarray:
-    """Gather indirect light, the mean over the listed sub-rays of each pixel, with ``samples`` paths, (p,) or one."""
+def gather_in_pixels(lit: LitScene, rays: OffFace, work: PathWork, samples: Any, after: int = 0) -> np.ndarray:
+    """Gather indirect light, the mean over the listed sub-rays of each pixel, with ``samples`` paths, (p,) or one, that
+    follow the first ``after``. All begin where a sub-ray ends, which is found once."""
     mi, dr = lit.mi, lit.dr
-    across, down = (mi.Float(np.ascontiguousarray(each, np.float32)) for each in rays.slopes.T)
-    firsts = mi.UInt32((np.cumsum(rays.counts) - rays.counts).astype(np.uint32))
-    counts = mi.UInt32(rays.counts.astype(np.uint32))
+    ray = dr.normalize(mi.Vector3f(*(on_device(mi.Float, each) for each in rays.slopes.T), 1.0))
+    hit = lit.meet(mi.Point3f(0.0), ray, coherent=True)
+    ends = (*hit.place, *hit.normal, hit.distance, lit.albedo(hit))
+    dr.eval(ends, hit.surface)
+    firsts, counts = (on_device(mi.UInt32, each) for each in (np.cumsum(rays.counts) - rays.counts, rays.counts))
 
-    def start(place: Any, u1: Any, u2: Any) -> tuple[Any, Any, Any, Any]:
+    def start(place: Any, u1: Any, u2: Any, u3: Any) -> tuple[Any, ...]:
         first, count = (dr.gather(mi.UInt32, a, place) for a in (firsts, counts))
-        which = first + dr.minimum(mi.UInt32(u1 * mi.Float(count)), count - 1)
-        slopes = (dr.gather(mi.Float, each, which) for each in (across, down))
-        return mi.Point3f(0.0), mi.Point3f(0.0), dr.normalize(mi.Vector3f(*slopes, 1.0)), 1.0
+        which = first + dr.minimum(mi.UInt32(u3 * mi.Float(count)), count - 1)
+        x, y, z, nx, ny, nz, distance, albedo = (dr.gather(mi.Float, each, which) for each in ends)
+        point, normal = mi.Point3f(x, y, z), mi.Normal3f(nx, ny, nz)
+        direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2)))
+        surface = dr.gather(mi.UInt32, hit.surface, which)
+        seen = lit.lobe(surface, normal, -mi.Vector3f(point) / distance, direction)
+        return point, normal, direction, seen, albedo, distance
 
-    return _gather(lit, start, work, np.broadcast_to(np.asarray(samples), rays.pixel.shape), False)
+    work = work._replace(bounces=work.bounces - 1)
+    return _gather(lit, start, work, np.broadcast_to(np.asarray(samples), rays.pixel.shape), rays.pixel, None, after)
 
 
 def range_noise_m(batches: np.ndarray, total: np.ndarray, frequencies_hz: tuple[float, ...]) -> np.ndarray:
@@ -116,11 +125,16 @@ def range_noise_m(batches: np.ndarray, total: np.ndarray, frequencies_hz: tuple[
 
 def range_change_m(change: np.ndarray, total: np.ndarray, frequencies_hz: tuple[float, ...]) -> np.ndarray:
     """Return the change of range (..., n) by a small change (..., f, n) of phasors ``total`` (f, n); 0 without light.
-    Phases turn by Im(dH / H) and are combined with the least-squares weights c f_k / (4 pi sum f^2)."""
-    f = np.array(frequencies_hz)[:, None]
-    weights = SPEED_OF_LIGHT_AIR * f / (4 * np.pi * (f**2).sum())
+    Phases turn by Im(dH / H) and are combined with the `range_weights`."""
+    weights = range_weights(frequencies_hz)[:, None]
     by_light = np.divide(weights, total, out=np.zeros(total.shape, complex), where=np.abs(total) > 0)
     return np.asarray((change.real * by_light.imag + change.imag * by_light.real).sum(axis=-2))
+
+
+def range_weights(frequencies_hz: tuple[float, ...]) -> np.ndarray:
+    """Return the least-squares weights (f,) of phases in a range: c f_k / (4 pi sum f^2), in metres per radian."""
+    f = np.array(frequencies_hz)
+    return np.asarray(SPEED_OF_LIGHT_AIR * f / (4 * np.pi * (f**2).sum()))
 
 
 def noise_lines(frequencies_hz: tuple[float, ...]) -> list[int]:
@@ -164,14 +178,15 @@ def _towards(
 
 
 class _Walk:
-    """Paths that are followed backwards from places. ``start`` (place, u1, u2): point from which the path's length
-    counts, origin, direction and weight of the first ray. ``on_surface``: light that reaches the first hit directly
-    counts (for a start at the lens it is the direct part), and all places share one rotation of the low-discrepancy
-    points (modulo 1). ``longest``: most points in a batch. What differs between boards is data, not constants."""
+    """Paths that are followed backwards from places. ``start`` (place, u1, u2, u3): a point, its normal, the direction
+    of the first ray, two factors of its weight, and the path's length up to there. ``turns`` (places,): places of the
+    same number share one rotation of the low-discrepancy points (modulo 1). ``longest``: most points in a batch. What
+    differs between boards is data, not constants."""
 
-    def __init__(self, lit: LitScene, start: Any, work: PathWork, on_surface: bool, bright: Any, longest: int) -> None:
-        self.lit, self.start, self.work, self.on_surface = lit, start, work, on_surface
+    def __init__(self, lit: LitScene, start: Any, work: PathWork, turns: np.ndarray, bright: Any, longest: int) -> None:
+        self.lit, self.start, self.work = lit, start, work
         mi, dr = lit.mi, lit.dr
+        self.turns, self.stream = on_device(mi.UInt32, turns), dr.opaque(mi.UInt32, work.seed * 1024)
         self.dimensions = START_DIMENSIONS + PER_VERTEX * (work.bounces + 1)
         self.table = mi.Float(_sobol(self.dimensions, longest, work.seed))
         self.batch_points, self.aim = dr.opaque(mi.UInt32, longest), None
@@ -179,10 +194,10 @@ class _Walk:
             self.aim = tuple(mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in bright[:3, k])) for k in (0, 1, 3))
 
     def sums(self, lanes: np.ndarray) -> np.ndarray:
-        """Return sums over the paths of lanes: (f + 1, n) complex64, intensity last. ``lanes`` (4, n) uint32: each
+        """Return sums over the paths of lanes: (f + 1, n) complex64, intensity last. ``lanes`` (4, n): each
         follows ``count`` paths of a place and batch, starting at number ``first``."""
         mi, dr, lines = self.lit.mi, self.lit.dr, len(self.work.frequencies_hz)
-        self.place, self.batch, self.first, self.count = map(mi.UInt32, lanes)
+        self.place, self.batch, self.first, self.count = (on_device(mi.UInt32, each) for each in lanes)
         n, kinds = lanes.shape[1], (mi.UInt32, mi.UInt32, mi.Point3f, mi.Normal3f, mi.Vector3f, mi.Float)
         zeros = [dr.zeros(mi.Float, n) for _ in range(2 * lines + 1)]
         state = (*(dr.zeros(kind, n) for kind in kinds), dr.ones(mi.Float, n), zeros)
@@ -205,24 +220,22 @@ class _Walk:
     ) -> tuple[Any, ...]:
         """Continue at the next vertex, or begin the next path. ``length``: that up to ``before``, the ray's start."""
         lit, mi, dr, fresh = self.lit, self.lit.mi, self.lit.dr, vertex == 0
-        first = self._uniform(sample, 0), self._uniform(sample, 1)
-        start_point, origin, start_direction, weight = self.start(self.place, *first)
-        before = dr.select(fresh, start_point, before)
-        origin = dr.select(fresh, origin, before + LIFT_M * before_normal)
-        direction = dr.select(fresh, start_direction, direction)
-        length, throughput = dr.select(fresh, 0, length), dr.select(fresh, weight, throughput)
+        which = *self._uniform(sample, 0), self._uniform(sample, 2)[0]
+        point, normal, first, seen, weight, way = self.start(self.place, *which)
+        before, before_normal = dr.select(fresh, point, before), dr.select(fresh, normal, before_normal)
+        direction = dr.select(fresh, first, direction)
+        length, throughput = dr.select(fresh, way, length), dr.select(fresh, seen * weight, throughput)
 
-        hit = lit.meet(origin, direction)
+        hit = lit.meet(before + LIFT_M * before_normal, direction)
         met = hit.valid
         length = length + dr.select(met, dr.norm(hit.place - before), 0)
         throughput = throughput * lit.albedo(hit)
-        arriving, leg = lit.arriving(hit, met if self.on_surface else met & ~fresh)
+        arriving, leg = lit.arriving(hit)
         light = dr.select(met, throughput * arriving, 0)
-        totals = _added(totals, light, length + leg, self.work.frequencies_hz)
+        totals = added(totals, light, length + leg, self.work.frequencies_hz)
 
         more = met & (vertex < self.work.bounces) & (throughput > 0)
-        dimension = START_DIMENSIONS + PER_VERTEX * vertex
-        u1, u2 = self._uniform(sample, dimension), self._uniform(sample, dimension + 1)
+        u1, u2 = self._uniform(sample, START_DIMENSIONS + PER_VERTEX * vertex)
         direction = mi.Frame3f(hit.normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2)))
         if self.aim is not None:
             # the half of the square left by the other choice is a square too
@@ -236,25 +249,25 @@ class _Walk:
         sample, vertex = sample + dr.select(more, mi.UInt32(0), 1), dr.select(more, vertex + 1, 0)
         return sample, vertex, hit.place, hit.normal, direction, length, throughput, totals
 
-    def _uniform(self, sample: Any, dimension: Any) -> Any:
-        """Return a co-ordinate of the low-discrepancy point of each lane's path, shifted by its place's rotation."""
+    def _uniform(self, sample: Any, dimension: Any) -> tuple[Any, Any]:
+        """Return two co-ordinates of the low-discrepancy point of each lane's path, shifted by its place's rotation."""
         mi, dr = self.lit.mi, self.lit.dr
-        number = self.batch * self.batch_points + self.first + sample
-        u = dr.gather(mi.Float, self.table, number * self.dimensions + dimension)
-        rotation = self.batch + BATCHES * (0 if self.on_surface else self.place)
-        u += mi.sample_tea_float32(rotation, dimension + self.work.seed * 1024, 4)
-        return u - dr.floor(u)
+        number = (self.batch * self.batch_points + self.first + sample) * self.dimensions + dimension
+        rotation = self.batch + BATCHES * dr.gather(mi.UInt32, self.turns, self.place)
+        shifts = mi.sample_tea_32(rotation, dimension + self.stream, 4)
+        u = [dr.gather(mi.Float, self.table, number + k) + mi.Float(shifts[k] >> 8) * 2**-24 for k in (0, 1)]
+        return u[0] - dr.floor(u[0]), u[1] - dr.floor(u[1])
 
 
 def _gather(
-    lit: LitScene, start: Any, work: PathWork, samples: np.ndarray, on_surface: bool, bright: Any = None
+    lit: LitScene, start: Any, work: PathWork, samples: np.ndarray, turns: np.ndarray, bright: Any, after: int = 0
 ) -> np.ndarray:
-    """Follow ``samples`` (n,) paths from each place (other arguments: `_Walk`). Return the light (BATCHES, f + 1, n)
-    complex64 of each batch, frequency 0 (intensity) last. Phase counts from where the light is gathered. Units as in
-    `NoiseFreeView`, with the place's albedo if the start was the lens. Cosine-weighted directions cancel cos/pi of a
-    Lambertian surface, so each bounce multiplies by its albedo and, if it is glossy, by `LitScene.lobe`."""
-    per_batch = np.maximum(samples // BATCHES, 1)
-    walked = _Walk(lit, start, work, on_surface, bright, int(per_batch.max()))
+    """Follow ``samples`` (n,) paths from each place, after the first ``after`` (other arguments: `_Walk`). Return the
+    light (BATCHES, f + 1, n) complex64 of each batch, frequency 0 (intensity) last. Units as in `NoiseFreeView`, but
+    per unit albedo of a point. Cosine-weighted directions cancel cos/pi of a Lambertian surface, so each bounce
+    multiplies by its albedo and, if it is glossy, by `LitScene.lobe`."""
+    per_batch, earlier = np.maximum(samples // BATCHES, 1), after // BATCHES
+    walked = _Walk(lit, start, work, turns, bright, int(per_batch.max()) + earlier)
     lines = len(work.frequencies_hz)
     # lanes for so many paths a batch at each place; the first lane of each place and batch
     per_pair = np.repeat(-(-per_batch // PATHS_A_LANE), BATCHES)
@@ -262,31 +275,12 @@ def _gather(
     pair = np.repeat(np.arange(len(per_pair)), per_pair)
     place, batch = np.divmod(pair, BATCHES)
     first = (np.arange(len(pair)) - begins[pair]) * PATHS_A_LANE
-    lanes = np.stack([place, batch, first, np.minimum(per_batch[place] - first, PATHS_A_LANE)]).astype(np.uint32)
+    lanes = np.stack([place, batch, earlier + first, np.minimum(per_batch[place] - first, PATHS_A_LANE)])
     at_once = max(FLOATS_AT_ONCE // (2 * lines + 1), 1)
     chunks = (lanes[:, begin : begin + at_once] for begin in range(0, lanes.shape[1], at_once))
     sums = np.concatenate([walked.sums(chunk) for chunk in chunks], axis=1)
     by_batch = np.add.reduceat(sums, begins, axis=1).reshape(lines + 1, len(samples), BATCHES) / per_batch[:, None]
     return np.ascontiguousarray(np.moveaxis(by_batch, 2, 0), np.complex64)
-
-
-def _added(totals: list[Any], light: Any, length: Any, frequencies_hz: tuple[float, ...]) -> list[Any]:
-    """Add the light of a path to real and imaginary sums by frequency, intensity last; for a comb by recurrence."""
-    import drjit as dr
-
-    out, waves, step_hz = [], wave_numbers(frequencies_hz), comb_step(frequencies_hz)
-    if step_hz is None:
-        for number in waves:
-            sine, cosine = dr.sincos(float(number) * length)
-            out += [light * cosine, light * sine]
-    else:
-        sine, cosine = dr.sincos(float(waves[0]) * length)
-        turn_sine, turn_cosine = dr.sincos(float(wave_numbers((step_hz,))[0]) * length)
-        re, im = light * cosine, light * sine
-        for _ in waves:
-            out += [re, im]
-            re, im = re * turn_cosine - im * turn_sine, re * turn_sine + im * turn_cosine
-    return [total + part for total, part in zip(totals, [*out, light], strict=True)]
 
 
 def face_triangles(target: Target) -> list[np.ndarray]:
@@ -302,8 +296,8 @@ def face_triangles(target: Target) -> list[np.ndarray]:
 def face_light(
     lit: LitScene, target: Target, direct: DirectLight, slopes: np.ndarray, work: PathWork, config: RenderConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indirect light by way of the face (without its holes) in the pixels that see any of it, in the order
-    of `numpy.nonzero` of ``direct.face[-1]``: mean (f + 1, n); batches (B, l, n) at the frequencies `noise_lines`."""
+    """Return the indirect light (f + 1, n) by way of the face (without its holes) in the pixels that see any of it, in
+    the order of `numpy.nonzero` of ``direct.face[-1]``, and its noise of range (n,) in metres."""
     seen = direct.face[-1].real > 0
     rays = np.concatenate([slopes[seen], np.ones((int(seen.sum()), 1))], axis=-1)
     rays *= (direct.face_range_m[seen] / np.linalg.norm(rays, axis=-1))[..., None]
@@ -322,34 +316,55 @@ def face_light(
     bright[:3, 3] = transform_points(T_camera_board, np.append((low + high) / 2, 0.0))
     bright[:3, :2] *= (high - low) / 2
     light = gather_at_points(lit, position, normals, work, config.face_samples, bright)
-    few, share = noise_lines(work.frequencies_hz), direct.face[:, seen]
-    at_nodes = np.concatenate([light.mean(axis=0, dtype=complex), *light[:, few]])
-    everywhere = (between_nodes(xs, ys, x_seen, y_seen) @ at_nodes.T).T
-    batches = everywhere[len(share) :].reshape(len(light), len(few), -1)
-    return share * everywhere[: len(share)], share[few] * batches
+    few, mean = noise_lines(work.frequencies_hz), np.ascontiguousarray(light.mean(axis=0, dtype=complex).T)
+    off = np.ascontiguousarray(np.moveaxis(light[:, few] - light[:, few].mean(axis=0), 2, 0), complex)
+    place = np.stack([(x_seen - xs[0]) / (xs[1] - xs[0]), (y_seen - ys[0]) / (ys[1] - ys[0])])
+    weights = range_weights(tuple(work.frequencies_hz[k] for k in few))
+    around = place, (len(xs), len(ys)), mean, off, np.array(few), weights
+    return _between_nodes(*around, direct.face[:, seen], direct.phasor[:, seen])
 
 
-def between_nodes(nodes_x: np.ndarray, nodes_y: np.ndarray, x: np.ndarray, y: np.ndarray) -> sparse.csr_array:
-    """Return bilinear weights (n, len(nodes_y) len(nodes_x)) of evenly spaced nodes, row by row, at n places. The error
-    is (s/D)^2/8 for a spacing s and a distance D of the light source: 2e-3 at 80 mm and 0.7 m."""
-    columns, parts = len(nodes_x), []
-    for nodes, values in ((nodes_x, x), (nodes_y, y)):
-        place = (values - nodes[0]) / (nodes[1] - nodes[0])
-        cell = np.clip(place.astype(np.int64), 0, len(nodes) - 2)
-        parts.append((cell, place - cell))
-    (i, right), (j, down) = parts
-    index = np.stack([(j + b) * columns + i + a for b in (0, 1) for a in (0, 1)], axis=1)
-    weight = np.stack([(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right], axis=1)
-    starts = np.arange(len(x) + 1) * 4
-    return sparse.csr_array((weight.ravel(), index.ravel(), starts), shape=(len(x), columns * len(nodes_y)))
+@numba.njit(**FAST)
+def _between_nodes(place, size, mean, off, few, weights, share, total):  # type: ignore[no-untyped-def]
+    """Interpolate light between nodes, bilinearly, at places (2, n) in steps of the nodes (``size``: their columns and
+    rows): ``mean`` (nodes, f + 1), and its batches' deviations ``off`` (nodes, B, l) at lines ``few``. Return light
+    times ``share`` (f + 1, n), and its noise of range when added to ``total`` (f, n). The error is (s/D)^2/8 for a
+    spacing s and a distance D of the light source: 2e-3 at 80 mm and 0.7 m."""
+    batches, lines = off.shape[1:]
+    found, noise_m, turn = np.empty_like(share), np.empty(place.shape[1]), np.zeros(lines, np.complex128)
+    for i in range(place.shape[1]):
+        c, r = min(max(int(place[0, i]), 0), size[0] - 2), min(max(int(place[1, i]), 0), size[1] - 2)
+        p, q = place[0, i] - c, place[1, i] - r
+        index = (r * size[0] + c, r * size[0] + c + 1, (r + 1) * size[0] + c, (r + 1) * size[0] + c + 1)
+        weight = ((1 - q) * (1 - p), (1 - q) * p, q * (1 - p), q * p)
+        for k in range(mean.shape[1]):
+            value = 0j
+            for n in range(4):
+                value += weight[n] * mean[index[n], k]
+            found[k, i] = share[k, i] * value
+        for line in range(lines):
+            k = few[line]
+            whole = total[k, i] + found[k, i]
+            turn[line] = weights[line] * share[k, i] / whole if whole != 0 else 0j
+        square = 0.0
+        for b in range(batches):
+            change = 0.0
+            for line in range(lines):
+                value = 0j
+                for n in range(4):
+                    value += weight[n] * off[index[n], b, line]
+                change += (turn[line] * value).imag
+            square += change * change
+        noise_m[i] = np.sqrt(square / (batches - 1) / batches)
+    return found, noise_m
 
 
 RIM_PX = 3  # rendered surroundings of the board's outline, so that its rim looks as on the whole sensor
 NEAR_PX = 3  # beyond the outline, edges behind the board are finely sampled: the camera's filter mixes these pixels in
 HOLE_RIM_PX = 1
 NARROW = ("through", "blind", "slot", "gouge", "chip")  # damage that may lie between a pixel's corners and its centre
-PILOT_SAMPLES = 128  # paths that show a pixel's noise within a third; fewer miss rare bright paths behind a hole
-PILOT_SEED = 1 << 20  # offset that separates these from the paths that count
+FIRST_SAMPLES = 32  # paths of each pixel inside the outline before it is known how many are needed
+AROUND = 1.0 - np.eye(25)[12].reshape(5, 5)  # pixels whose first paths show how many: 768 seldom miss bright ones
 
 
 def target_region(target: Target, optics: Optics) -> Region:
@@ -420,17 +435,13 @@ def indirect_light(
     seen = np.flatnonzero(direct.face[-1].real)
     if seen.size:
         work = PathWork(frequencies, config.bounces - 1, config.seed)
-        mean, batches = face_light(lit, target, direct, slopes, work, config)
-        indirect[:, seen] = mean
-        total[:, seen] += mean[:-1]
-        variance[seen] = range_noise_m(batches, total[:, seen], frequencies) ** 2
+        indirect[:, seen], noise_m = face_light(lit, target, direct, slopes, work, config)
+        total[:, seen] += indirect[:-1, seen]
+        variance[seen] = noise_m**2
     work, rays = PathWork(frequencies, config.bounces, config.seed), direct.off_face
     here, share, within = rays.pixel, rays.share, inside.ravel()[rays.pixel]
     if here.size:
-        many = np.full(here.size, config.rest_samples)
-        if within.any():
-            many[within] = _samples_inside(lit, rays.chosen(within), total[:, here[within]], work, config)
-        light = gather_in_pixels(lit, rays, work, many)
+        light = _light_in_pixels(lit, direct, total[:, here], within, work, config)
         mean = share * light.mean(axis=0, dtype=complex)
         indirect[:, here] += mean
         total[:, here] += mean[:-1]
@@ -438,25 +449,37 @@ def indirect_light(
     return indirect.reshape(-1, *shape), np.sqrt(variance).reshape(shape)
 
 
-def _samples_inside(
-    lit: LitScene, rays: OffFace, total: np.ndarray, work: PathWork, config: RenderConfig
-) -> int | np.ndarray:
-    """Return how many paths reduce a pixel's noise to ``hole_noise_mm``, from a pilot run, which does not count."""
-    if config.hole_samples <= PILOT_SAMPLES:
-        return config.hole_samples
-    pilot = gather_in_pixels(lit, rays, work._replace(seed=work.seed + PILOT_SEED), PILOT_SAMPLES)
-    batches = rays.share * pilot[:, noise_lines(work.frequencies_hz)]
-    total = total + rays.share * pilot.mean(axis=0, dtype=complex)[:-1]
-    noise_m = range_noise_m(batches, total, work.frequencies_hz)
-    wanted = PILOT_SAMPLES * (noise_m / (config.hole_noise_mm * MM)) ** 2
-    doublings = np.ceil(np.log2(np.maximum(wanted / PILOT_SAMPLES, 1)) - 0.5)
-    return np.minimum(PILOT_SAMPLES * 2**doublings, config.hole_samples).astype(np.int64)
+def _light_in_pixels(
+    lit: LitScene, direct: DirectLight, total: np.ndarray, within: np.ndarray, work: PathWork, config: RenderConfig
+) -> np.ndarray:
+    """Return the light (B, f + 1, p) of paths; ``total`` (f, p): all other light. In the pixels ``within`` (p,), the
+    first paths of the pixels around show how many reduce the noise of range to ``hole_noise_mm``. A pixel's own do not
+    decide: those that missed rare bright light would end too soon, and the mean would be biased."""
+    first, rays, f = min(FIRST_SAMPLES, config.hole_samples), direct.off_face, work.frequencies_hz
+    share, shape = rays.share, direct.range_m.shape
+    light = gather_in_pixels(lit, rays, work, np.where(within, first, config.rest_samples))
+    mean = light.mean(axis=0, dtype=complex)
+    noise_m = range_noise_m(share * light[:, noise_lines(f)], total + share * mean[:-1], f)
+    spread = (noise_m * np.abs(total[0] / share + mean[0])) ** 2
+    around = np.zeros((*shape, 4))
+    around.reshape(-1, 4)[rays.pixel[within]] = np.stack([within, spread, mean[0].real, mean[0].imag], -1)[within]
+    summed = cv2.filter2D(around, -1, AROUND, borderType=cv2.BORDER_CONSTANT).reshape(-1, 4)[rays.pixel]
+    count, spread, re, im = (summed / np.maximum(summed[:, :1], 1)).T
+    expected_m = np.sqrt(spread) / np.maximum(np.abs(total[0] / share + re + 1j * im), 1e-30)
+    wanted = (np.where(count > 0, expected_m, noise_m) / (config.hole_noise_mm * MM)) ** 2
+    doublings = np.ceil(np.log2(np.clip(wanted, 1, config.hole_samples)) - 0.5)
+    many = np.where(within, np.clip(first * 2**doublings, first, config.hole_samples), 0).astype(np.int64)
+    if (more := many > first).any():
+        further = gather_in_pixels(lit, rays.chosen(more), work, (many - first)[more], after=first)
+        light[..., more] += (1 - first / many[more]) * (further - light[..., more])
+    return light
 
 
 def _at_holes(target: Target, optics: Optics, slopes: np.ndarray) -> np.ndarray:
-    """Return the pixels (h, w) bool whose central ray passes the mouth of `NARROW` damage, or HOLE_RIM_PX beside it."""
+    """Return 1 in pixels (h, w) whose central ray passes the mouth of `NARROW` damage, 2 within HOLE_RIM_PX of its rim
+    on both sides, 0 elsewhere."""
     rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
-    found, T_board_camera = np.zeros(slopes.shape[:2], bool), invert(target.T_camera_board)
+    found, T_board_camera = np.zeros(slopes.shape[:2], np.int8), invert(target.T_camera_board)
     for hole, declared in zip(target.truth, target.config.damages, strict=True):
         if hole.kind in NARROW:
             centre, axis = hole.centre_camera_m, hole.axis_camera
@@ -464,5 +487,6 @@ def _at_holes(target: Target, optics: Optics, slopes: np.ndarray) -> np.ndarray:
             with np.errstate(divide="ignore", invalid="ignore"):
                 on_plane = rays * ((centre @ axis) / (rays @ axis))[..., None]
             x, y, _ = np.moveaxis(transform_points(T_board_camera, on_plane), -1, 0)
-            found |= hole.within(x, y, rim_m + declared.reach_mm * MM - hole.reach_m)
+            about = hole.within(x, y, rim_m + declared.reach_mm * MM - hole.reach_m)
+            found[about] = np.maximum(found[about], 2 - hole.within(x[about], y[about], -rim_m))
     return found

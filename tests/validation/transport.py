@@ -25,8 +25,8 @@ if __name__ == "__main__":
     sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
 
 from harness.vocabulary.geometry import MM, Lens
-from scenes.optics import NoiseFreeView, Optics, Quadrilaterals, RenderConfig
-from scenes.render.direct import OffFace, cast, phasor_sums
+from scenes.optics import NoiseFreeView, Optics, Quadrilaterals, RenderConfig, wave_numbers
+from scenes.render.direct import OffFace, cast
 from scenes.render.scene import LitScene, lit_scene, load_mitsuba
 from scenes.render.view import PathWork, gather_in_pixels, range_change_m, range_noise_m, render_view
 from scenes.sensor.camera import load_camera
@@ -94,9 +94,11 @@ def compared(scene: Scene, title: str, here: np.ndarray, paths: int, most: int) 
     picked = slice(None, None, max(len(rows) // most, 1))
     rows, cols = rows[picked], cols[picked]
     frequencies = scene.optics.frequencies_hz
-    slopes = Quadrilaterals(scene.optics.lens, scene.view.region).coarse(rows, cols, SIDE)
+    footprint = Quadrilaterals(scene.optics.lens, scene.view.region)
+    slopes = footprint.slopes(rows, cols, footprint.grid(SIDE))
     hits = cast(scene.lit, slopes.reshape(-1, 2))
-    direct = phasor_sums(hits.amplitude.reshape(-1, SIDE**2), hits.path_m.reshape(-1, SIDE**2), frequencies)
+    turned = hits.amplitude * np.exp(1j * wave_numbers(frequencies)[:, None] * hits.path_m)
+    direct = turned.reshape(len(frequencies), -1, SIDE**2).mean(axis=-1)
     count = np.full(len(rows), SIDE**2)
     rays = OffFace(np.arange(len(rows)), count, np.ones(len(rows)), slopes.reshape(-1, 2).astype(np.float32))
     light = gather_in_pixels(scene.lit, rays, PathWork(frequencies, LONGEST, seed=777), paths)
