@@ -1,8 +1,6 @@
 """Averages streamed frames into one cloud. Frames that do not belong are left out and reported. The first
 `REFERENCE_FRAMES` are the reference: mostly bad first frames, or a moving camera, are not corrected."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from itertools import chain, islice
 from typing import Literal

@@ -1,8 +1,6 @@
 """Clusters of points by Euclidean distance, at one threshold of their scores or at several. As the threshold falls,
 clusters only grow and join. Points are sorted into cells so small that all points of a cell belong to one cluster."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numba

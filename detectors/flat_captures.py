@@ -8,8 +8,6 @@ noise and averages out; a camera that did not move sees the same S each time, an
 The smooth fit is a polynomial in 1/z over the rays' slopes, in which a plane is exact; it absorbs structure wider than
 about a sixth of the image. Not modelled: errors of the stated poses, and the correlation of noise."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 

@@ -4,8 +4,6 @@ The pattern is assumed to be a range error along each pixel's ray that is the sa
 pattern that changes with distance, temperature or brightness (`detectors.flat_captures` tests the first two), and the
 mixing of pixels by a depth engine's filter at the edge of a hole."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path

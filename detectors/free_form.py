@@ -1,7 +1,5 @@
 """The smooth free form that is added to a simple shape: penalised splines in the picture's plane."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numba

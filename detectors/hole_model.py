@@ -8,8 +8,6 @@ Not modelled: light between wall and floor, which makes a wall look deeper than 
 floor that is not flat; the lower weight of deep neighbours in a bilateral filter (holes of 2 to 3 times the blur are
 measured up to 16 % too deep at 33 mm)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

@@ -7,8 +7,6 @@ texture raise the threshold where they are. Findings are peaks of the score.
 Not modelled: the noise's spectrum, damage narrower than a pixel or wider than the widest filter, texture that resembles
 damage, and steps of the noise within a window."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple

@@ -1,7 +1,5 @@
 """Operations on masks (h, w) bool: enclosed areas, rims, connected parts and nearest pixels."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -5,8 +5,6 @@ simulated: scattered dropouts are places where white noise, averaged over a squa
 level. The square gives the share of missing neighbours and the level the local rate; both come from clusters that are
 too small to be findings. Not modelled: dropouts in equal blobs wider than 3 pixels."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 from typing import NamedTuple

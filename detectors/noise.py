@@ -1,7 +1,5 @@
 """Robust statistics, and the noise of an average: the error that rounding leaves, and the range of shared noise."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Access to Open3D for files of points, odometry and volumes. Only this module imports it: that takes seconds."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any

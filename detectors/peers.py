@@ -4,8 +4,6 @@
 `fpfh_memory` compares shape features with those of undamaged targets. Each has the settings and the formula of its
 source; none knows the camera's noise."""
 
-from __future__ import annotations
-
 import logging
 import os
 from collections.abc import Mapping, Sequence

@@ -5,8 +5,6 @@ closest planes, move it onto the cloud (Besl and McKay 1992; Chen and Medioni 19
 (Tukey). Triangles that face away are left out. A part turned by more than about 30 degrees is not found. A direction
 that the mesh does not fix, such as a shift of a plane along itself, stays undetermined; no result depends on it."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Finds the large connected smooth surfaces of a cloud. A pipe up to its limb is one; two faces of a box are two."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import NamedTuple

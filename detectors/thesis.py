@@ -2,8 +2,6 @@
 text: a robust cubic and a robust deviation of the residual. Its script uses ``surface: {method: least_squares,
 drop_cross_terms: true}, scale: raw_z_std`` with k = 1.2. `highest_before` follows the text's rule against outliers."""
 
-from __future__ import annotations
-
 from typing import ClassVar, Literal
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Several views of one target: each a cloud in its own camera's frame, the first being the reference."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,8 +1,6 @@
 """The templates of the matched filters, and the whitening of noise. Pictures are residuals in standard deviations of
 the local noise, on grids padded by the longest lag, so that nothing wraps around."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import lru_cache

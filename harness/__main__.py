@@ -1,7 +1,5 @@
 """The command ``tofpod PROGRAM ...`` runs every program; ``tofpod`` alone lists the most common tasks."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import shlex

@@ -1,7 +1,5 @@
 """``python -m harness.characterise``: measures your own camera on static captures, as a page and a camera file."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """``python -m harness.clean``: removes stored renders or results folders, after confirmation."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from contextlib import ExitStack

@@ -1,7 +1,5 @@
 """``python -m harness.detect``: finds the damage in a real capture, prints a table and, with --out, writes files."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

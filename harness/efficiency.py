@@ -1,7 +1,5 @@
 """``python -m harness.efficiency RESULTS``: compares every detector of a study with the ideal observer."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

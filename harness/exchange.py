@@ -1,7 +1,5 @@
 """Writes simulated captures in formats of other programs: TUM RGB-D, ROS 2, MCAP; images and masks of data sets."""
 
-from __future__ import annotations
-
 import errno
 import sqlite3
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """Finds what `harness.ls` lists and `harness.clean` removes: tofpod's own entries in ``--out``, never behind a link."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import inspect

@@ -1,7 +1,5 @@
 """``python -m harness.ls``: lists detectors and cameras with their settings, results folders, and stored renders."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import time

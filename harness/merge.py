@@ -1,7 +1,5 @@
 """``python -m harness.merge``: joins the journals of shards and machines in one results folder."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections import Counter

@@ -1,7 +1,5 @@
 """``python -m harness.prepare``: compiles the inner loops once, as part of the installation."""
 
-from __future__ import annotations
-
 import argparse
 import time
 from contextlib import suppress

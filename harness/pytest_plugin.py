@@ -6,8 +6,6 @@
 This test runs the study beside it and compares it with ``limit.baseline.json`` there, as `harness.check` does. ``pytest
 --tofpod-update`` writes the baseline. Renders and finished trials are kept in pytest's cache folder."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """``python -m harness.sweep experiments/averaging.yaml``: runs an experiment and writes its report."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

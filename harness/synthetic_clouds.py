@@ -1,7 +1,5 @@
 """Small synthetic clouds with known damage for tests of detectors (`harness.testing`)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """``python -m harness.validate``: compares the simulated cameras with published figures, or with a real capture."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

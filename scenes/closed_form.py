@@ -1,7 +1,5 @@
 """Views in closed form: infinite planes under one emitter, with direct light only. For calibration and checks."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

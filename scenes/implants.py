@@ -6,8 +6,6 @@ turns both renders into frames with the same random numbers; recorded frames kee
 Not modelled: the surface's curvature within the small board, texture at the damage, light that reaches it by way of
 other surfaces, and damage that lowers noise: recorded noise is never removed. Ranges are not rounded again."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 from pathlib import Path

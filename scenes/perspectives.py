@@ -1,8 +1,6 @@
 """Several views of one target: its pose in each, the error of the nominal poses, and whether a camera sees it. The room
 moves with the camera, as if the target were turned on a table."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Annotated, Literal
 

@@ -13,8 +13,6 @@ because views see different parts of damage. Views that look through the same pi
 Not modelled: errors that all views share in all pixels, or registrations to one reference; a pattern that varies over
 the sensor; changes of the blur. If views are no farther apart than the pattern's length, its sill is extrapolated."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations, product

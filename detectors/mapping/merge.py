@@ -5,8 +5,6 @@ with the triangles of the map to an image without distortion, because the field'
 views have equal weight, and depth counts along the view's own optical axis (Curless and Levoy 1996). Not modelled:
 noise and incidence in the weights; views through a hole, which remove part of its rim."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass

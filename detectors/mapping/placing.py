@@ -3,8 +3,6 @@
 Samples are resampled to a grid over triangles of neighbours, which leaves no gaps and no moire between two grids. It
 blurs with a tent whose variance is a sixth of the spacing squared."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property

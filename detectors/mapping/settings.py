@@ -1,7 +1,5 @@
 """Settings that turn registered views into one cloud."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import Field

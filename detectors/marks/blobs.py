@@ -4,8 +4,6 @@ A smooth polynomial fitted over the target removes uneven light. The scatter of 
 determinant, Rousseeuw 1985) measures the variation of the target's own colour; the threshold is extrapolated from its
 tail to a given rate of false pixels. Marks may cover a quarter of the target. Not modelled: hard shadows."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

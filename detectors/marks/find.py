@@ -5,8 +5,6 @@ may be thick or have a range error of its own. Its centroid is the mean of the p
 plane, weighted by the surface that they cover and by their colour. Spots behind the surface are holes. Not modelled: a
 surface or tag that bends within the mark; a lens whose distortion is more than quadratic over one tag."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Fiducial marks for a registration: their data, settings of the rules that find them, conditions on a set of marks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal

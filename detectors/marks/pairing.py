@@ -9,8 +9,6 @@ Kabsch's closed form (1976; Umeyama 1991 for the sign) gives the start; Gauss-Ne
 most probable rigid transform and its covariance. Not modelled: marks that are seen twice, or moved between the views;
 errors that the points of one set share."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations

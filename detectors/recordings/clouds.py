@@ -5,8 +5,6 @@ Open3D drops the grid and fills a truncated PLY with zeros, so the header is rea
 or both, unless a line of names says otherwise. Its grid is stated by a comment or a first line of two whole numbers, or
 given by a lens with as many pixels, or by a common sensor size on which x/z and y/z rise evenly."""
 
-from __future__ import annotations
-
 import codecs
 import io
 import re

@@ -4,8 +4,6 @@ The layout is recognised by a sub-folder ``depth`` (with ``color`` or ``rgb`` be
 or by names that are numbers; else every 16-bit grey PNG counts. A ``depth.txt`` marks TUM RGB-D. A picture's first
 bytes show its kind, and Pillow reads its header: OpenCV would decode 30,000 x 30,000 pixels into gigabytes."""
 
-from __future__ import annotations
-
 import io
 import re
 import struct

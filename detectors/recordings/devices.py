@@ -4,8 +4,6 @@ k4arecorder writes tracks titled COLOR, DEPTH and IR (16-bit big-endian grey, de
 attaches the factory calibration. Phones store ARKit's depth, a confidence from 0 to 2 for each pixel (0 is no return),
 the lens of the colour camera, and poses; the program warns if these show movement."""
 
-from __future__ import annotations
-
 import re
 import zipfile
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Stored numbers as distances: codes that mean "no return", the depth unit in metres, and its origin."""
 
-from __future__ import annotations
-
 import math
 import re
 from typing import Any, NamedTuple

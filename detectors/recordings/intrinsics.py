@@ -1,7 +1,5 @@
 """The lens of a capture from a file: JSON or YAML of many programs, bare matrices, an Azure Kinect's calibration."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable, Iterator, Sequence

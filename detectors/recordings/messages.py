@@ -2,8 +2,6 @@
 
 ``compressedDepth``: twelve bytes (a format, two numbers of the quantisation), then a PNG or RVL (Wilson 2017)."""
 
-from __future__ import annotations
-
 import struct
 from typing import Any
 

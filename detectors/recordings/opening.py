@@ -1,7 +1,5 @@
 """Recognises the format of a capture, and opens it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import islice

@@ -12,8 +12,6 @@ Odometry (Open3D's hybrid term; Park, Zhou & Koltun, ICCV 2017) aligns each view
 depth together, starting from no motion, so that errors add up. It uses only the target: on a turntable the room does
 not move with the target. No loop is closed, no map is kept."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any

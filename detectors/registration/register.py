@@ -4,8 +4,6 @@ Errors that a whole view shares (an offset, wiggling, the lens) show as a distan
 does not explain. They widen the covariance and are noted; a view is refused only if they would blur the merged map by
 more than `BLUR_M`, or by more than a pixel if pixels are coarser."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from time import perf_counter

@@ -1,7 +1,5 @@
 """The result of a registration, and the sampling of a view: the scale of residuals, overlaps and tolerances."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Literal
 

@@ -3,8 +3,6 @@
 Every board is one average of frames of one unit of a camera. No two splits share boards; ``validation`` and ``test``
 have those of a study of the same experiment. Several views and real captures are not included."""
 
-from __future__ import annotations
-
 import io
 import json
 import re

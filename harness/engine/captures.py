@@ -1,7 +1,5 @@
 """An experiment on a real capture: each point judges it once, by the steps of `harness.detect`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from detectors import load_detector

@@ -5,8 +5,6 @@ whole part, else measured nearby. The signal of damage and its scatter are learn
 boards of the family, in random poses as wide as those requested. Not modelled: the direction of the undamaged part's
 error at a place (the unit's pattern, the surface's misfit), light of other parts, sizes in missing returns."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Shows the progress of a sweep, and its amount of work in advance."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Callable, Iterator

@@ -3,8 +3,6 @@
 Noise is the difference between a unit's average and a camera without noise, unit errors and rounding, away from damage
 and rim, minus a cubic. The signature is what that camera shows near damage, minus a cubic through the rest."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import ndimage
 

@@ -3,8 +3,6 @@
 A placement corresponds to a simulated board: some damages at once, in one group of recorded frames. The placements in
 one recording share its surface and fixed pattern and, if it has few frames, its noise."""
 
-from __future__ import annotations
-
 import math
 import sys
 import time

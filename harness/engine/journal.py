@@ -3,8 +3,6 @@
 Each process that writes has its own segment, so that shards may share a folder and journals merge by appending. A
 segment begins with its version; further lines are entries with a checksum. Torn or altered lines are ignored."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import os

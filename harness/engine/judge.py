@@ -1,7 +1,5 @@
 """Judges one detector on one cloud: rows for the run and for each damage, and further rows for a study's board."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

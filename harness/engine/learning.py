@@ -2,8 +2,6 @@
 
 The journal stores the learned state, for resuming and shards; a file named after its key holds it for trials."""
 
-from __future__ import annotations
-
 import base64
 import io
 from dataclasses import replace

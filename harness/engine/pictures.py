@@ -1,7 +1,5 @@
 """Draws a report's pictures again from their seeds: the first damaged repeat or, in a study, damages near the limit."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, cast
 

@@ -4,8 +4,6 @@ judged trials use both. Trials in the journal are not run again, nor are views r
 Each shard calibrates its own thresholds, and different processors give slightly different last digits. So the journal
 stores the thresholds in use; after a merge, trials judged within `AGREES` of them count as judged at them."""
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A simulated set-up with what a trial needs, and clouds with the truth on their grid. Detectors get only the cloud."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Runs a validated experiment, and writes its folder of results."""
 
-from __future__ import annotations
-
 import datetime
 import sys
 import time

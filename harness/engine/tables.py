@@ -1,7 +1,5 @@
 """Converts records of trials into tables: one row per trial and damage, per trial, per probe pixel, and per variant."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import islice

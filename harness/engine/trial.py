@@ -3,8 +3,6 @@
 Averages are drawn at once if that gives the same distribution (plain means of `FEWEST_FRAMES` frames or more, if the
 camera's model supports it). Frames that jump are then left out by their displacement, which is known exactly."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ distance, frames, depth and albedo. It answers questions within the computed ran
 The surface is a quadratic of ln a90 in the logarithms of the axes, by least squares weighted with each limit's own
 interval. Its stated error is the root mean square error of ln a90 at each set-up when the others predict it."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

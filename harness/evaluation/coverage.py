@@ -6,8 +6,6 @@ to a power of that cosine, because detection at oblique incidence is less certai
 the threshold, so the law gives POD at every size and place: MIL-HDBK-1823A's signal against size (appendix G), with the
 place beside the size. Not modelled: other differences between places of equal angle, range and unit of score."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

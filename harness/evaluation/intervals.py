@@ -3,8 +3,6 @@
 Sources: Wilson 1927 and Clopper and Pearson 1934 (proportions), Garwood 1936 (Poisson), Student and Welch (means),
 Efron and Tibshirani 1993 (percentile bootstrap). Not covered: repeats of one set-up are repeats of the noise."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

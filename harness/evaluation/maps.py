@@ -4,8 +4,6 @@ Both maps of a comparison use the same frames, so differences are paired; interv
 and pose. Errors of registrations are target registration errors (Fitzpatrick, West and Maurer 1998) of places on the
 board: the true error, and the one that the method predicts."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial

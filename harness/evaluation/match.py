@@ -1,7 +1,5 @@
 """Match detections to damage: nearest within a stated distance, one to one; the rest are false calls."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

@@ -1,7 +1,5 @@
 """The shape of a hole in an averaged cloud: a flat floor, or a bowl."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

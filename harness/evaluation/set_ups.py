@@ -2,8 +2,6 @@
 The smallest hole that a set-up finds is given as a step on its ladder of sizes, and as the size found in half of the
 trials: a point on a monotone curve through the rates, not a probability of detection in the sense of the handbooks."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Rates, means and intervals of rows per trial, and the error of an averaged range against the number of frames."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby

@@ -1,7 +1,5 @@
 """Finds mistakes that involve several keys of an experiment, or things outside the file: names, files, views."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import lru_cache
 from itertools import combinations

@@ -1,7 +1,5 @@
 """Loads an experiment from a YAML file and ``--set`` overrides, and reports all of its mistakes at once."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import replace

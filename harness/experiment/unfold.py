@@ -1,8 +1,6 @@
 """Applies ``--set path=value``, unfolds axes, switches and variations into points, and validates each of them, with
 problems at the value that causes them. Set-ups differ in the axes other than the number of frames."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -1,3 +1,1 @@
 """The work of `harness.detect`: it turns captures and arguments into findings, which it prints and writes."""
-
-from __future__ import annotations

@@ -1,7 +1,5 @@
 """A gauge board: its declaration, its pose in a capture by its coded marks, and the hits and misses of its holes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal

@@ -3,8 +3,6 @@
 A refitted model has the unit's own lens, gain, fixed pattern, displaced frames and, if the captures show it, gate for
 faint pixels; all other numbers are those of the known camera. The surfaces' albedo is stated and not measured."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Iterator, Sequence

@@ -3,8 +3,6 @@
 Measurement and simulation are those of `harness.characterise`; nothing is fitted to make both agree.
 """
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

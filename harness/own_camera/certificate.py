@@ -4,8 +4,6 @@ The terms are those of VDI/VDE 2634 part 2 and ISO 10360-13 (optical 3D measurin
 E2862 and E3023 (probability of detection). The figures follow these standards without their artefacts and procedures.
 Nothing here is an accredited calibration."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from datetime import date
 from pathlib import Path

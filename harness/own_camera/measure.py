@@ -4,8 +4,6 @@ Flat surfaces are found in each capture. Without them, every pixel with a steady
 and edges are not measured. Temporal noise is that of single pixels about their own mean, without each frame's
 displacement. Not measured: errors that all frames and pixels share, and noise slower than the capture."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Presents a comparison of two studies as a table for terminal and page, as a sentence, and as data for programs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

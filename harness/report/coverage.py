@@ -1,7 +1,5 @@
 """The coverage page: a part, coloured by the smallest damage that is found at each place."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any

@@ -1,7 +1,5 @@
 """Draws the scene of an experiment: camera, target and the surface behind it, from the side and not to scale."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

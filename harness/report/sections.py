@@ -1,7 +1,5 @@
 """Sections that several pages of a sweep share, and the final tables for a terminal."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple

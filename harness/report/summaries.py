@@ -1,7 +1,5 @@
 """Summaries of an experiment that is not a study, computed once for files, pages and the terminal."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A cloud that can be turned in the browser: an offline file with the findings and, if known, the true damage."""
 
-from __future__ import annotations
-
 import base64
 from dataclasses import dataclass
 from pathlib import Path

@@ -3,8 +3,6 @@
 The file of figures is YAML; a new figure needs only an entry there. All problems of a file are reported together, each
 with its place. The file states a reason for each figure that fails; all others must pass."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections import defaultdict

@@ -4,8 +4,6 @@ A published figure names a quantity and those conditions that differ from the de
 range of conditions and is measured by the same function. All scenes lie about the optical axis.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache

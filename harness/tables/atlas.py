@@ -1,7 +1,5 @@
 """The table of the atlas: limits at any distance and number of frames, interpolated between computed set-ups."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product

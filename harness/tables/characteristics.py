@@ -1,7 +1,5 @@
 """Tables of a user's camera: its flat field, figures of its captures and of simulations, diagrams, its certificate."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Tables of coverage: patches of a part, camera poses, and sets of poses that reach a goal. Their rows are mappings."""
 
-from __future__ import annotations
-
 from harness.tables.schema import Column, Table
 from harness.tables.text import percent
 

@@ -1,7 +1,5 @@
 """Tables of efficiency: detectors compared with the ideal observer, and the ideal observer's result on each damage."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 

@@ -2,8 +2,6 @@
 
 A curve says nothing about sizes that were not inspected, so a size beyond the largest is written as ``> 15.9``."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import replace

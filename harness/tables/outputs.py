@@ -1,7 +1,5 @@
 """Declares the files that programs write into a results folder, for `harness.clean` and `results/README.md`."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass

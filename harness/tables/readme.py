@@ -1,7 +1,5 @@
 """The text of `results/README.md`; ``python -m harness.tables.readme > results/README.md`` writes it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 
 from harness.tables.coverage import COVERAGE_TABLES

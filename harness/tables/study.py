@@ -1,7 +1,5 @@
 """Tables of a study besides its limits: thresholds, chance hits, operating points, axes, and limits of depth."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple

@@ -3,8 +3,6 @@
 A verdict needs certainty in either direction: if an interval allows both, it is "undecided". No experiment can change a
 rule, and no rule was chosen to make a claim come out."""
 
-from __future__ import annotations
-
 import json
 import warnings
 from collections.abc import Callable, Iterable, Sequence

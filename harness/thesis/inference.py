@@ -4,8 +4,6 @@ The result is a cloud of 1 frame in which holes 5 to 11 were found, and a cloud 
 is found with probability (hits + 1/2) / (repeats + 1), so that few repeats neither prove nor exclude anything. Holes
 are assumed independent given the set-up. All set-ups have the same prior probability."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

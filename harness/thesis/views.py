@@ -3,8 +3,6 @@
 Repeats vary the noise and the errors of the nominal poses, but not the poses, the board or the camera's unit. So C7 is
 judged over pairs of views; C8 and C10, which have a single pair, are judged over units of the camera."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Literal

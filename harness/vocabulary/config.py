@@ -1,7 +1,5 @@
 """The base class of every declaration that a user writes: strict, finite and frozen, without unknown keys."""
 
-from __future__ import annotations
-
 from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict, model_validator

@@ -1,7 +1,5 @@
 """The user's mistakes: one clear message and exit code 2. Any other exception is a bug and keeps its traceback."""
 
-from __future__ import annotations
-
 import io
 import os
 import select

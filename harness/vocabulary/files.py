@@ -2,8 +2,6 @@
 
 A hostile file may try to fill the memory. Most such files are refused unread; libraries run in `limited_memory`."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import json

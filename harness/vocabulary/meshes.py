@@ -1,7 +1,5 @@
 """Reads meshes of parts from files of limited size, in metres and with the front facing the camera."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 from typing import Annotated, Any, Literal

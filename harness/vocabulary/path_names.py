@@ -1,7 +1,5 @@
 """Dotted paths and their values as tables show them: ``source.target.distance_m`` becomes "distance", in m."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import re

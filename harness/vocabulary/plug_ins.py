@@ -1,7 +1,5 @@
 """Finds built-in and plug-in detectors, cameras and others by name, without importing them."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """The frame of all programs: the parser, one message for a user's mistake, and exit codes."""
 
-from __future__ import annotations
-
 import argparse
 import shlex
 import signal

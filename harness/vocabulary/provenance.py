@@ -3,8 +3,6 @@
 Every stored file states its version: JSON and Parquet in a key, CSV in a column, YAML in a comment on the first line,
 HTML in ``<meta name="generator">``. A newer file is refused; an older file is read or made again."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import importlib.metadata

@@ -1,7 +1,5 @@
 """Random streams and digests derived from content, so that order, processes and resumption cannot change a result."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from typing import Any

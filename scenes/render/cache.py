@@ -1,7 +1,5 @@
 """Stores renders by content, in files with a checksum; lists, locks and trims their folder."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import io

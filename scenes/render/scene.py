@@ -1,7 +1,5 @@
 """Mitsuba: loads it, builds a target's scene in the camera's frame, and answers the queries of light transport."""
 
-from __future__ import annotations
-
 import os
 import sys
 import warnings

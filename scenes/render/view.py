@@ -4,8 +4,6 @@ Indirect light has met at least two surfaces; it is gathered by following paths 
 low-discrepancy points (Sobol, scrambled anew for each batch) gives its noise. On the board's undamaged face, indirect
 light is smooth, so it is gathered at the nodes of a coarse grid and interpolated."""
 
-from __future__ import annotations
-
 import time
 from functools import lru_cache
 from typing import Any, NamedTuple

@@ -4,8 +4,6 @@ After a change of the sensor model, run ``python -m scenes.sensor.calibration NA
 camera's file; a test compares both. The gain gives the published temporal deviation of single pixels, without the
 jitter of whole frames (subtracted in squares) and without jumps. Ambient light is the default of `CameraConfig`."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from typing import TypeVar

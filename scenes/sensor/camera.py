@@ -1,7 +1,5 @@
 """Cameras as data: a YAML file in which every number has a tag and a source, of tofpod or of an installed package."""
 
-from __future__ import annotations
-
 import difflib
 import json
 from collections.abc import Iterator, Mapping

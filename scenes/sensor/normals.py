@@ -1,7 +1,5 @@
 """Standard normals for the cameras' noise, vectorised, from a generator's raw words; single-threaded, float32."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

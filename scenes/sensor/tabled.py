@@ -6,8 +6,6 @@ filter correlates neighbours; each unit has a fixed pattern, the same in all fra
 depth (mixing of neighbours, flying pixels), light over several surfaces, ambient light, warm-up and displacements of
 whole frames. `harness.sweep` simulates all of them."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

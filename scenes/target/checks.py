@@ -1,7 +1,5 @@
 """Checks of a declaration as a whole: all parts that do not fit are found and named; nothing is built."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import cv2

@@ -7,8 +7,6 @@ depth the boards keep their places, sizes and tilts: their results are paired.
 
 Not modelled: damage that is correlated (a row, a cluster), several kinds on one board."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import lru_cache

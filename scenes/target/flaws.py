@@ -8,8 +8,6 @@ plane that touches the face; they are exact to second order in size over radius 
 
 Not modelled: burrs, spring-back, rust that stands on the face, another albedo of the exposed material."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal

@@ -4,8 +4,6 @@ A texture is (rows, columns[, channels]); u = x / width + 1/2 runs with the colu
 height runs with the rows from the top (+y): row 0 begins at v = 0. The centre of texel (row, column) is at u = (column
 + 1/2) / columns, v = (row + 1/2) / rows; between centres bilinear, beyond the outermost constant."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

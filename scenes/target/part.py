@@ -7,8 +7,6 @@ longer side, and interpolated bilinearly.
 Not checked: neighbouring triangles that fold onto each other. Not modelled: steps of the front within a step of the
 grid; pressed dents and chips, which need a sheet's back or a declared edge."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal

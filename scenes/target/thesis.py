@@ -5,8 +5,6 @@ its error script. They state eleven holes of 1/16 to 1 in, drilled in one row of
 2 in apart from the 1/4 in hole on, strips of coloured tape, and an Azure Kinect. Every other value is a choice with a
 reason, made before any claim was scored; `experiments/averaging.yaml` tries other plausible values."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field

@@ -1,7 +1,5 @@
 """The target in closed form: the face as a height field, the planes around it, and the damage: place and volume."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ saturation. A target is found if y > decision, so POD = Phi((x - mu) / sigma), m
 independent and multiplies the covariance by k, the mean number of signals per target. That is right if a target's
 signals are equal, else cautious. Not modelled: scatter that grows with size, curvature (`diagnose` tests both)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from itertools import product

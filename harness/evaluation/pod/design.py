@@ -1,7 +1,5 @@
 """Plans hit/miss studies: it simulates them from a guess of the POD curve and analyses them like real ones."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

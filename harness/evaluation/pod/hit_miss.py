@@ -12,8 +12,6 @@ covers 91 to 96 % (1,000 studies of 60 targets for each of five true curves). So
 all models that the data hardly distinguish from the best (`near_models`): 95.6 to 99 %
 (``tests/validation/pod_coverage.py``)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial

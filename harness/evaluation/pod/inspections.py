@@ -3,8 +3,6 @@
 A row is a flaw, or an inspection of a flaw. Several response columns (one for each inspector, the handbook's own
 layout) are inspections of the row's flaw. `Inspections.notes` says how unclear cells were interpreted."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import io

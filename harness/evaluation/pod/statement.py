@@ -1,7 +1,5 @@
 """The statement on one set of inspections, from hits and misses or from signals: curve, bounds, and their basis."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property

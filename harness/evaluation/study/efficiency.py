@@ -6,8 +6,6 @@ share of independent pixels, or of frames without a fixed pattern, that the idea
 (Tanner and Birdsall, J. Acoust. Soc. Am. 30 (1958), 922). It is unknown if d'_p was not inspected. Hits by missing
 returns are left out, as the ideal observer does not use these."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -8,8 +8,6 @@ scatters by 2 mm about 6 mm, a90/95 of the true model covers 88 % (60 boards) an
 covers 86 % with 20 boards (300 studies, ``tests/validation/study_coverage.py``). A study draws boards at random, not
 damages, so whole boards are resampled with replacement (cluster bootstrap; Davison and Hinkley 1997, section 3.8)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -2,8 +2,6 @@
 share its render, its pose and its surface. The tests of hits and limits ignore that each set-up drew its own
 calibration of the threshold; those of signals and false calls do not. The first of two p-values means worse."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

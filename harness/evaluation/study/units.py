@@ -8,8 +8,6 @@ are combined as the root of the sum of squares (Zou and Donner, Statistics in Me
 ``tests/validation/units_coverage.py`` measures how often a new unit is within the limit. Not modelled: units that
 differ in more than their fixed pattern (temperature, age, a maker's change of parts)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

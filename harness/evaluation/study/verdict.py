@@ -4,8 +4,6 @@ than `MARGIN` and by more than chance explains, by Holm's step-down method over 
 `ALPHA`; or if it has lost its limit. On the same boards, the tests of hits and of a90 decide on the limit; on other
 boards, the bootstrap of a90 does. See `harness.evaluation.study.paired`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Literal, get_args

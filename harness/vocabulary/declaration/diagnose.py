@@ -1,7 +1,5 @@
 """Translates pydantic's errors into problems with a place, the legal values and the nearest legal word."""
 
-from __future__ import annotations
-
 import difflib
 import json
 import re

@@ -1,8 +1,6 @@
 """The structure that a declaration's models require, read from the annotations of their fields. A *splice* places a
 model where another model holds free data, such as the settings of a detector that is chosen by name."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass

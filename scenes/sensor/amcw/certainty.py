@@ -5,8 +5,6 @@ sure if the engine's table of gates (`ranging.first_failed`) gives the same resu
 within `DEVIATIONS`. If noise is too large for that, bounds that hold at any noise are used. If a window shows one even
 surface, noise lowers the weight of all neighbours by the same share, which a table gives by the phase noise."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import cv2

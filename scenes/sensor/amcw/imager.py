@@ -8,8 +8,6 @@ that changes during a frame, cross-talk between pixels, in-pixel rejection of am
 in which exposures end, phase errors that differ between frequencies (except harmonics), any further post-processing.
 Errors of a unit's tables of lens, emitter and phase offsets are part of its fixed pattern and offset."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple

@@ -1,8 +1,6 @@
 """Compiled inner loops of the continuous-wave imager up to the filtered phasor: exposure and phase-space filter. The
 filter serves a full image, or a list of pixels with `LANES` frames done together. Single-threaded, float32."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numba

@@ -1,7 +1,5 @@
 """The continuous-wave imager's engine after its filter: unwrap, fuse, gate, round. Compiled loops, float32."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -6,8 +6,6 @@ drift, rounding. Not modelled: light that met more than one surface (only direct
 of a second lens, the texture that a stereo camera needs, noise shared by successive frames, and clustered dropouts. The
 effects multipath, wiggling, ambient and saturation change nothing."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

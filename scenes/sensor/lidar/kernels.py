@@ -4,8 +4,6 @@ A code of period T correlates to a pulse that repeats with T, so its spectrum is
 on that comb are the spectrum H of all light paths within a beam. With weights W, the correlation is c(t) = sum_k W_k
 Re(H_k exp(-2 pi i k t / T)) / sum_k W_k; a single return of light a is a pulse of height a."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numba

@@ -8,8 +8,6 @@ beside the transmitter; rounding. Not modelled: wiggling and the edge gate (thes
 the real code, uneven speed and direction errors of the mirror, a beam width that changes with distance, drift over
 seconds, light of other lidars, motion, walk error with amplitude, and other filters of the vendor."""
 
-from __future__ import annotations
-
 from functools import cached_property
 from typing import NamedTuple
 
