@@ -103,7 +103,7 @@ class MatchedDetector(LocalDetector):
 
     settings_type: ClassVar[type[MatchedConfig]] = MatchedConfig
     name = "matched"
-    version = 7
+    version = 8
 
     def __init__(self, settings: FilterConfig, covariance: np.ndarray | None = None) -> None:
         """``covariance``: the noise's, in squared deviations, that `calibrate` has learned."""
@@ -204,21 +204,30 @@ def _judged(
     """Return signed scores (r, c) of residuals in deviations, and the deviation of the narrowest template's height."""
     covariance = _covariance(values, known, depth_px) if covariance is None else covariance
     window_px = whitening.window_of(covariance)
+    templates = whitening.bank(window_px)
     worth_of = whitening.worths(whitening.spectrum(covariance, (whitening.GRID, whitening.GRID)), window_px)
     noise = _Noise(whitening.filters(covariance, values.shape), window_px, worth_of)
-    tamed = _tamed(values)
-    # strong residuals, as seen by round templates
-    signed, by, solved = _scored(tamed, known, noise, rough=True)
-    radius_px = np.array([each.radius_px for each in whitening.bank(window_px)], np.float32)
+    tamed, heard = _tamed(values), np.zeros(known.shape, np.uint8)
+    signed, by, solved, _ = _scored(tamed, known, noise)
+    radius_px = np.array([each.radius_px for each in templates], np.float32)
+    raised = np.array([each.raised for each in worth_of], np.float32)
     size = np.abs(signed)
     peaks = np.argwhere((size > STRONG) & _highest(size))
-    core, taken = _cores(peaks, size, radius_px[by], values, known)
+    peaks = peaks[np.argsort(size[tuple(peaks.T)], kind="stable")]
+    strong_by = by[tuple(peaks.T)]
+    for (row, column), radius in zip(peaks.tolist(), radius_px[strong_by].tolist(), strict=True):
+        cv2.circle(heard, (column, row), round(radius), 1, cv2.FILLED)
+    core, heights, peak_of = _cores(peaks, radius_px[strong_by], values, known)
     seen = known & ~grown(core, MARGIN_PX) if core.any() else known
     # where much is removed, the first solution is a poor start
-    signed, by, _ = _scored(tamed * seen, seen, noise, start=None if core.any() else solved)
+    start = None if core.any() else solved
+    signed, by, _, deviations = _scored(tamed * seen, seen, noise, heard.view(np.bool_), start)
+    # only now are the deviations of the strong scores known
+    square, more = size[tuple(peaks.T)] ** 2 - raised[strong_by], raised[strong_by]
+    strengths = np.sqrt(np.maximum(square, 0.0) / deviations[strong_by] ** 2 + more)
     _fill_discs(signed, radius_px[by])
     signed *= known
-    signed[core] = taken[core]
+    signed[core] = heights[core] * strengths[peak_of[core]]
     reach = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
     low, high = (np.asarray(of(signed, reach)) for of in (cv2.erode, cv2.dilate))
     lobe = (signed < -LOBE_SHARE * low) & (signed > -LOBE_SHARE * high)
@@ -234,22 +243,27 @@ def _tamed(values: np.ndarray) -> np.ndarray:
 
 
 def _scored(
-    values: np.ndarray, seen: np.ndarray, noise: _Noise, start: np.ndarray | None = None, rough: bool = False
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    values: np.ndarray,
+    seen: np.ndarray,
+    noise: _Noise,
+    heard: np.ndarray | None = None,
+    start: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return each pixel's strongest score (r, c) with its sign, the index of its template, and C^-1 r, from the pixels
-    ``seen`` (r, c). ``start``: an approximate solution. ``rough``: only round templates at the centres of pixels,
-    without the scatter of scores, which strong residuals would spoil."""
+    ``seen`` (r, c); and the deviation (t,) of each template's scores. ``heard`` (r, c) bool: strong findings, which the
+    scatter of scores ignores; if None, they are sought: only at the centres of pixels, and with deviations of 1.
+    ``start``: an approximate solution."""
+    rough = heard is None
     solved = whitening.inverse_times(values, seen, noise.filters, start, ROUGH if rough else whitening.CONVERGED)
     spectra, visible, tail = [whitening.transformed(solved, noise.filters.grid)], {}, 1.0
-    there = seen.astype(np.float32)
-    views = [_view(there, there if rough else _depth_px(seen))]
-    if not rough:
-        spectra.append(whitening.halved(spectra[0]))
-        views.append(_view(_halved(there), _halved(views[0].depth_px)))
+    there, depth_px = seen.astype(np.float32), _depth_px(seen)
+    spectra.append(whitening.halved(spectra[0]))
+    views = [_view(there, depth_px), _view(_halved(there), _halved(depth_px))]
     scores, products = [np.empty_like(view.there) for view in views], [np.empty_like(each) for each in spectra]
-    best = [(np.zeros(view.there.shape, np.float32), np.zeros(view.there.shape, np.uint8)) for view in views]
-    templates, worths = whitening.bank(noise.window_px), noise.worths
-    wanted = [not rough or not (each.coarse or any(each.halves)) for each in templates]
+    # of fine, coarse and slots' scores
+    best = [(np.zeros_like(views[at].there), np.zeros(views[at].there.shape, np.uint8)) for at in (0, 1, 1)]
+    templates, worths, spread = whitening.bank(noise.window_px), noise.worths, np.ones(len(noise.worths))
+    wanted = [not rough or not any(each.halves) for each in templates]
     for pair, numbers in whitening.spectra(noise.filters.grid, noise.window_px):
         if not any(wanted[number] for number in numbers):
             continue
@@ -267,25 +281,30 @@ def _scored(
             cv2.extractChannel(both, channel, dst=score)
             cv2.multiply(score, visible[key], dst=score, scale=worth.energy**-0.5)
             deviation = 1.0
-            if not rough:
+            if heard is not None:
                 step, round_px = 1 + coarse, 0.0 if template.slot else template.radius_px
-                deviations, quiet = _deviations(score, view, round(round_px / step) if round_px >= WIDE_PX else 0)
+                reach_px = round(round_px / step) if round_px >= WIDE_PX else 0
+                deviations, quiet = _deviations(score, view, heard[::step, ::step], reach_px)
                 deviation = float(deviations[-1])
                 _calm(score, quiet, deviation, max(WINDOW_RADII * template.radius_px, LEAST_WINDOW) / step)
                 _even(score, view.rim, view.starts, deviation / deviations)
                 if template.radius_px <= TAIL_PX:
                     tail = tail if any(template.halves) else _tail(score, deviation)
                     deviation *= tail
-            _keep_stronger(*best[coarse], score, 1.0 / deviation, worth.raised, *template.halves, number)
+            spread[number] = deviation
+            _keep_stronger(
+                *best[coarse + template.slot], score, 1.0 / deviation, worth.raised, *template.halves, number
+            )
     signed, by = best[0]
-    for half, half_by in best[1:]:
+    # linear interpolation would lower the narrow ridges of slots' scores by a seventh
+    for (half, half_by), smooth in zip(best[1:], (cv2.INTER_LINEAR, cv2.INTER_NEAREST), strict=True):
         wide, wide_by = (
             np.ascontiguousarray(cv2.resize(each, None, fx=2, fy=2, interpolation=how)[: len(seen), : seen.shape[1]])
-            for each, how in ((half, cv2.INTER_LINEAR), (half_by, cv2.INTER_NEAREST))
+            for each, how in ((half, smooth), (half_by, cv2.INTER_NEAREST))
         )
         wider = (np.abs(wide) > np.abs(signed)).view(np.uint8)
         cv2.copyTo(wide, wider, signed), cv2.copyTo(wide_by, wider, by)
-    return signed * seen, by, solved
+    return signed * seen, by, solved, spread
 
 
 class _View(NamedTuple):
@@ -348,12 +367,13 @@ def _halved(image: np.ndarray) -> np.ndarray:
     return np.asarray(cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
 
 
-def _deviations(score: np.ndarray, view: _View, reach_px: int) -> tuple[np.ndarray, np.ndarray]:
+def _deviations(score: np.ndarray, view: _View, heard: np.ndarray, reach_px: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the deviation (z,) of the scores (r, c) in each zone of a view, from sizes up to `CAP`, at least that of
-    the last zone; and the scores, 0 within ``reach_px`` of strong ones, which are excluded."""
+    the last zone; and the scores, 0 within ``reach_px`` of strong and ``heard`` ones (r, c), which are excluded."""
     found, _ = _scatter(score, view.rim, view.starts)
-    if reach_px and cv2.norm(score, cv2.NORM_INF) > FAINT * found[-1]:
-        quiet = score * ~grown(np.abs(score) > FAINT * found[-1], reach_px)
+    if (reach_px and cv2.norm(score, cv2.NORM_INF) > FAINT * found[-1]) or heard.any():
+        loud = heard | (np.abs(score) > FAINT * found[-1]) if reach_px else heard
+        quiet = score * ~grown(loud, reach_px)
         again, count = _scatter(quiet, view.rim, view.starts)
         return (again if count > FEWEST else found), quiet
     return found, score
@@ -498,23 +518,22 @@ def _highest(size: np.ndarray) -> np.ndarray:
 
 
 def _cores(
-    peaks: np.ndarray, size: np.ndarray, radius_px: np.ndarray, values: np.ndarray, known: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return (r, c) bool: the loud pixels under ``peaks`` (n, 2) of the scores' ``size``, and what lies between them,
-    where they fill a disc of the template's ``radius_px`` (r, c). Also return their signed scores (r, c), in proportion
-    to the values over 3 x 3 pixels, so that two holes that touch keep two peaks."""
-    core, signed = np.zeros(size.shape, bool), np.zeros(size.shape)
+    peaks: np.ndarray, radius_px: np.ndarray, values: np.ndarray, known: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (r, c) bool: the loud pixels under ``peaks`` (n, 2), weakest first, and what lies between them, where they
+    fill a disc of the template's ``radius_px`` (n,). Also return their signed heights (r, c), up to 1, in proportion to
+    the values over 3 x 3 pixels, so that two holes that touch keep two peaks; and each pixel's peak (r, c)."""
+    core, signed, peak_of = np.zeros(known.shape, bool), np.zeros(known.shape), np.zeros(known.shape, np.intp)
     loud = known & (np.abs(values) > LOUD_SIGMAS)
     around = (cv2.blur(each, (3, 3)) for each in (values, known.astype(np.float32)))
     smooth = next(around) / np.maximum(next(around), 0.1)
     count, parts, stats, _ = cv2.connectedComponentsWithStats(grown(loud, 1).astype(np.uint8))
-    score = np.zeros(count)
-    for row, column in peaks.tolist():
+    highest = np.full(count, -1)
+    for peak, (row, column) in enumerate(peaks.tolist()):
         for number in np.unique(parts[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]):
-            least = LOUD_SHARE * np.pi * radius_px[row, column] ** 2
-            if number > 0 and stats[number, cv2.CC_STAT_AREA] > least:
-                score[number] = max(score[number], size[row, column])
-    for number in np.flatnonzero(score):
+            if number > 0 and stats[number, cv2.CC_STAT_AREA] > LOUD_SHARE * np.pi * radius_px[peak] ** 2:
+                highest[number] = peak
+    for number in np.flatnonzero(highest >= 0):
         left, top, width, height = stats[number, :4]
         cut = np.s_[top : top + height, left : left + width]
         part = (parts[cut] == number) & known[cut]
@@ -522,9 +541,9 @@ def _cores(
         # quiet pixels between loud ones are not a finding of the other sign
         side = np.sign(heights[np.abs(heights).argmax()])
         heights = np.where(np.abs(heights) > LOUD_SIGMAS, heights, side * np.maximum(side * heights, 0.0))
-        signed[cut][part] = score[number] * heights / np.abs(heights).max()
+        signed[cut][part], peak_of[cut][part] = heights / np.abs(heights).max(), highest[number]
         core[cut] |= part
-    return core, signed
+    return core, signed, peak_of
 
 
 def _depth_px(known: np.ndarray) -> np.ndarray:
