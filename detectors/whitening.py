@@ -42,7 +42,7 @@ SIDES_PX = (0, 1, 2, 3, 5, 8, 12, 18)
 """Half-sides that a `Worth` may have: the visible share is computed once for each."""
 GRID = 96
 """Side of the grid that holds the widest template and the reach of its whitened edge."""
-CONVERGED, MOST_ITERATIONS, FADED = 0.2, 40, 0.3
+CONVERGED, MOST_ITERATIONS, FADED = 0.15, 40, 0.3
 """Error at which C^-1 r is solved, most steps, and weight of 0 in the values that fill unknown pixels."""
 EDGE_PX = 7.0
 """Depth of an outline's pixels among which errors count, in units of the sum of what is unknown around its pixels."""
@@ -138,7 +138,8 @@ def inverse_times(
     tight, share, towards = np.zeros_like(by.inverse), np.empty_like(by.inverse), np.empty_like(mask)
     tight[:h, :w] = mask
     near = cv2.GaussianBlur(tight, (13, 13), 2.0, borderType=cv2.BORDER_CONSTANT)[:h, :w]
-    damp, enough = mask * np.sqrt(near), error**2 * EDGE_PX * float(mask.sum() - np.vdot(mask, near))
+    damp, unknown = mask * np.sqrt(near), float(mask.sum() - np.vdot(mask, near))
+    enough = error**2 * min(EDGE_PX * unknown, float(mask.sum()))
     _spread(mask, mask, np.ones_like(share), False, share)
     share = (1.0 - tight) / (share + FADED)
 

@@ -14,7 +14,7 @@ import pytest
 from detectors.interface import Detection
 from detectors.local import LocalConfig, LocalDetector
 from detectors.matched import MatchedDetector
-from detectors.whitening import inverse_times, noise_covariance, spectrum
+from detectors.whitening import filters, inverse_times, noise_covariance, spectrum
 from harness.synthetic_clouds import LENS, plane, with_gaps
 from harness.testing import check_detector
 from harness.vocabulary.geometry import Cloud, Region
@@ -184,7 +184,8 @@ def test_the_matched_filter_is_the_likelihoods_with_pixels_missing() -> None:
     noise = sum(np.roll(raw, (i, j), (0, 1)) for i in range(3) for j in range(3)) / 3.0
     known = rng.random(noise.shape) > 0.1
     shape = (128, 128)
-    power = spectrum(noise_covariance(noise, known, shape), shape)
+    lags = noise_covariance(noise, known, shape)
+    power = spectrum(lags, shape)
     part = (slice(20, 42), slice(24, 46))
     known_part, noise_part = known[part], noise[part]
     covariance = np.fft.irfft2(power, shape)
@@ -193,7 +194,8 @@ def test_the_matched_filter_is_the_likelihoods_with_pixels_missing() -> None:
     dense = covariance[apart[..., 0], apart[..., 1]]
     # the products of neighbours are two thirds of the variance; the least power adds to the variance alone
     assert 0.5 < covariance[0, 1] / covariance[0, 0] < 2 / 3
-    solved = inverse_times(np.where(known_part, noise_part, 0).astype(np.float32), known_part, power, shape)
+    by = filters(lags, known_part.shape)
+    solved = inverse_times(np.where(known_part, noise_part, 0).astype(np.float32), known_part, by, error=0.01)
     expected = np.linalg.solve(dense, noise_part[known_part])
     np.testing.assert_allclose(solved[known_part], expected, atol=0.02 * np.abs(expected).max())
     assert not solved[~known_part].any()
