@@ -25,7 +25,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import cv2
 import numba
@@ -33,19 +33,10 @@ import numpy as np
 import scipy.fft
 from scipy import special
 
-from detectors import whitening
+from detectors import local, whitening
 from detectors.clusters import PLAIN
 from detectors.interface import Evidence
-from detectors.local import (
-    LEAST_WINDOW,
-    LEVEL_SIGMAS,
-    SADDLE,
-    FilterConfig,
-    LocalDetector,
-    LocalEvidence,
-    LocalPicture,
-    local_sigma,
-)
+from detectors.local import FilterConfig, LocalDetector, LocalEvidence, LocalPicture
 from detectors.masks import grown
 from detectors.missing import missing_evidence
 from detectors.noise import median_of
@@ -66,7 +57,8 @@ ALONE_PX = 7
 """Half of the square in which a peak is the highest."""
 RIM_PX = 6
 """Depth of the target's rim, to which the camera's window and lens reach over its edge."""
-LAYER_PX = 4  # side of the squares in which what the rim shares is averaged
+LAYER_PX, MODEST_SIGMAS = 4, local.LEVEL_SIGMAS
+"""Side of the squares in which what the rim shares is averaged, and the limit to which residuals are clipped there."""
 RIM_ENDS_PX = (1, 2, 3, 5, 8, 12)
 """Distances from the outline up to which scores have their own scatter; farther inside, all scores share one."""
 N_ZONES = len(RIM_ENDS_PX) + 1
@@ -79,8 +71,9 @@ DEVIATIONS = np.geomspace(0.2, 50.0, 200)
 CAPPED = DEVIATIONS * np.sqrt(2.0 / np.pi) * (1.0 - np.exp(-0.5 * (CAP / DEVIATIONS) ** 2)) + 2.0 * CAP * special.ndtr(
     -CAP / DEVIATIONS
 )
-CAPPED_UNEVEN = float(np.interp(UNEVEN, DEVIATIONS, CAPPED))
-"""Deviations of a Gaussian, and the mean of its size if more than `CAP` counts as `CAP`."""
+STEPS = 4096
+DEVIATION_OF = np.interp(np.arange(STEPS * CAP + 2) / STEPS, CAPPED, DEVIATIONS)
+"""Deviations of a Gaussian, the mean of its size if more than `CAP` counts as `CAP`; and the inverse, by `STEPS`."""
 FAINT = 3.5
 """Scores below this are all raised by the same factor, because `Worth` counts maxima."""
 LOBE_SHARE = 0.5
@@ -168,8 +161,9 @@ def _in_deviations(
     around = (cv2.blur(each, side, borderType=cv2.BORDER_REFLECT) for each in (values, known.astype(np.float32)))
     short = values - next(around) / np.maximum(next(around), np.float32(1e-6))
     short[~known] = np.nan
-    share = median_of(np.abs(short[known])) / max(median_of(np.abs(values[known])), 1e-12)
-    unit_m = np.maximum(local_sigma(short) / max(share, 1e-3), floor_m)
+    some = slice(None, None, max(1, np.count_nonzero(known) // 65536))
+    share = median_of(np.abs(short[known][some])) / max(median_of(np.abs(values[known][some])), 1e-12)
+    unit_m = np.maximum(local.local_sigma(short) / max(share, 1e-3), floor_m)
     depth_px = _depth_px(known)
     return _without_rim(values / unit_m, depth_px * known), known, depth_px, unit_m
 
@@ -190,48 +184,37 @@ def _covariance(noise: np.ndarray, known: np.ndarray, depth_px: np.ndarray) -> n
     return whitening.noise_covariance(noise, inner & (loud == 0), whitening.grid_of(noise.shape))
 
 
-class _Noise(NamedTuple):
-    """The bank for a picture's noise: `whitening.Filters`, and each template's `Worth`."""
-
-    filters: whitening.Filters
-    window_px: int
-    worths: tuple[whitening.Worth, ...]
-
-
 def _judged(
     values: np.ndarray, known: np.ndarray, depth_px: np.ndarray, covariance: np.ndarray | None
 ) -> tuple[np.ndarray, float]:
     """Return signed scores (r, c) of residuals in deviations, and the deviation of the narrowest template's height."""
     covariance = _covariance(values, known, depth_px) if covariance is None else covariance
     window_px = whitening.window_of(covariance)
-    templates = whitening.bank(window_px)
-    worth_of = whitening.worths(whitening.spectrum(covariance, (whitening.GRID, whitening.GRID)), window_px)
-    noise = _Noise(whitening.filters(covariance, values.shape), window_px, worth_of)
+    worths = whitening.worths(whitening.spectrum(covariance, (whitening.GRID, whitening.GRID)), window_px)
+    noise = whitening.filters(covariance, values.shape), window_px, worths
     tamed, heard = _tamed(values), np.zeros(known.shape, np.uint8)
     signed, by, solved, _ = _scored(tamed, known, noise)
-    radius_px = np.array([each.radius_px for each in templates], np.float32)
-    raised = np.array([each.raised for each in worth_of], np.float32)
+    radius_px = np.array([each.radius_px for each in whitening.bank(window_px)], np.float32)
     size = np.abs(signed)
     peaks = np.argwhere((size > STRONG) & _highest(size))
     peaks = peaks[np.argsort(size[tuple(peaks.T)], kind="stable")]
-    strong_by = by[tuple(peaks.T)]
+    strong, strong_by = size[tuple(peaks.T)], by[tuple(peaks.T)]
     for (row, column), radius in zip(peaks.tolist(), radius_px[strong_by].tolist(), strict=True):
         cv2.circle(heard, (column, row), round(radius), 1, cv2.FILLED)
     core, heights, peak_of = _cores(peaks, radius_px[strong_by], values, known)
     seen = known & ~grown(core, MARGIN_PX) if core.any() else known
     # where much is removed, the first solution is a poor start
-    start = None if core.any() else solved
-    signed, by, _, deviations = _scored(tamed * seen, seen, noise, heard.view(np.bool_), start)
+    signed, by, _, spread = _scored(tamed * seen, seen, noise, heard > 0, None if core.any() else solved)
     # only now are the deviations of the strong scores known
-    square, more = size[tuple(peaks.T)] ** 2 - raised[strong_by], raised[strong_by]
-    strengths = np.sqrt(np.maximum(square, 0.0) / deviations[strong_by] ** 2 + more)
+    more = np.array([each.raised for each in worths])[strong_by]
+    strong = np.sqrt(np.maximum(strong**2 - more, 0.0) / spread[strong_by] ** 2 + more)
     _fill_discs(signed, radius_px[by])
     signed *= known
-    signed[core] = heights[core] * strengths[peak_of[core]]
+    signed[core] = heights[core] * strong[peak_of[core]]
     reach = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
     low, high = (np.asarray(of(signed, reach)) for of in (cv2.erode, cv2.dilate))
     lobe = (signed < -LOBE_SHARE * low) & (signed > -LOBE_SHARE * high)
-    return (signed * ~lobe).astype(np.float64), noise.worths[0].energy ** -0.5
+    return (signed * ~lobe).astype(np.float64), worths[0].energy ** -0.5
 
 
 def _tamed(values: np.ndarray) -> np.ndarray:
@@ -245,56 +228,49 @@ def _tamed(values: np.ndarray) -> np.ndarray:
 def _scored(
     values: np.ndarray,
     seen: np.ndarray,
-    noise: _Noise,
+    noise: tuple[whitening.Filters, int, Sequence[whitening.Worth]],
     heard: np.ndarray | None = None,
     start: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return each pixel's strongest score (r, c) with its sign, the index of its template, and C^-1 r, from the pixels
-    ``seen`` (r, c); and the deviation (t,) of each template's scores. ``heard`` (r, c) bool: strong findings, which the
-    scatter of scores ignores; if None, they are sought: only at the centres of pixels, and with deviations of 1.
-    ``start``: an approximate solution."""
-    rough = heard is None
-    solved = whitening.inverse_times(values, seen, noise.filters, start, ROUGH if rough else whitening.CONVERGED)
-    spectra, visible, tail = [whitening.transformed(solved, noise.filters.grid)], {}, 1.0
-    there, depth_px = seen.astype(np.float32), _depth_px(seen)
+    ``seen`` (r, c); and the deviation (t,) of each template's scores. ``noise``: its `whitening.filters`, the window's
+    side, and each template's `Worth`. ``heard`` (r, c) bool: strong findings, which the scatter of scores ignores; None
+    to seek them, at the centres of pixels and with deviations of 1. ``start``: an approximate solution."""
+    (filters, window_px, worths), rough = noise, heard is None
+    solved = whitening.inverse_times(values, seen, filters, start, ROUGH if rough else whitening.CONVERGED)
+    spectra, visible, tail = [whitening.transformed(solved, filters[0].shape)], {}, 1.0
+    views = [(seen.astype(np.float32), _depth_px(seen))]
     spectra.append(whitening.halved(spectra[0]))
-    views = [_view(there, depth_px), _view(_halved(there), _halved(depth_px))]
-    scores, products = [np.empty_like(view.there) for view in views], [np.empty_like(each) for each in spectra]
+    views.append((_halved(views[0][0]), _halved(views[0][1])))
+    zones = [_zones(*view) for view in views]
+    scores, products = [np.empty_like(there) for there, _ in views], [np.empty_like(each) for each in spectra]
     # of fine, coarse and slots' scores
-    best = [(np.zeros_like(views[at].there), np.zeros(views[at].there.shape, np.uint8)) for at in (0, 1, 1)]
-    templates, worths, spread = whitening.bank(noise.window_px), noise.worths, np.ones(len(noise.worths))
-    wanted = [not rough or not any(each.halves) for each in templates]
-    for pair, numbers in whitening.spectra(noise.filters.grid, noise.window_px):
-        if not any(wanted[number] for number in numbers):
+    best = [(np.zeros_like(there), np.zeros(there.shape, np.uint8)) for there, _ in (*views, views[1])]
+    templates, spread = whitening.bank(window_px), np.ones(len(worths))
+    for pair, numbers in whitening.spectra(filters[0].shape, window_px):
+        wanted = [not rough or not any(templates[number].halves) for number in numbers]
+        if not any(wanted):
             continue
         coarse = templates[numbers[0]].coarse
-        view, score = views[coarse], scores[coarse]
+        (there, depth_px), score = views[coarse], scores[coarse]
         both = whitening.responses(spectra[coarse], pair, products[coarse])[: len(score), : score.shape[1]]
-        for channel, number in enumerate(numbers):
-            if not wanted[number]:
-                continue
+        for channel, number in [each for each in enumerate(numbers) if wanted[each[0]]]:
             template, worth = templates[number], worths[number]
             key = coarse, template.slot, worth.sides
             if key not in visible:
+                share = cv2.blur(there, worth.sides, borderType=cv2.BORDER_CONSTANT)
                 # errors along outlines, from light and flying pixels, look like slots
-                visible[key] = _visible(view.sums, view.inner if template.slot else view.there, *worth.sides)
+                visible[key] = _visible(share, there * (depth_px > RIM_PX) if template.slot else there)
             cv2.extractChannel(both, channel, dst=score)
             cv2.multiply(score, visible[key], dst=score, scale=worth.energy**-0.5)
             deviation = 1.0
             if heard is not None:
-                step, round_px = 1 + coarse, 0.0 if template.slot else template.radius_px
-                reach_px = round(round_px / step) if round_px >= WIDE_PX else 0
-                deviations, quiet = _deviations(score, view, heard[::step, ::step], reach_px)
-                deviation = float(deviations[-1])
-                _calm(score, quiet, deviation, max(WINDOW_RADII * template.radius_px, LEAST_WINDOW) / step)
-                _even(score, view.rim, view.starts, deviation / deviations)
+                deviation = _evened(score, template, *zones[coarse], heard)
                 if template.radius_px <= TAIL_PX:
                     tail = tail if any(template.halves) else _tail(score, deviation)
                     deviation *= tail
             spread[number] = deviation
-            _keep_stronger(
-                *best[coarse + template.slot], score, 1.0 / deviation, worth.raised, *template.halves, number
-            )
+            _keep_stronger(*best[coarse + template.slot], score, 1 / deviation, worth.raised, *template.halves, number)
     signed, by = best[0]
     # linear interpolation would lower the narrow ridges of slots' scores by a seventh
     for (half, half_by), smooth in zip(best[1:], (cv2.INTER_LINEAR, cv2.INTER_NEAREST), strict=True):
@@ -307,58 +283,23 @@ def _scored(
     return signed * seen, by, solved, spread
 
 
-class _View(NamedTuple):
-    """Where the scores of a solution lie: ``there`` (r, c), the share of known pixels, and its ``sums`` (r + 1, c + 1)
-    up to each pixel; ``inner`` (r, c), the same off the outline; ``depth_px`` (r, c), the distances from the outline;
-    ``rim``, the flat indices of the pixels by zone, but for the last one, and where in it zones start."""
-
-    there: np.ndarray
-    sums: np.ndarray
-    inner: np.ndarray
-    depth_px: np.ndarray
-    rim: np.ndarray
-    starts: np.ndarray
-
-
-def _view(there: np.ndarray, depth_px: np.ndarray) -> _View:
-    return _View(there, cv2.integral(there), there * (depth_px > RIM_PX), depth_px, *_zones(there, depth_px))
-
-
 @numba.njit(**PLAIN)
-def _zones(there: np.ndarray, depth_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    known, depths = there.ravel(), depth_px.ravel()
-    zones, ends = np.empty(len(known), np.uint8), np.zeros(N_ZONES + 1, np.int64)
-    for at in range(len(known)):
-        zone = ZONES[int(np.ceil(min(depths[at], np.float32(len(ZONES) - 1))))]
-        zones[at] = zone if known[at] > 0 else N_ZONES - 1
-        ends[zones[at] + 1] += 1
-    starts = np.cumsum(ends)[:-1]
-    rim, ends = np.empty(starts[-1], np.int64), starts.copy()
-    for at in range(len(known)):
-        if zones[at] < N_ZONES - 1:
-            rim[ends[zones[at]]] = at
-            ends[zones[at]] += 1
-    return rim, starts
-
-
-@numba.njit(**PLAIN)
-def _visible(sums: np.ndarray, judged: np.ndarray, across: int, down: int) -> np.ndarray:
-    """Return 1 / sqrt(s) (r, c) where ``judged`` is not 0 and enough of a template is visible, 0 elsewhere; s is the
-    mean over a rectangle of a picture that is 0 outside, from its ``sums`` (r + 1, c + 1)."""
-    (h, w), beside, under = judged.shape, across // 2, down // 2
-    found, least, area = np.empty((h, w), np.float32), np.float32(LEAST_SEEN), np.float32(1.0 / (across * down))
-    line = np.empty(w + across, np.float32)
-    for i in range(h):
-        top, bottom, inside = sums[max(i - under, 0)], sums[min(i + under + 1, h)], line[beside : beside + w + 1]
-        for j in range(w + 1):
-            inside[j] = bottom[j] - top[j]
-        line[:beside], line[beside + w + 1 :] = 0, inside[w]
-        left, right, ok, to = line[:w], line[across:], judged[i], found[i]
-        for j in range(w):
-            share = (right[j] - left[j]) * area
-            root = np.float32(1.0) / np.sqrt(max(share, least))
-            to[j] = root if (share > least) & (ok[j] > 0) else np.float32(0.0)
+def _visible(share: np.ndarray, judged: np.ndarray) -> np.ndarray:
+    """Return 1 / sqrt(share) (r, c) where ``judged`` is not 0 and enough of a template is visible, 0 elsewhere."""
+    found, least = np.empty(share.shape, np.float32), np.float32(LEAST_SEEN)
+    for i in range(share.shape[0]):
+        of, ok, to = share[i], judged[i], found[i]
+        for j in range(len(to)):
+            root = np.float32(1.0) / np.sqrt(max(of[j], least))
+            to[j] = root if (of[j] > least) & (ok[j] > 0) else np.float32(0.0)
     return found
+
+
+def _zones(there: np.ndarray, depth_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the flat indices (n,) of the known pixels outside the last zone, and their zones (n,)."""
+    zone = ZONES[np.ceil(np.minimum(depth_px, len(ZONES) - 1)).astype(np.uint8)]
+    rim = np.flatnonzero((zone < N_ZONES - 1) & (there > 0))
+    return rim, zone.ravel()[rim]
 
 
 def _halved(image: np.ndarray) -> np.ndarray:
@@ -367,34 +308,46 @@ def _halved(image: np.ndarray) -> np.ndarray:
     return np.asarray(cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
 
 
-def _deviations(score: np.ndarray, view: _View, heard: np.ndarray, reach_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the deviation (z,) of the scores (r, c) in each zone of a view, from sizes up to `CAP`, at least that of
-    the last zone; and the scores, 0 within ``reach_px`` of strong and ``heard`` ones (r, c), which are excluded."""
-    found, _ = _scatter(score, view.rim, view.starts)
-    if (reach_px and cv2.norm(score, cv2.NORM_INF) > FAINT * found[-1]) or heard.any():
-        loud = heard | (np.abs(score) > FAINT * found[-1]) if reach_px else heard
-        quiet = score * ~grown(loud, reach_px)
-        again, count = _scatter(quiet, view.rim, view.starts)
-        return (again if count > FEWEST else found), quiet
-    return found, score
-
-
-def _calm(score: np.ndarray, quiet: np.ndarray, deviation: float, half_px: float) -> None:
-    """Divide the scores (r, c) where the ``quiet`` ones (r, c) that are not 0 within a square of ``half_px`` scatter by
-    more than `UNEVEN` deviations: the noise there differs from elsewhere."""
-    size = _parts(quiet, CAP * deviation, round(half_px / PART_PX)) / deviation
-    if size.max() > CAPPED_UNEVEN:
-        local = np.maximum(np.interp(size, CAPPED, DEVIATIONS) / UNEVEN, 1.0).astype(np.float32)
-        score /= cv2.resize(local, score.shape[::-1], interpolation=cv2.INTER_LINEAR)
+def _evened(
+    score: np.ndarray, template: whitening.Template, rim: np.ndarray, zones: np.ndarray, heard: np.ndarray
+) -> float:
+    """Return the deviation of the scores (r, c) in the last zone, and divide the scores where others scatter more: in
+    the ``zones`` (n,) of the pixels ``rim`` (n,), and where the squares around scatter by more than `UNEVEN` deviations
+    because the noise there differs from elsewhere. Scores next to ``heard`` (r, c) and strong ones do not count."""
+    step, loud = 1 + template.coarse, heard[:: 1 + template.coarse, :: 1 + template.coarse]
+    found, sums, counts = _scatter(score, rim, zones)
+    is_wide = template.radius_px >= WIDE_PX and not template.slot
+    if is_wide and cv2.norm(score, cv2.NORM_INF) > FAINT * found[-1]:
+        loud = loud | (np.abs(score) > FAINT * found[-1])
+    if loud.any():
+        quiet = score * ~grown(loud, round(template.radius_px / step) if is_wide else 0)
+        again, sums, counts = _scatter(quiet, rim, zones)
+        found = again if counts.sum() > FEWEST else found
+    deviation, half_px = float(found[-1]), max(WINDOW_RADII * template.radius_px, local.LEAST_WINDOW) / step
+    window = (2 * round(half_px / PART_PX) + 1,) * 2
+    size = cv2.blur(sums, window) / np.maximum(cv2.blur(counts, window), 0.05 * PART_PX**2)
+    if DEVIATION_OF[int(STEPS * size.max())] > UNEVEN * deviation:
+        more = np.maximum(np.interp(size, CAPPED, DEVIATIONS) / (UNEVEN * deviation), 1.0).astype(np.float32)
+        score /= cv2.resize(more, score.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    _even(score, rim, zones, (deviation / found).astype(np.float32))
+    return deviation
 
 
 @numba.njit(**PLAIN)
-def _parts(score: np.ndarray, cap: float, reach: int) -> np.ndarray:
-    """Return, for each square (r, c) of `PART_PX`, the mean size, at most ``cap``, of the scores that are not 0 in the
-    squares up to ``reach`` squares away; a mean of few is drawn towards 0."""
-    (h, w), most = score.shape, np.float32(cap)
+def _even(score: np.ndarray, rim: np.ndarray, zones: np.ndarray, factors: np.ndarray) -> None:
+    flat = score.ravel()
+    for k in range(len(rim)):
+        flat[rim[k]] *= factors[zones[k]]
+
+
+@numba.njit(**PLAIN)
+def _scatter(score: np.ndarray, rim: np.ndarray, zones: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the deviations (z,) of the scores (r, c) that are not 0 in each zone, at least that of the last, from
+    sizes up to `CAP`; and the sums of these sizes in squares of `PART_PX`, and their numbers."""
+    (h, w), most, flat, last = score.shape, np.float32(CAP), score.ravel(), N_ZONES - 1
     rows, columns = max(1, h // PART_PX), max(1, w // PART_PX)
-    sums, sizes, numbers = np.zeros((rows + 1, columns + 1, 2)), np.empty(w, np.float32), np.empty(w, np.int32)
+    sums, counts = np.zeros((rows, columns)), np.zeros((rows, columns))
+    sizes, numbers = np.empty(w, np.float32), np.empty(w, np.int32)
     for row in range(rows):
         sizes[:], numbers[:] = 0, 0
         for i in range(row * h // rows, (row + 1) * h // rows):
@@ -402,65 +355,22 @@ def _parts(score: np.ndarray, cap: float, reach: int) -> np.ndarray:
             for j in range(w):
                 sizes[j] += min(abs(of[j]), most)
                 numbers[j] += of[j] != 0
-        part, total, count = 0, 0.0, 0
-        for j in range(w):
-            total += sizes[j]
-            count += numbers[j]
-            if j + 1 == (part + 1) * w // columns:
-                part += 1
-                sums[row + 1, part, 0] = sums[row, part, 0] + total
-                sums[row + 1, part, 1] = sums[row, part, 1] + count
-    found = np.empty((rows, columns))
-    for row in range(rows):
-        top, bottom = max(row - reach, 0), min(row + reach + 1, rows)
-        above, under = sums[top], sums[bottom]
         for part in range(columns):
-            left, right = max(part - reach, 0), min(part + reach + 1, columns)
-            whole = under[right, 0] - under[left, 0] - above[right, 0] + above[left, 0]
-            known = under[right, 1] - under[left, 1] - above[right, 1] + above[left, 1]
-            found[row, part] = whole / max(known, 0.05 * PART_PX**2 * (right - left) * (bottom - top))
-    return found
-
-
-@numba.njit(**PLAIN)
-def _scatter(score: np.ndarray, rim: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return the deviation (z,) of the scores (r, c) that are not 0 in each zone, and the number of such scores."""
-    last, most, flat = len(starts) - 1, np.float32(CAP), score.ravel()
-    sizes, numbers = np.zeros(score.shape[1], np.float32), np.zeros(score.shape[1], np.int32)
-    for i in range(score.shape[0]):
-        of = score[i]
-        for j in range(len(of)):
-            sizes[j] += min(abs(of[j]), most)
-            numbers[j] += of[j] != 0
-    sums, counts = np.zeros(last + 1), np.zeros(last + 1, np.int64)
-    whole, number = sizes.sum(), int(numbers.sum())
-    for zone in range(last):
-        total, count = np.float32(0.0), 0
-        for at in rim[starts[zone] : starts[zone + 1]]:
-            total += min(abs(flat[at]), most)
-            count += flat[at] != 0
-        sums[zone], counts[zone] = total, count
-    sums[last], counts[last] = whole - sums.sum(), number - counts.sum()
-    if counts[last] < FEWEST:
-        sums[last], counts[last] = whole, max(number, 1)
-    found = np.empty(last + 1)
+            for j in range(part * w // columns, (part + 1) * w // columns):
+                sums[row, part] += sizes[j]
+                counts[row, part] += numbers[j]
+    totals, known, found = np.zeros(N_ZONES), np.zeros(N_ZONES), np.zeros(N_ZONES)
+    for k in range(len(rim)):
+        totals[zones[k]] += min(abs(flat[rim[k]]), most)
+        known[zones[k]] += flat[rim[k]] != 0
+    totals[last], known[last] = sums.sum() - totals.sum(), counts.sum() - known.sum()
+    if known[last] < FEWEST:
+        totals[last], known[last] = sums.sum(), counts.sum()
     for zone in range(last, -1, -1):
-        size, k = sums[zone] / max(counts[zone], 1), 1
-        while k < len(CAPPED) - 1 and CAPPED[k] < size:
-            k += 1
-        share = min(max((size - CAPPED[k - 1]) / (CAPPED[k] - CAPPED[k - 1]), 0.0), 1.0)
-        found[zone] = DEVIATIONS[k - 1] + share * (DEVIATIONS[k] - DEVIATIONS[k - 1])
-        found[zone] = max(found[zone], found[last]) if counts[zone] >= FEWEST else found[last]
-    return found, number
-
-
-@numba.njit(**PLAIN)
-def _even(score: np.ndarray, rim: np.ndarray, starts: np.ndarray, factors: np.ndarray) -> None:
-    """Multiply the scores (r, c) of each zone but the last by its factor."""
-    flat = score.ravel()
-    for zone in range(len(starts) - 1):
-        for at in rim[starts[zone] : starts[zone + 1]]:
-            flat[at] *= np.float32(factors[zone])
+        if zone == last or known[zone] >= FEWEST:
+            found[zone] = DEVIATION_OF[int(STEPS * totals[zone] / max(known[zone], 1.0))]
+        found[zone] = max(found[zone], found[last])
+    return found, sums, counts
 
 
 @numba.njit(**PLAIN)
@@ -499,17 +409,11 @@ def _fill_discs(signed: np.ndarray, radius_px: np.ndarray) -> None:
     size = np.abs(signed)
     peaks = (size > STRONG / 2) & (radius_px >= WIDE_PX) & _highest(size)
     for row, column in np.argwhere(peaks).tolist():
-        radius, least = int(radius_px[row, column]), SADDLE * 1.01 * signed[row, column]
-        up, left = max(radius - row, 0), max(radius - column, 0)
-        cut = np.s_[row - radius + up : row + radius + 1, column - radius + left : column + radius + 1]
-        inside = _disc(radius)[up : up + size[cut].shape[0], left : left + size[cut].shape[1]]
+        radius, least = int(radius_px[row, column]), local.SADDLE * 1.01 * signed[row, column]
+        cut = np.s_[max(row - radius, 0) : row + radius + 1, max(column - radius, 0) : column + radius + 1]
+        rows, columns = np.ogrid[: size[cut].shape[0], : size[cut].shape[1]]
+        inside = (rows - min(row, radius)) ** 2 + (columns - min(column, radius)) ** 2 <= radius**2
         signed[cut][inside & (size[cut] < abs(least))] = least
-
-
-@lru_cache(maxsize=32)
-def _disc(radius_px: int) -> np.ndarray:
-    reach = np.arange(-radius_px, radius_px + 1)
-    return np.hypot(reach[:, None], reach) <= radius_px
 
 
 def _highest(size: np.ndarray) -> np.ndarray:
@@ -557,34 +461,27 @@ def _without_rim(noise: np.ndarray, depth_px: np.ndarray) -> np.ndarray:
     """Return the residuals (r, c) minus what they share, along some 65 pixels, with those at the same distance from the
     outline, beyond what those next to the rim share: subtracting a mean would leave a step there. Pixels whose
     ``depth_px`` (r, c) is 0 are unknown."""
-    sums = _layers(noise, depth_px)
-    side = 2 * (LEAST_WINDOW // LAYER_PX) + 1
+    noise, sums = noise.astype(np.float32), np.zeros((2, *(-(-side // LAYER_PX) for side in noise.shape), RIM_PX + 1))
+    _layers(noise, depth_px, sums, True)
+    side = 2 * (local.LEAST_WINDOW // LAYER_PX) + 1
     total, count = (cv2.blur(each, (side, side), borderType=cv2.BORDER_CONSTANT) for each in sums)
-    shared = total / np.maximum(count, 1e-6)
-    return _lowered(noise, depth_px, shared - shared[..., RIM_PX:])
+    sums[0] = total / np.maximum(count, 1e-6)
+    sums[0] -= sums[0, ..., RIM_PX:]
+    _layers(noise, depth_px, sums, False)
+    return noise
 
 
 @numba.njit(**PLAIN)
-def _layers(noise: np.ndarray, depth_px: np.ndarray) -> np.ndarray:
-    """Return the sums of clipped residuals, and their numbers (2, r, c, `RIM_PX` + 1), in squares of `LAYER_PX`, for
-    each distance from the outline within the rim, and for those next to the rim together."""
-    h, w = noise.shape
-    sums = np.zeros((2, -(-h // LAYER_PX), -(-w // LAYER_PX), RIM_PX + 1), np.float32)
-    for i in range(h):
-        for j in range(w):
-            if 0 < depth_px[i, j] <= 2 * RIM_PX:
-                layer = min(int(depth_px[i, j]) - 1, RIM_PX)
-                sums[0, i // LAYER_PX, j // LAYER_PX, layer] += min(max(noise[i, j], -LEVEL_SIGMAS), LEVEL_SIGMAS)
-                sums[1, i // LAYER_PX, j // LAYER_PX, layer] += 1
-    return sums
-
-
-@numba.njit(**PLAIN)
-def _lowered(noise: np.ndarray, depth_px: np.ndarray, shared: np.ndarray) -> np.ndarray:
-    """Return the residuals (r, c) minus what the pixels of the rim share, in the order of `_layers`."""
-    found = noise.astype(np.float32)
+def _layers(noise: np.ndarray, depth_px: np.ndarray, sums: np.ndarray, summed: bool) -> None:
+    """Add clipped residuals to ``sums``, and their numbers (2, r, c, `RIM_PX` + 1), in squares of `LAYER_PX`, for each
+    distance from the outline within the rim, and for those next to it together; or subtract from the rim's residuals
+    the first of the sums there."""
     for i in range(noise.shape[0]):
         for j in range(noise.shape[1]):
-            if 0 < depth_px[i, j] <= RIM_PX:
-                found[i, j] -= shared[i // LAYER_PX, j // LAYER_PX, int(depth_px[i, j]) - 1]
-    return found
+            if 0 < depth_px[i, j] <= (2 * RIM_PX if summed else RIM_PX):
+                at = i // LAYER_PX, j // LAYER_PX, min(int(depth_px[i, j]) - 1, RIM_PX)
+                if summed:
+                    sums[0][at] += min(max(noise[i, j], -MODEST_SIGMAS), MODEST_SIGMAS)
+                    sums[1][at] += 1
+                else:
+                    noise[i, j] -= np.float32(sums[0][at])

@@ -16,6 +16,7 @@ import scipy.linalg
 
 from detectors.clusters import PLAIN
 
+Filters = tuple[np.ndarray, np.ndarray]
 SMALL_RADII_PX, HALVES_PX = (0.5, 1.5), ((0.0, 0.0), (0.5, 0.5), (0.0, 0.5), (0.5, 0.0))
 """Radii of small discs, and the positions between pixels at which they are compared: half a pixel costs up to a seventh
 of the score if the window has sharp sides. The first radius stands for all holes smaller than a pixel."""
@@ -42,7 +43,7 @@ SIDES_PX = (0, 1, 2, 3, 5, 8, 12, 18)
 """Half-sides that a `Worth` may have: the visible share is computed once for each."""
 GRID = 96
 """Side of the grid that holds the widest template and the reach of its whitened edge."""
-CONVERGED, MOST_ITERATIONS, FADED = 0.15, 40, 0.3
+CONVERGED, MOST_ITERATIONS, FADED = 0.15, 80, 0.3
 """Error at which C^-1 r is solved, most steps, and weight of 0 in the values that fill unknown pixels."""
 EDGE_PX = 7.0
 """Depth of an outline's pixels among which errors count, in units of the sum of what is unknown around its pixels."""
@@ -50,14 +51,10 @@ TAPS = np.array([1.0, 2.0, 3.0], np.float32) / np.float32(9.0)
 """Weights, along each axis, of second and direct neighbours and of the pixel itself, which fill unknown pixels."""
 
 
-def grid_of(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the grid for transforms of pictures of this shape; it holds every template, and its half is even."""
-    return tuple(_fast(max(side, GRID) + LONGEST_LAG_PX) for side in shape)
-
-
-def _fast(side: int) -> int:
-    """Return the next side that transforms fast."""
-    return 8 * scipy.fft.next_fast_len(math.ceil(side / 8))
+def grid_of(shape: tuple[int, ...], least: int = GRID, more: int = LONGEST_LAG_PX) -> tuple[int, ...]:
+    """Return the grid for transforms of pictures of this shape, as they are fast; it holds every template, and its half
+    is even. ``least``: its least side without the margin of ``more`` pixels."""
+    return tuple(8 * scipy.fft.next_fast_len(math.ceil((max(side, least) + more) / 8)) for side in shape)
 
 
 def noise_covariance(noise: np.ndarray, quiet: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -102,40 +99,29 @@ def _centred(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return np.roll(padded, (-(image.shape[0] // 2), -(image.shape[1] // 2)), (0, 1))
 
 
-class Filters(NamedTuple):
-    """A covariance on the ``grid`` of a picture's transforms, and its inverse on a smaller grid: spectra packed as by
-    `cv2.dft`, over the number of the grid's pixels."""
-
-    grid: tuple[int, ...]
-    power: np.ndarray
-    inverse: np.ndarray
-
-
 def filters(covariance: np.ndarray, shape: tuple[int, ...]) -> Filters:
-    """Return the `Filters` of noise with this covariance for pictures of this ``shape``."""
-    # what wraps around in the preconditioner costs no steps
-    grid, tight = grid_of(shape), tuple(_fast(max(side, 2 * LONGEST_LAG_PX) + 4) for side in shape)
+    """Return the power spectrum of noise with this covariance on the grid of pictures of this ``shape``, and its
+    inverse on a smaller grid, where what wraps around costs no steps. Both are packed as by `cv2.dft`, over sizes."""
     powers = []
-    for each in (grid, tight):
+    for each in (grid_of(shape), grid_of(shape, 2 * LONGEST_LAG_PX, 4)):
         power = cv2.dft(_centred(covariance, each))
         # a real spectrum: the real factor of each number takes the imaginary one's place too
         power[:, 2::2], power[2::2, :: each[1] - 1] = power[:, 1:-1:2], power[1:-1:2, :: each[1] - 1]
-        least = np.float32(max(LEAST_POWER * float(covariance.max()), 1e-12))
-        powers.append(np.maximum(power, least) * np.float32(power.size))
-    return Filters(grid, powers[0] / np.float32(powers[0].size ** 2), 1.0 / powers[1])
+        powers.append(np.maximum(power, np.float32(max(LEAST_POWER * float(covariance.max()), 1e-12))))
+    return powers[0] / np.float32(powers[0].size), np.float32(1.0 / powers[1].size) / powers[1]
 
 
 def inverse_times(
     values: np.ndarray, known: np.ndarray, by: Filters, start: np.ndarray | None = None, error: float = CONVERGED
 ) -> np.ndarray:
-    """Return C^-1 r (r, c) over the known pixels, 0 elsewhere, by conjugate gradients from ``start`` (r, c), until the
-    scores near unknown pixels, where errors gather, err by some ``error`` deviations. The preconditioner fills unknown
-    pixels from their neighbours, applies the stationary inverse, and then the transpose of the filling: with zeros
-    instead, ragged outlines and missing pixels take up to four times the steps. Along outlines it would still be too
-    large: the less is known around a pixel, the more it is damped there, which saves a third of the steps."""
-    (h, w), mask = values.shape, known.astype(np.float32)
-    wide, whole, onward = np.zeros(by.grid, np.float32), np.empty(by.grid, np.float32), np.empty_like(mask)
-    tight, share, towards = np.zeros_like(by.inverse), np.empty_like(by.inverse), np.empty_like(mask)
+    """Return C^-1 r (r, c) over the known pixels, 0 elsewhere, for the `filters` of C. Conjugate gradients go on from
+    ``start`` (r, c) until scores near unknown pixels, where errors gather, err by some ``error`` deviations. The
+    preconditioner fills unknown pixels from their neighbours, applies the stationary inverse, and then the transpose of
+    the filling: with zeros instead, ragged outlines and missing pixels take up to four times the steps. It would still
+    be too large along outlines: damping it the more, the less is known around a pixel, saves a third of the steps."""
+    (h, w), mask, (power, inverse) = values.shape, known.astype(np.float32), by
+    wide, whole, onward = np.zeros_like(power), np.empty_like(power), np.empty_like(mask)
+    tight, share, towards = np.zeros_like(inverse), np.empty_like(inverse), np.empty_like(mask)
     tight[:h, :w] = mask
     near = cv2.GaussianBlur(tight, (13, 13), 2.0, borderType=cv2.BORDER_CONSTANT)[:h, :w]
     damp, unknown = mask * np.sqrt(near), float(mask.sum() - np.vdot(mask, near))
@@ -144,17 +130,16 @@ def inverse_times(
     share = (1.0 - tight) / (share + FADED)
 
     def filtered(image: np.ndarray, factors: np.ndarray, out: np.ndarray) -> np.ndarray:
-        cv2.dft(image, dst=out)
-        np.multiply(out, factors, out=out)
+        np.multiply(cv2.dft(image, dst=out), factors, out=out)
         return np.asarray(cv2.dft(out, dst=out, flags=cv2.DFT_INVERSE))
 
     def covered(image: np.ndarray) -> np.ndarray:
         wide[:h, :w] = image
-        return np.multiply(filtered(wide, by.power, whole)[:h, :w], mask, out=onward)
+        return np.multiply(filtered(wide, power, whole)[:h, :w], mask, out=onward)
 
     def conditioned(image: np.ndarray) -> np.ndarray:
-        filled = _spread(image, damp, share, False, tight)
-        return _spread(filtered(filled, by.inverse, filled), share, damp, True, towards)
+        filled = filtered(_spread(image, damp, share, False, tight), inverse, tight)
+        return _spread(filled, share, damp, True, towards)
 
     solution, rest = np.zeros_like(mask), values * mask
     if start is not None:
@@ -175,8 +160,8 @@ def inverse_times(
 
 @numba.njit(**PLAIN)
 def _spread(image: np.ndarray, inner: np.ndarray, outer: np.ndarray, back: bool, out: np.ndarray) -> np.ndarray:
-    """Write s = ``image`` x ``inner``, on a grid that is 0 elsewhere, plus ``outer`` x s blurred by `TAPS`, into the grid
-    ``out``; or if ``back``, the transpose: the image plus s blurred, times ``outer``. Grids share their first pixel."""
+    """Write s = ``image`` x ``inner``, on a grid that is 0 elsewhere, plus ``outer`` x s blurred by `TAPS`, into the
+    grid ``out``; or if ``back``, the transpose: the image plus s blurred, times ``outer``. Grids share a corner."""
     (height, width), (h, w) = out.shape, image.shape
     columns, (one, two, three) = max(width, w), (TAPS[0], TAPS[1], TAPS[2])
     lines, down = np.zeros((5, columns), np.float32), np.zeros(columns + 4, np.float32)
@@ -292,7 +277,9 @@ def _energies(window_px: int) -> list[tuple[tuple[np.ndarray, ...], np.ndarray, 
     found = []
     for coarse, side in ((False, GRID), (True, GRID // 2)):
         cut = np.ix_(np.r_[: side // 2, GRID - side // 2 : GRID], np.arange(side // 2 + 1))
-        values = np.stack([size[cut] for size, each in zip(sizes, bank(window_px), strict=True) if each.coarse == coarse])
+        values = np.stack(
+            [size[cut] for size, each in zip(sizes, bank(window_px), strict=True) if each.coarse == coarse]
+        )
         half = np.full(side // 2 + 1, 2.0, np.float32)
         half[[0, -1]] = 1.0
         beside = [half * values * np.roll(values, 1, axis=1), 2.0 * values * np.roll(values, -1, axis=2)]
@@ -307,8 +294,8 @@ def _energies(window_px: int) -> list[tuple[tuple[np.ndarray, ...], np.ndarray, 
 @lru_cache(maxsize=6)
 def spectra(shape: tuple[int, ...], window_px: int) -> tuple[tuple[np.ndarray, tuple[int, ...]], ...]:
     """Return the spectra of pairs of templates (an odd one alone) of undisturbed damage of height 1 on a grid, and
-    their numbers in the `bank`: one complex transform correlates a real picture with both. They are divided by the number
-    of pixels of the inverse transform. Coarse templates have only the lower half."""
+    their numbers in the `bank`: one complex transform correlates a real picture with both. They are divided by the size
+    of the inverse transform. Coarse templates have only the lower half."""
     pairs = []
     for coarse in (False, True):
         numbers = [number for number, template in enumerate(bank(window_px)) if template.coarse == coarse]
@@ -323,12 +310,12 @@ def spectra(shape: tuple[int, ...], window_px: int) -> tuple[tuple[np.ndarray, t
 def bank(window_px: int) -> tuple[Template, ...]:
     """Return the templates as seen through a window of `WINDOWS_PX`: discs, paraboloids and slots; coarse ones last."""
 
-    def disc(radius_px: float, off: tuple[float, float] = (0.0, 0.0), side_px: int = window_px) -> Template:
+    def disc(radius_px: float, off: tuple[float, float] = (0.0, 0.0)) -> Template:
         def inside(x: np.ndarray, y: np.ndarray) -> np.ndarray:
             return np.hypot(x - off[1], y - off[0]) < radius_px
 
         halves = (int(2 * off[0]), int(2 * off[1]))
-        return Template(seen(inside, radius_px, side_px), radius_px, halves, coarse=radius_px >= COARSE_PX)
+        return Template(seen(inside, radius_px), radius_px, halves, coarse=radius_px >= COARSE_PX)
 
     def dent(radius_px: float) -> Template:
         image = seen(lambda x, y: np.maximum(1.0 - (x**2 + y**2) / radius_px**2, 0.0), radius_px)
@@ -343,21 +330,19 @@ def bank(window_px: int) -> tuple[Template, ...]:
 
         return Template(seen(inside, SLOT_PX[0] / 2), SLOT_PX[0] / 4, slot=True, coarse=True)
 
-    def seen(
-        shape: Callable[[np.ndarray, np.ndarray], np.ndarray], reach_px: float, side_px: int = window_px
-    ) -> np.ndarray:
-        """Return a shape of x and y in pixels, averaged over pixels and blurred by a lens and a window."""
+    def seen(shape: Callable[[np.ndarray, np.ndarray], np.ndarray], reach_px: float) -> np.ndarray:
+        """Return a shape of x and y in pixels, averaged over pixels and blurred by a lens."""
         finer, half = 4, int(reach_px + 5)
         places = (np.arange((2 * half + 1) * finer) + 0.5) / finer - (half + 0.5)
         height = shape(places[None, :], places[:, None]).astype(float)
         pixels = height.reshape(2 * half + 1, finer, 2 * half + 1, finer).mean(axis=(1, 3))
-        blurred = cv2.GaussianBlur(pixels, (0, 0), LENS_BLUR_PX, borderType=cv2.BORDER_CONSTANT)
-        return np.asarray(cv2.blur(blurred, (side_px, side_px), borderType=cv2.BORDER_CONSTANT))
+        return np.asarray(cv2.GaussianBlur(pixels, (0, 0), LENS_BLUR_PX, borderType=cv2.BORDER_CONSTANT))
 
-    small = [disc(radius_px, off) for radius_px in SMALL_RADII_PX for off in HALVES_PX]
-    if window_px == DEEP_WINDOW_PX:
-        small += [disc(DEEP_PX, off, 1) for off in HALVES_PX]
-    found = (*small, *map(disc, RADII_PX), *map(dent, DENT_RADII_PX), *map(slot, SLOTS_DEG))
+    small = (disc(radius_px, off) for radius_px in SMALL_RADII_PX for off in HALVES_PX)
+    sharp = [*small, *map(disc, RADII_PX), *map(dent, DENT_RADII_PX), *map(slot, SLOTS_DEG)]
+    window, border = (window_px, window_px), cv2.BORDER_CONSTANT
+    found = [each._replace(image=np.asarray(cv2.blur(each.image, window, borderType=border))) for each in sharp]
+    found += [disc(DEEP_PX, off) for off in HALVES_PX if window_px == DEEP_WINDOW_PX]
     return tuple(sorted(found, key=lambda template: template.coarse))
 
 

@@ -63,8 +63,8 @@ def found(cloud: Cloud, threshold: float) -> tuple[Detection, ...]:
 
 
 def test_a_score_is_the_likelihoods_where_pixels_are_missing() -> None:
-    """Beside the dense covariance of the known pixels alone, for each template that the picture holds: closely if solved
-    to a small error, and within twice the error that `CONVERGED` states."""
+    """Beside the dense covariance of the known pixels alone, for each template that the picture holds: closely if
+    solved to a small error, and within twice the error that `CONVERGED` states."""
     noise = blurred(1, (26, 30)).astype(np.float32)
     known = np.random.default_rng(2).random(noise.shape) > 0.1
     grid = grid_of(noise.shape)

@@ -74,7 +74,10 @@ def board_views(batch: Batch, points: tuple[Point, ...]) -> dict[int, BoardView]
     basis = Chebyshev.over(places, DEGREE).basis(places)
     surface = np.zeros((len(basis), *set_up.on_board.shape))
     surface[:, set_up.on_board] = basis
-    signals_m = _signatures_m(set_up, clear_z_m - noise_free_z_m(undamaged))
+    reach_m = REACH_PX * max(set_up.pitch_mm) * MM
+    x, y = np.moveaxis(set_up.board_xy_m, -1, 0)
+    near = [damage.within(x, y, reach_m) for damage in set_up.truth]
+    signals_m = np.where(near, clear_z_m - noise_free_z_m(undamaged), 0.0)
     seen = ndimage.binary_erosion(set_up.on_board, iterations=2) & np.isfinite(clear_z_m)
     inside = np.concatenate(list(set_up.outlines.values()))
     board, names = batch.board or 0, tuple(str(damage.id) for damage in set_up.truth)
@@ -115,11 +118,11 @@ def _noise_m(
         seed = int(random_stream(point.config.seed, *labels).integers(2**31))
         frames = _unit(set_up, unit_seed=seed).capture(capture.frames, point.config.seed, *labels)
         cloud = averages_of(frames, [capture.frames], capture.average, exact=capture.exact)[capture.frames]
-        noise = cloud.points_m[..., 2].copy()
-        known = intact & np.isfinite(noise)
+        noise = np.where(intact, cloud.points_m[..., 2], np.nan)
+        known = np.isfinite(noise)
         basis = surface[:, known].T
         noise[known] -= basis @ np.linalg.lstsq(basis, noise[known], rcond=None)[0]
-        fields.append(np.where(known, noise, np.nan))
+        fields.append(noise)
     noise_m = np.array(fields)
     return np.nan_to_num(noise_m), np.isfinite(noise_m)
 
@@ -130,12 +133,3 @@ def _deviation_m(noise_m: np.ndarray, known: np.ndarray) -> np.ndarray:
     there = count > 0.5 * len(noise_m) / SMOOTHED_PX
     nearest = ndimage.distance_transform_edt(~there, return_distances=False, return_indices=True)
     return np.asarray(np.sqrt(square[tuple(nearest)] / count[tuple(nearest)]))
-
-
-def _signatures_m(set_up: SetUp, change_m: np.ndarray) -> np.ndarray:
-    """Return the signature (n, h, w) of each damage: the change (h, w) that it makes, 0 away from it."""
-    pitch_m, signals = max(set_up.pitch_mm) * MM, []
-    for damage in set_up.truth:
-        near = damage.within(set_up.board_xy_m[..., 0], set_up.board_xy_m[..., 1], REACH_PX * pitch_m)
-        signals.append(np.where(near, change_m, 0.0))
-    return np.array(signals)
