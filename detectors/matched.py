@@ -205,9 +205,8 @@ def _judged(
     seen = known & ~grown(core, MARGIN_PX) if core.any() else known
     # where much is removed, the first solution is a poor start
     signed, by, _, spread = _scored(tamed * seen, seen, noise, heard > 0, None if core.any() else solved)
-    # only now are the deviations of the strong scores known
-    more = np.array([each.raised for each in worths])[strong_by]
-    strong = np.sqrt(np.maximum(strong**2 - more, 0.0) / spread[strong_by] ** 2 + more)
+    # only now is the typical deviation of scores known; each template's own would make scores depend on ties
+    strong = strong / np.median(spread)
     _fill_discs(signed, radius_px[by])
     signed *= known
     signed[core] = heights[core] * strong[peak_of[core]]
