@@ -205,8 +205,8 @@ def _judged(
     seen = known & ~grown(core, MARGIN_PX) if core.any() else known
     # where much is removed, the first solution is a poor start
     signed, by, _, spread = _scored(tamed * seen, seen, noise, heard > 0, None if core.any() else solved)
-    # only now is the typical deviation of scores known; each template's own would make scores depend on ties
-    strong = strong / np.median(spread)
+    # only now are deviations known; that of the narrowest template is known best
+    strong = strong / spread
     _fill_discs(signed, radius_px[by])
     signed *= known
     signed[core] = heights[core] * strong[peak_of[core]]
@@ -230,11 +230,11 @@ def _scored(
     noise: tuple[whitening.Filters, int, Sequence[whitening.Worth]],
     heard: np.ndarray | None = None,
     start: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Return each pixel's strongest score (r, c) with its sign, the index of its template, and C^-1 r, from the pixels
-    ``seen`` (r, c); and the deviation (t,) of each template's scores. ``noise``: its `whitening.filters`, the window's
-    side, and each template's `Worth`. ``heard`` (r, c) bool: strong findings, which the scatter of scores ignores; None
-    to seek them, at the centres of pixels and with deviations of 1. ``start``: an approximate solution."""
+    ``seen`` (r, c); and the deviation of the narrowest template. ``noise``: its `whitening.filters`, the window's side,
+    and each template's `Worth`. ``heard`` (r, c) bool: strong findings, which the scatter of scores ignores; None to
+    seek them, at the centres of pixels and with deviations of 1. ``start``: an approximate solution."""
     (filters, window_px, worths), rough = noise, heard is None
     solved = whitening.inverse_times(values, seen, filters, start, ROUGH if rough else whitening.CONVERGED)
     spectra, visible, tail = [whitening.transformed(solved, filters[0].shape)], {}, 1.0
@@ -245,7 +245,7 @@ def _scored(
     scores, products = [np.empty_like(there) for there, _ in views], [np.empty_like(each) for each in spectra]
     # of fine, coarse and slots' scores
     best = [(np.zeros_like(there), np.zeros(there.shape, np.uint8)) for there, _ in (*views, views[1])]
-    templates, spread = whitening.bank(window_px), np.ones(len(worths))
+    templates, spread = whitening.bank(window_px), 1.0
     for pair, numbers in whitening.spectra(filters[0].shape, window_px):
         wanted = [not rough or not any(templates[number].halves) for number in numbers]
         if not any(wanted):
@@ -268,7 +268,7 @@ def _scored(
                 if template.radius_px <= TAIL_PX:
                     tail = tail if any(template.halves) else _tail(score, deviation)
                     deviation *= tail
-            spread[number] = deviation
+            spread = spread if number else deviation
             _keep_stronger(*best[coarse + template.slot], score, 1 / deviation, worth.raised, *template.halves, number)
     signed, by = best[0]
     # linear interpolation would lower the narrow ridges of slots' scores by a seventh
