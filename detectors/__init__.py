@@ -26,8 +26,7 @@ BUILT_IN = {
     "thesis": "detectors.thesis:ThesisDetector",
 }
 
-NEEDED = {"m3c2": "py4dgeo"}
-"""Packages of the extra `peers`, by detector."""
+NEEDED = {"m3c2": "py4dgeo"}  # packages of the extra `peers`, by detector
 
 DETECTORS = PlugIns(GROUP, "detector", lambda: BUILT_IN)
 

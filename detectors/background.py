@@ -28,8 +28,7 @@ MOST_CELLS, CELL_POINTS, EVEN_CELL_POINTS, ENOUGH_CELLS, FEW_CELLS = 3600, 16, 6
 """Most cells; points per cell, at least and where there are enough; enough cells; fewest cells to choose a shape."""
 TILE_CELLS, FOLDS = 3, 5
 """Side, in cells, of a tile that is predicted as a whole, and the number of folds into which the tiles are dealt."""
-LEAST_SCALE_M = 0.04
-"""Largest width of damage, unless the settings differ: no free form that could follow it is chosen."""
+LEAST_SCALE_M = 0.04  # largest width of damage, unless the settings differ: no free form that could follow it is chosen
 WORTH = 0.1
 """A shape is as good as the best if its error of prediction is larger by at most this share of a pixel's noise."""
 NOISIER = 1.25
@@ -38,8 +37,7 @@ STEEPEST_DEG = 75.0
 """Incidence beyond which a surface is not judged: a pixel covers 4 times its width there, and its noise grows."""
 FREE_FORM_FROM, MISFIT_FROM = 0.02, 0.1
 """Share of the area with structure from which a free form is tried, and from which a warning of a misfit is given."""
-STATED = ("polynomial", "mesh")
-"""Shapes that the user states."""
+STATED = ("polynomial", "mesh")  # shapes that the user states
 STRUCTURE_CELLS, STRUCTURE_SIGMAS, SEEN = 5, 4.0, 0.5
 """Side of the block averaged to see structure, least significance of structure, and share of a pixel's noise."""
 

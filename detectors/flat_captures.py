@@ -24,13 +24,11 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, Lens, transform_points
 
 SMOOTH = SurfaceConfig(degree=5, method="bisquare")
-OUTLIER_SIGMAS = 6.0
-"""Larger residuals do not belong to a flat surface: they are marks, dirt or flying pixels."""
+OUTLIER_SIGMAS = 6.0  # larger residuals do not belong to a flat surface: they are marks, dirt or flying pixels
 STABLE_SHARE = 0.2
 """Part of the pattern's rms by which two parts of the captures may differ beyond their noise: 4 % of its variance then
 remain. Where the surface's shape is solved for, it takes up to half of such a change."""
-SURE = 1.1
-"""Ratio to its noise from which a difference counts: noise that 30,000 pixels share makes 3 % of it."""
+SURE = 1.1  # ratio to its noise from which a difference counts: noise that 30,000 pixels share makes 3 % of it
 SAME_PLACE_M, SAME_TURN = 2 * MM, 0.003
 """Changes of distance and of the plane's normal (rad) below which no movement of the camera shows: ten times the wander
 of a static Azure Kinect, and the effect of that wander over an image."""

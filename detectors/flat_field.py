@@ -26,8 +26,7 @@ SAME_LENS = 0.02
 """Relative difference of focal lengths, and of centres to the width, up to which two lenses may belong to one camera
 and mode: calibrations of one unit differ by less, modes of one camera by more."""
 WELL_COVERED = 0.9
-NEAR_ENOUGH = 1.2
-"""Ratio of distances up to which a pattern counts as measured there."""
+NEAR_ENOUGH = 1.2  # ratio of distances up to which a pattern counts as measured there
 AGAIN = "run python -m harness.flatfield on captures of this camera in this mode"
 
 

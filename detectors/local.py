@@ -36,8 +36,7 @@ pixels. The ratio of 1.5 keeps nine tenths of the signal of a width between two 
 SURROUNDINGS, WIDEST_SHARE = 3, 6.0
 """Number of steps by which a filter's surroundings are wider; the target's least width in widths of the widest
 filter."""
-FAINT = 0.02
-"""Weight of the value 0 in every mean."""
+FAINT = 0.02  # weight of the value 0 in every mean
 CLIP_SIGMAS, LEVEL_SIGMAS = 6.0, 2.0
 """Clipping of single pixels in deviations of the local noise, because a flying pixel alone is no finding; and the same
 for the local level and for surroundings, which damage must not shift."""
@@ -51,8 +50,7 @@ means, which give a standard deviation to 8 %; samples from its middle to its ed
 nothing new; and the fewest finite samples of a local median."""
 SADDLE, PROMINENCE = 0.75, 1.5
 """Two peaks are one if the saddle is higher than this share of the lower one, or fewer units of score below it."""
-CORE = 0.5
-"""A finding's size is measured on the pixels with at least this share of its score."""
+CORE = 0.5  # a finding's size is measured on the pixels with at least this share of its score
 
 
 class FilterConfig(Config):

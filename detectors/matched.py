@@ -43,20 +43,15 @@ from detectors.noise import median_of
 from harness.vocabulary.geometry import Cloud
 
 LEAST_SEEN = 0.6
-SHORT_PX = 13
-"""Width over which noise is compared between places: wider filters count there as much as elsewhere."""
-QUIET_SIGMAS = 4.0
-"""Larger residuals and their neighbours do not count for the covariance."""
+SHORT_PX = 13  # width over which noise is compared between places: wider filters count there as much as elsewhere
+QUIET_SIGMAS = 4.0  # larger residuals and their neighbours do not count for the covariance
 CLIP_SIGMAS = 5.0
 """Limit to which a pixel is clipped if its neighbours are smaller: a single flying pixel is not a finding."""
 STRONG, LOUD_SIGMAS, MARGIN_PX = 6.0, 3.0, 2
 """A peak with this score, the loud pixels connected to it, and those around are removed; the rest is judged again."""
-LOUD_SHARE = 0.5
-"""The loud pixels at a peak fill at least this share of its template's disc."""
-ALONE_PX = 7
-"""Half of the square in which a peak is the highest."""
-RIM_PX = 6
-"""Depth of the target's rim, to which the camera's window and lens reach over its edge."""
+LOUD_SHARE = 0.5  # the loud pixels at a peak fill at least this share of its template's disc
+ALONE_PX = 7  # half of the square in which a peak is the highest
+RIM_PX = 6  # depth of the target's rim, to which the camera's window and lens reach over its edge
 LAYER_PX, MODEST_SIGMAS = 4, local.LEVEL_SIGMAS
 """Side of the squares in which what the rim shares is averaged, and the limit to which residuals are clipped there."""
 RIM_ENDS_PX = (1, 2, 3, 5, 8, 12)
@@ -65,8 +60,7 @@ N_ZONES = len(RIM_ENDS_PX) + 1
 ZONES = np.searchsorted(RIM_ENDS_PX, np.arange(RIM_ENDS_PX[-1] + 2)).astype(np.uint8)
 WINDOW_RADII, PART_PX, UNEVEN = 6, 8, 1.25
 """Half of the window of the local scatter in radii, the side of its squares, and scatter that chance explains."""
-CAP, FEWEST = 2.0, 200
-"""Largest score that counts in the scatter, and the fewest scores that determine it."""
+CAP, FEWEST = 2.0, 200  # largest score that counts in the scatter, and the fewest scores that determine it
 DEVIATIONS = np.geomspace(0.2, 50.0, 200)
 CAPPED = DEVIATIONS * np.sqrt(2.0 / np.pi) * (1.0 - np.exp(-0.5 * (CAP / DEVIATIONS) ** 2)) + 2.0 * CAP * special.ndtr(
     -CAP / DEVIATIONS
@@ -74,14 +68,11 @@ CAPPED = DEVIATIONS * np.sqrt(2.0 / np.pi) * (1.0 - np.exp(-0.5 * (CAP / DEVIATI
 STEPS = 4096
 DEVIATION_OF = np.interp(np.arange(STEPS * CAP + 2) / STEPS, CAPPED, DEVIATIONS)
 """Deviations of a Gaussian, the mean of its size if more than `CAP` counts as `CAP`; and the inverse, by `STEPS`."""
-FAINT = 3.5
-"""Scores below this are all raised by the same factor, because `Worth` counts maxima."""
+FAINT = 3.5  # scores below this are all raised by the same factor, because `Worth` counts maxima
 LOBE_SHARE = 0.5
 """A score below this share of a score of the other sign within `RIM_PX` is a side lobe of the whitening."""
-WIDE_PX = 5.0
-"""Radius from which noise may split a template's finding into several peaks."""
-ROUGH = 0.4
-"""Error at which C^-1 r is solved for strong findings, as `whitening.CONVERGED`."""
+WIDE_PX = 5.0  # radius from which noise may split a template's finding into several peaks
+ROUGH = 0.4  # error at which C^-1 r is solved for strong findings, as `whitening.CONVERGED`
 TAIL_PX, TAIL_SHARE, TAIL_SIGMAS = 1.5, 0.0005, 3.29
 """Largest radius at which a template's own scores show their tail; the share of pixels beyond it on either side; and
 where a Gaussian has it. Wider means are near Gaussian, and too few of them are independent."""
@@ -241,7 +232,7 @@ def _scored(
     views = [(seen.astype(np.float32), _depth_px(seen))]
     spectra.append(whitening.halved(spectra[0]))
     views.append((_halved(views[0][0]), _halved(views[0][1])))
-    zones = [_zones(*view) for view in views]
+    zones = [] if rough else [_zones(*view) for view in views]
     scores, products = [np.empty_like(there) for there, _ in views], [np.empty_like(each) for each in spectra]
     # of fine, coarse and slots' scores
     best = [(np.zeros_like(there), np.zeros(there.shape, np.uint8)) for there, _ in (*views, views[1])]
@@ -345,10 +336,9 @@ def _scatter(score: np.ndarray, rim: np.ndarray, zones: np.ndarray) -> tuple[np.
     sizes up to `CAP`; and the sums of these sizes in squares of `PART_PX`, and their numbers."""
     (h, w), most, flat, last = score.shape, np.float32(CAP), score.ravel(), N_ZONES - 1
     rows, columns = max(1, h // PART_PX), max(1, w // PART_PX)
-    sums, counts = np.zeros((rows, columns)), np.zeros((rows, columns))
-    sizes, numbers = np.empty(w, np.float32), np.empty(w, np.int32)
+    sums, counts, whole, number = np.zeros((rows, columns)), np.zeros((rows, columns)), 0.0, 0.0
     for row in range(rows):
-        sizes[:], numbers[:] = 0, 0
+        sizes, numbers = np.zeros(w, np.float32), np.zeros(w, np.int32)
         for i in range(row * h // rows, (row + 1) * h // rows):
             of = score[i]
             for j in range(w):
@@ -358,16 +348,22 @@ def _scatter(score: np.ndarray, rim: np.ndarray, zones: np.ndarray) -> tuple[np.
             for j in range(part * w // columns, (part + 1) * w // columns):
                 sums[row, part] += sizes[j]
                 counts[row, part] += numbers[j]
+            whole += sums[row, part]
+            number += counts[row, part]
     totals, known, found = np.zeros(N_ZONES), np.zeros(N_ZONES), np.zeros(N_ZONES)
+    size_there, number_there = 0.0, 0
     for k in range(len(rim)):
-        totals[zones[k]] += min(abs(flat[rim[k]]), most)
-        known[zones[k]] += flat[rim[k]] != 0
-    totals[last], known[last] = sums.sum() - totals.sum(), counts.sum() - known.sum()
+        size, one = min(abs(flat[rim[k]]), most), flat[rim[k]] != 0
+        totals[zones[k]] += size
+        known[zones[k]] += one
+        size_there += size
+        number_there += one
+    totals[last], known[last] = whole - size_there, number - number_there
     if known[last] < FEWEST:
-        totals[last], known[last] = sums.sum(), counts.sum()
+        totals[last], known[last] = whole, number
     for zone in range(last, -1, -1):
         if zone == last or known[zone] >= FEWEST:
-            found[zone] = DEVIATION_OF[int(STEPS * totals[zone] / max(known[zone], 1.0))]
+            found[zone] = DEVIATION_OF[int(STEPS * max(totals[zone], 0.0) / max(known[zone], 1.0))]
         found[zone] = max(found[zone], found[last])
     return found, sums, counts
 

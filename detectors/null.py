@@ -33,16 +33,14 @@ NORMAL_PEAKS = 10.0
 peaks show that deviation to 16 %; robust scales of heavy-tailed noise err by as much."""
 CROWDED, LADDER = 0.6, 1.06
 """Share of the largest number of findings at any threshold, and the ratio of thresholds tried for the floor."""
-LEAST = 3.0
-"""Lowest threshold in units of score: bounded errors end so near that peaks in front predict nothing behind."""
+LEAST = 3.0  # lowest threshold in units of score: bounded errors end so near that peaks in front predict nothing behind
 MOST = 10.0  # thresholds above this are not due to noise alone, which needs 4 to 7 on all recordings
 OBJECT_MARGIN_PX = 6  # margin around an object: its edge is mixed over 3 pixels, and its shadow lies beside it
 PATCH_PX, LEAST_OBJECT_PX = 5, 100
 """Side of the square that smooths residual and picture, and least pixels of an object: four such squares."""
 PROUD, PROUD_FOOT = 6.0, 3.0
 """Smoothed residual of an object in front of the surface, in deviations: at its highest point, and everywhere on it."""
-MARKED = 8.0
-"""Slope of an edge in the picture, in multiples of the median slope: a tag, print, another material."""
+MARKED = 8.0  # slope of an edge in the picture, in multiples of the median slope: a tag, print, another material
 MOST_MASKED = 0.5  # largest share of the judged area under objects: the rest must represent the whole
 RIM_PX, RIM_CALLS = 10, 2
 """Depth of the target's rim, and number of calls behind the surface along it that chance does not explain."""

@@ -34,12 +34,9 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud
 from harness.vocabulary.seeds import random_stream
 
-LOD_SIGMAS = 1.96
-"""Standard deviations in py4dgeo's level of detection, which holds 95 % of chance differences."""
-LEAST_SAMPLES = 4
-"""Fewest points of a cylinder in each cloud: fewer do not show the scatter."""
-MOST_ALONE = 0.01
-"""Share of the target without a counterpart that gives a warning."""
+LOD_SIGMAS = 1.96  # standard deviations in py4dgeo's level of detection, which holds 95 % of chance differences
+LEAST_SAMPLES = 4  # fewest points of a cylinder in each cloud: fewer do not show the scatter
+MOST_ALONE = 0.01  # share of the target without a counterpart that gives a warning
 
 
 class PlaneRansacConfig(ScoreMapConfig):

@@ -26,8 +26,7 @@ SAMPLE, STEPS = 4000, 20
 LEAST_SCALE_M, FAR_M = 0.1 * MM, 10.0
 EDGE_PX, BENT = 1.5, 0.5
 """Pixels within this distance of a step or edge of the part are not judged; bend, in pixels, that makes an edge."""
-LOOSE = 1e-6
-"""A direction with a smaller share of the largest information is not fixed by the part."""
+LOOSE = 1e-6  # a direction with a smaller share of the largest information is not fixed by the part
 
 
 @lru_cache(maxsize=4)

@@ -20,8 +20,7 @@ Filters = tuple[np.ndarray, np.ndarray]
 SMALL_RADII_PX, HALVES_PX = (0.5, 1.5), ((0.0, 0.0), (0.5, 0.5), (0.0, 0.5), (0.5, 0.0))
 """Radii of small discs, and the positions between pixels at which they are compared: half a pixel costs up to a seventh
 of the score if the window has sharp sides. The first radius stands for all holes smaller than a pixel."""
-RADII_PX = (2.2, 3.2, 4.5, 6.4, 9.0, 13.0, 18.0)
-"""Radii of further discs."""
+RADII_PX = (2.2, 3.2, 4.5, 6.4, 9.0, 13.0, 18.0)  # radii of further discs
 DEEP_PX, DEEP_WINDOW_PX = 1.0, 3
 """Radius of a disc that only the lens blurs, and the window with which it is compared too: a filter that weighs pixels
 by phase (libfreenect2) does not average narrow deep holes. The bank's discs have .74 of the score of such a hole."""
@@ -32,17 +31,13 @@ SLOT_PX, SLOTS_DEG = (12.0, 2.0), tuple(15.0 * k for k in range(12))
 WINDOWS_PX = (1, 3, 5)
 """Sides of the square over which cameras average: 3 for a Kinect v2, 5 for an Azure Kinect, 1: only the lens blurs."""
 LENS_BLUR_PX = 0.6
-LONGEST_LAG_PX = 28
-"""Lag at which Parzen's window fades the covariance to 0."""
+LONGEST_LAG_PX = 28  # lag at which Parzen's window fades the covariance to 0
 COARSE_PX = 9.0
 """Radius from which only every second pixel is scored: between these pixels, scores change by some hundredths."""
-LEAST_POWER = 0.01
-"""Least value of the spectrum, as a share of its mean."""
+LEAST_POWER = 0.01  # least value of the spectrum, as a share of its mean
 MOST_WHITENED = 2000  # most pixels whose dense covariance is factored: 0.2 s and 64 MB
-SIDES_PX = (0, 1, 2, 3, 5, 8, 12, 18)
-"""Half-sides that a `Worth` may have: the visible share is computed once for each."""
-GRID = 96
-"""Side of the grid that holds the widest template and the reach of its whitened edge."""
+SIDES_PX = (0, 1, 2, 3, 5, 8, 12, 18)  # half-sides that a `Worth` may have: the visible share is computed once for each
+GRID = 96  # side of the grid that holds the widest template and the reach of its whitened edge
 CONVERGED, MOST_ITERATIONS, FADED = 0.15, 80, 0.3
 """Error at which C^-1 r is solved, most steps, and weight of 0 in the values that fill unknown pixels."""
 EDGE_PX = 7.0
@@ -118,7 +113,7 @@ def inverse_times(
     ``start`` (r, c) until scores near unknown pixels, where errors gather, err by some ``error`` deviations. The
     preconditioner fills unknown pixels from their neighbours, applies the stationary inverse, and then the transpose of
     the filling: with zeros instead, ragged outlines and missing pixels take up to four times the steps. It would still
-    be too large along outlines: damping it the more, the less is known around a pixel, saves a third of the steps."""
+    be too large along outlines: damping it the more, the less is known around a pixel, saves a fifth of the steps."""
     (h, w), mask, (power, inverse) = values.shape, known.astype(np.float32), by
     wide, whole, onward = np.zeros_like(power), np.empty_like(power), np.empty_like(mask)
     tight, share, towards = np.zeros_like(inverse), np.empty_like(inverse), np.empty_like(mask)
@@ -174,7 +169,8 @@ def _spread(image: np.ndarray, inner: np.ndarray, outer: np.ndarray, back: bool,
             for j in range(w):
                 line[j] = seen[j] * by[j]
         else:
-            line[:] = 0
+            for j in range(w):
+                line[j] = 0
         row = i - 2
         if row >= 0:
             above, over, own = lines[(i + 1) % 5], lines[(i + 2) % 5], lines[(i + 3) % 5]

@@ -32,16 +32,12 @@ from harness.vocabulary.geometry import Cloud, MapViews, Reason, Region, invert,
 CELLS = 2000
 CLASSES, PER_CLASS = 12, 100
 """Number of distance classes on the sensor, with equal numbers of pairs; fewest pairs for a median."""
-LENGTHS = 24
-"""Number of trial lengths, geometric from a pixel to the largest distance between views."""
+LENGTHS = 24  # number of trial lengths, geometric from a pixel to the largest distance between views
 EXPONENTS = (1.0, 1.5, 2.0)
 """A pattern that a filter smooths over a few pixels has a covariance that is flat at first (2), not pointed (1)."""
-MEDIAN_SQUARE = 0.45494
-"""Median of the square of a standard normal deviate."""
-MEDIAN_ERROR = 2.33
-"""Relative standard error of the median of n such squares, times the root of n."""
-GATE_SIGMAS = 5.0
-"""An observation this many deviations from the median of at least three views is an outlier."""
+MEDIAN_SQUARE = 0.45494  # median of the square of a standard normal deviate
+MEDIAN_ERROR = 2.33  # relative standard error of the median of n such squares, times the root of n
+GATE_SIGMAS = 5.0  # an observation this many deviations from the median of at least three views is an outlier
 
 
 @dataclass(frozen=True)
@@ -165,14 +161,11 @@ def _outliers(heights: np.ndarray, variances: np.ndarray) -> np.ndarray:
     return rejected
 
 
-LATERAL_PX = 0.1
-"""Standard deviation of a pixel's direction: the reprojection error of a well calibrated lens."""
+LATERAL_PX = 0.1  # standard deviation of a pixel's direction: the reprojection error of a well calibrated lens
 SMOOTH_POINTS = 8192
 BINS, PER_BIN = 16, 40
-SAMPLED = 16_384
-"""Number of pixels for the law: the median of a class is then known to 7 % from three frames."""
-LEAST_M2 = 1e-14
-"""Least variance, so that no weight is infinite: no point is known better than to 0.1 um."""
+SAMPLED = 16_384  # number of pixels for the law: the median of a class is then known to 7 % from three frames
+LEAST_M2 = 1e-14  # least variance, so that no weight is infinite: no point is known better than to 0.1 um
 
 
 def fuse(

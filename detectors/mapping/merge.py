@@ -29,8 +29,7 @@ from harness.vocabulary.geometry import MM, Cloud, Region, invert, transform_poi
 
 TRUNCATION_VOXELS = 4.0
 """Distance at which the field is truncated: over 5 mm for pixels of 1.4 mm, ten times the noise of one frame."""
-OVERSAMPLING = 2
-"""Pixels of the undistorted image along a side of an original pixel; the field takes the nearest depth."""
+OVERSAMPLING = 2  # pixels of the undistorted image along a side of an original pixel; the field takes the nearest depth
 WALL_DEG = 60.0
 """A crossing whose normal is farther from that of the smooth face lies on a wall. A dent as deep as its radius has
 flanks of 45 degrees; a drilled wall has 90, less the effect of the camera's blur."""
@@ -128,10 +127,8 @@ def _facing(views: Sequence[ChosenView], points_m: np.ndarray, normals: np.ndarr
     return np.asarray(along >= np.cos(np.deg2rad(WALL_DEG)) * np.linalg.norm(turned, axis=1))
 
 
-SEVERAL = -1
-"""Stands for several views, or for an unknown view."""
-MAX_BOXES = 1 << 21
-"""Most boxes of the grid along one axis, so that three axes fit into a 63-bit key."""
+SEVERAL = -1  # stands for several views, or for an unknown view
+MAX_BOXES = 1 << 21  # most boxes of the grid along one axis, so that three axes fit into a 63-bit key
 
 
 @dataclass(frozen=True)

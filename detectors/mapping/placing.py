@@ -20,8 +20,7 @@ from detectors.surface import Surface, SurfaceConfig, fit_surface
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud, invert, transform_points
 
-LONGEST_EDGE = 4.0
-"""Longest edge, in spacings, of a triangle between samples without a grid: longer edges cross a gap."""
+LONGEST_EDGE = 4.0  # longest edge, in spacings, of a triangle between samples without a grid: longer edges cross a gap
 SLACK = 1e-9
 """Tolerance for a cell on the edge between two triangles: it belongs to the first, and rounding must not lose it."""
 
@@ -126,10 +125,8 @@ def _fill(places: np.ndarray, triangles: np.ndarray, corners: np.ndarray, shares
 
 
 FIT_POINTS = 20_000
-STEEPEST = 0.1
-"""Cosine between optical axis and surface normal below which the axis does not locate the target."""
-MAX_CELLS = 1 << 24
-"""Most cells of a map: those of a board of 4 m in millimetres."""
+STEEPEST = 0.1  # cosine between optical axis and surface normal below which the axis does not locate the target
+MAX_CELLS = 1 << 24  # most cells of a map: those of a board of 4 m in millimetres
 
 
 @dataclass(frozen=True)

@@ -24,14 +24,12 @@ DEGREE = 2
 """Degree of the polynomial: the light of one lamp, or of two lamps of different colour, bends once over a board."""
 SAMPLE, STEPS, CORE = 4096, 6, 0.6
 """Number of pixels in the fit, number of steps of the scatter, and share of the pixels on which the scatter rests."""
-CORE_SHRINKS = {1: 0.2146, 2: 0.3891}
-"""Variance of the innermost part (`CORE`) of a Gaussian in one and two dimensions."""
+CORE_SHRINKS = {1: 0.2146, 2: 0.3891}  # variance of the innermost part (`CORE`) of a Gaussian in one and two dimensions
 GAUSSIAN_LIMITS = {1: 4.4172, 2: 4.7985}
 """Distances that a share `FALSE_RATE` of a Gaussian exceeds, in one and two dimensions."""
 NEARBY_PX = 16
 """Distance over which a camera smears colour: JPEG stores one value for two by two pixels, in blocks of eight."""
-TAIL = (0.4, 0.7)
-"""Quantiles from which the tail is extrapolated; pixels above them may belong to marks."""
+TAIL = (0.4, 0.7)  # quantiles from which the tail is extrapolated; pixels above them may belong to marks
 
 
 def chromaticity(rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

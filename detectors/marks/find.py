@@ -208,8 +208,7 @@ WEAK_SHARE = 1 / 3
 """Share of the strongest colour's contrast to its surroundings; beside such marks, weaker spots are stains."""
 UNLIKE_SHARE, UNLIKE_PIXELS = 0.3, 1.5
 """A mark is unlike the others if its sizes differ from their median by more than this share and this many pixels."""
-LARGEST_SHARE = 0.15
-"""Share of the target; a larger spot is a part of the target with another colour."""
+LARGEST_SHARE = 0.15  # share of the target; a larger spot is a part of the target with another colour
 
 
 def find_marks(cloud: Cloud, inside: np.ndarray, config: RedMarks | ColourMarks | CodedMarks) -> MarkSet:

@@ -22,8 +22,7 @@ from detectors.registration.registered import displacement_jacobian, moved_by
 from harness.vocabulary.geometry import MM, invert, transform_points
 
 MAX_STEPS = 20
-SMALL_STEP_M = 1e-10
-"""Gauss-Newton, which converges within three to five steps, stops when no point moves by more."""
+SMALL_STEP_M = 1e-10  # Gauss-Newton, which converges within three to five steps, stops when no point moves by more
 
 
 @dataclass(frozen=True)
@@ -91,8 +90,7 @@ FIT_CHI2 = 21.1
 """Largest chi^2 of a matched mark's place, with three degrees of freedom: a true match is lost once in 10,000."""
 GUESS_SIGMA_M = 50 * MM
 """Root mean square error of the guess at the marks: five degrees over half a metre, and a few centimetres."""
-PAIR_WORTH = 3.0
-"""Logarithm of the odds that a mark of one view is found in the other: 20 to 1."""
+PAIR_WORTH = 3.0  # logarithm of the odds that a mark of one view is found in the other: 20 to 1
 CLEAR_ODDS, FEWER = 4.5, 3
 """Log odds, 90 to 1, that decide between two placements; largest number of pairs that the winner may lack."""
 NO_PAIRS = np.zeros((0, 2), dtype=np.int64)

@@ -35,8 +35,7 @@ from harness.vocabulary.geometry import Frame, Lens, transform_points
 TITLES = ("DEPTH", "IR", "COLOR")
 LEGAL_MKV = "a recording of k4arecorder with its DEPTH track"
 SEGMENT_ID = bytes.fromhex("18538067")
-WAITING = 4
-"""Most captures that wait for their other pictures; the recorder interleaves tracks within one frame."""
+WAITING = 4  # most captures that wait for their other pictures; the recorder interleaves tracks within one frame
 
 
 def open_mkv(path: Path, given: Given) -> Recording:

@@ -139,8 +139,7 @@ READINGS = {
     **{"mm": (0.867, 0.15), "4000/m": (0.08, 0.0), "tum": (0.03, 0.0), "10000/m": (0.015, 0.0)},
     **{"cm": (0.003, 0.04), "um": (0.005, 0.01), "in": (0.0003, 0.01), "m": (0.0, 0.8)},
 }  # units and how common each is among integers and floating-point numbers: guesses that hardly move a decision
-NEAR_M = (0.8, 1.8)
-"""Middle and spread (a factor) of the usual distances of targets: 95 % are within 0.25 to 2.6 m."""
+NEAR_M = (0.8, 1.8)  # middle and spread (a factor) of the usual distances of targets: 95 % are within 0.25 to 2.6 m
 NEAR_LIMIT_M, FAR_FLOOR = 0.15, 0.05
 """A distance above the first has at least the second as its share of the most common distance's weight."""
 SURE, LIKELY, SHOWN = 0.98, 0.75, 0.003

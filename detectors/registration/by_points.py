@@ -250,8 +250,7 @@ def posterior_moments(
     return np.concatenate(moments).reshape(-1, 4, 4), objective
 
 
-DEPTH_DIFFERENCE_M = 0.03
-"""Largest difference in depth of a pair of pixels (Open3D's own default)."""
+DEPTH_DIFFERENCE_M = 0.03  # largest difference in depth of a pair of pixels (Open3D's own default)
 DRIFTS = "no covariance: that of Open3D's odometry counts its pairs and ignores how far it slid"
 
 

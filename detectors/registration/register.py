@@ -27,16 +27,13 @@ FALSE_ALARM_SIGMAS = 3.09
 """A view is refused beyond this multiple of the residual's own scatter: a good view once in a thousand."""
 MEDIAN_SCATTER = 1.65
 """Ratio of a standard deviation's relative error from the median to that from the mean square: 1 / sqrt(0.37)."""
-BLUR_M = 2.0 * MM
-"""Distance between registered views that blurs a map too much: twice the noise of a single frame."""
+BLUR_M = 2.0 * MM  # distance between registered views that blurs a map too much: twice the noise of a single frame
 UNDETERMINED_PITCHES = 3.0
 """A larger predicted error over the target, in pitches, and above `BLUR_M`, puts every point on a wrong pixel."""
-MAX_JUMP_DEG, MAX_JUMP_M = 30.0, 0.1
-"""Ten times the usual error of a nominal pose (some degrees, about 10 mm)."""
+MAX_JUMP_DEG, MAX_JUMP_M = 30.0, 0.1  # ten times the usual error of a nominal pose (some degrees, about 10 mm)
 UNJUDGED_AGREEMENT = ("nominal", "odometry")
 """Methods that never use the reference's surface: their remaining distance is noted, not refused."""
-TRIMMED = 0.9
-"""Share of the fiducial points, nearest first, that must agree: a colour rule also accepts stray pixels."""
+TRIMMED = 0.9  # share of the fiducial points, nearest first, that must agree: a colour rule also accepts stray pixels
 
 
 @dataclass(frozen=True)

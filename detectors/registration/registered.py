@@ -14,8 +14,7 @@ from detectors.noise import sigma_of
 from detectors.views import PreparedView
 from harness.vocabulary.geometry import MM, Cloud, invert, transform_points
 
-CLUSTER_PITCHES = 5.0
-"""Side of the cubes within which errors count as common: the window of the widest depth filter."""
+CLUSTER_PITCHES = 5.0  # side of the cubes within which errors count as common: the window of the widest depth filter
 UNKNOWN_COVARIANCE = np.full((6, 6), np.nan)
 SLIDES = "not determined: the points can slide or rotate without matching worse, as on a flat or smooth surface"
 
@@ -114,14 +113,11 @@ def clustered_sandwich(curvature: np.ndarray, scores: np.ndarray, points_m: np.n
 
 NOISE_LAG = 6
 """Pixels between the points of a second difference: beyond the widest depth filter, errors are independent."""
-MIN_OVERLAP = 0.1
-"""Least share of the view beside the reference's target: with less, nothing can be judged."""
-MOVING_PITCHES = 0.5
-"""An iteration whose last step moves the target by more has not converged."""
+MIN_OVERLAP = 0.1  # least share of the view beside the reference's target: with less, nothing can be judged
+MOVING_PITCHES = 0.5  # an iteration whose last step moves the target by more has not converged
 MAX_POINTS = 10_000
 """Most points of a cloud to register: the time of coherent point drift grows with the product of both numbers."""
-THINNED_POINTS = 2000
-"""Points on which overlap and agreement are judged: a share is then known to 1 %."""
+THINNED_POINTS = 2000  # points on which overlap and agreement are judged: a share is then known to 1 %
 
 
 @dataclass(frozen=True)

@@ -18,16 +18,12 @@ from harness.evaluation.pod.ahat import CensoredFit, fit_censored
 from harness.evaluation.pod.statement import POD
 from harness.vocabulary.errors import UserError
 
-BEYOND_DEG = 3.0
-"""Largest angle by which a patch may be steeper than all inspected damage."""
+BEYOND_DEG = 3.0  # largest angle by which a patch may be steeper than all inspected damage
 FAR = 1.5
 """Ratio of score to threshold above which the score's value is ignored, so that the law holds near the threshold."""
-GROWTHS = np.linspace(0.0, 4.0, 17)
-"""Powers of 1 / cosine with which the scatter may grow."""
-LOOSE = 2.0
-"""Limits count as rough above this ratio of the sizes found with probabilities of 90 % and 50 %."""
-FEWEST = 20
-"""Fewest damages from which the law is fitted."""
+GROWTHS = np.linspace(0.0, 4.0, 17)  # powers of 1 / cosine with which the scatter may grow
+LOOSE = 2.0  # limits count as rough above this ratio of the sizes found with probabilities of 90 % and 50 %
+FEWEST = 20  # fewest damages from which the law is fitted
 
 
 @dataclass(frozen=True, eq=False)

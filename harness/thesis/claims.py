@@ -27,8 +27,7 @@ from harness.vocabulary.declaration.yaml_source import read_yaml
 from harness.vocabulary.path_names import value_text
 
 Answer = Literal["borne out", "not borne out", "undecided"]
-FEW = 1
-"""The smaller number of frames in the thesis' claims; `harness.evaluation.maps.MANY` is the larger."""
+FEW = 1  # the smaller number of frames in the thesis' claims; `harness.evaluation.maps.MANY` is the larger
 
 
 @dataclass(frozen=True)
@@ -65,18 +64,13 @@ def decide(parts: Iterable[bool | None]) -> Answer:
 
 THESIS_HOLES = tuple(str(number) for number in range(1, 12))
 FOUND_WITH_MANY, FOUND_WITH_FEW = frozenset(THESIS_HOLES[3:]), frozenset(THESIS_HOLES[4:])
-RULER_MM = 25.4 / 16
-"""One graduation of the ruler (1/16 in) with which the thesis read its reference positions."""
+RULER_MM = 25.4 / 16  # one graduation of the ruler (1/16 in) with which the thesis read its reference positions
 SLOPE_MARGIN = 0.05
 """Exponents within this distance of -0.5 count as 1/sqrt(N); over 50 frames, it is a factor of 1.22 in noise."""
-UNCHANGED = 0.9
-"""The systematic error counts as lowered if it falls below this share, while white noise falls to 0.14."""
-FEWEST_UNITS = 3
-"""Fewest units of a camera, which must all agree, to decide a claim that depends on its fixed pattern."""
-FEWEST_PAIRS = 5
-"""Fewest pairs of views to compare registrations."""
-FEWEST_RANKED = 4
-"""Fewest holes to rank; with fewer, even a perfect order has a probability above 1 in 20 by chance."""
+UNCHANGED = 0.9  # the systematic error counts as lowered if it falls below this share, while white noise falls to 0.14
+FEWEST_UNITS = 3  # fewest units of a camera, which must all agree, to decide a claim that depends on its fixed pattern
+FEWEST_PAIRS = 5  # fewest pairs of views to compare registrations
+FEWEST_RANKED = 4  # fewest holes to rank; with fewer, even a perfect order has a probability above 1 in 20 by chance
 
 
 @dataclass(frozen=True)

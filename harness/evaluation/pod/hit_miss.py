@@ -43,15 +43,13 @@ from harness.vocabulary.errors import UserError
 
 Beyond = Literal["floor", "ceiling", "both"]
 METHOD = "likelihood ratio"
-EXACT = 1e-9
-"""Tolerance of the coefficients of a single study."""
+EXACT = 1e-9  # tolerance of the coefficients of a single study
 STEEPEST = 1e3
 """Largest slope in standardised sizes: a curve that rises within a thousandth of the sizes' spread is a step."""
 NEAR_DEVIANCE = 2.0
 """Largest excess over the least deviance, with one inspection per target, of a model that is hardly worse than the
 best. With equally many parameters, it is a difference of 2 in AIC (Burnham and Anderson 2002, 2.6)."""
-STARTS = 10
-"""Points of a coarse grid from which the search for the maximum with floor or ceiling starts."""
+STARTS = 10  # points of a coarse grid from which the search for the maximum with floor or ceiling starts
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,12 +264,9 @@ def rows_of_target(size: np.ndarray, inspections: ArrayLike | None) -> np.ndarra
     return np.bincount(target)[target]
 
 
-FARTHEST = 2.0**40
-"""Largest distance from the estimate, in spreads of the sizes, at which a bound is sought."""
-DIRECTIONS = 720
-"""Points on the outline of the confidence set that determine a band."""
-REACH = 10
-"""Most doublings of a distance, from 2 to 2000 standard errors."""
+FARTHEST = 2.0**40  # largest distance from the estimate, in spreads of the sizes, at which a bound is sought
+DIRECTIONS = 720  # points on the outline of the confidence set that determine a band
+REACH = 10  # most doublings of a distance, from 2 to 2000 standard errors
 
 
 def bound(fit: HitMissFit, pod: float = 0.9, confidence: float = 0.95, *, design_effect: float = 1.0) -> Bound:

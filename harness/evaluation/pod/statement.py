@@ -19,18 +19,13 @@ from harness.evaluation.pod.inspections import Inspections
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import jsonable
 
-POD, CONFIDENCE = 0.9, 0.95
-"""The field's usual statement, a90/95."""
-DRAWN = 241
-"""Number of sizes at which the curve and the band are drawn."""
-LEAST_TARGETS = 60
-"""Fewest independent targets of a hit/miss study, by MIL-HDBK-1823A."""
-APART = 0.05
-"""Largest relative difference between the a90/95 of models that fit about equally well without a warning."""
+POD, CONFIDENCE = 0.9, 0.95  # the field's usual statement, a90/95
+DRAWN = 241  # number of sizes at which the curve and the band are drawn
+LEAST_TARGETS = 60  # fewest independent targets of a hit/miss study, by MIL-HDBK-1823A
+APART = 0.05  # largest relative difference between the a90/95 of models that fit about equally well without a warning
 DOUBTED = ": do not trust its limit"
 POOLS = cache(ThreadpoolController)  # finds the libraries that compute in threads, which takes 2 ms
-FEWEST_SITES = 5
-"""Fewest unflawed sites whose signals can be fitted by a distribution."""
+FEWEST_SITES = 5  # fewest unflawed sites whose signals can be fitted by a distribution
 TESTED: dict[Beyond, str] = {
     "floor": "a floor: hits by chance at any size",
     "ceiling": "a ceiling: misses at any size",

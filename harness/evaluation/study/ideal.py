@@ -32,16 +32,11 @@ LEAST_POWER = 1e-3
 """Least power of the noise at any frequency, as a share of the mean; smaller estimates are only error."""
 CONVERGED, MOST_ITERATIONS = 1e-4, 200
 """Relative residual of C^-1 s, which is the relative error of d'^2, and the most steps to reach it."""
-NORMALS = 4096
-"""Draws of a neighbourhood of the statistic: rates of maxima are then known to 3 %, thresholds to 0.01."""
-AROUND = 3
-"""Half of the lattice of places around a damage at which it may be found, in strides."""
-NEAR_CORRELATION = 0.2
-"""Places with a smaller correlation to the damage's own place do not add to its detection."""
-SHARES = (0.5, 0.9)
-"""Shares of damages found for the comparison of observers."""
-RANGE = (1.0, 12.0)
-"""Range of thresholds, in deviations, in which the wanted one is sought."""
+NORMALS = 4096  # draws of a neighbourhood of the statistic: rates of maxima are then known to 3 %, thresholds to 0.01
+AROUND = 3  # half of the lattice of places around a damage at which it may be found, in strides
+NEAR_CORRELATION = 0.2  # places with a smaller correlation to the damage's own place do not add to its detection
+SHARES = (0.5, 0.9)  # shares of damages found for the comparison of observers
+RANGE = (1.0, 12.0)  # range of thresholds, in deviations, in which the wanted one is sought
 LAGS = np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1)
 
 

@@ -38,8 +38,7 @@ from harness.evaluation.study.units import OverUnits, over_units
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.seeds import random_stream
 
-DRAWS = 500
-"""The 95 % percentile is then the 475th smallest, known to about one percentile."""
+DRAWS = 500  # the 95 % percentile is then the 475th smallest, known to about one percentile
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,8 +143,7 @@ def design_effect(targets: Targets, curve: PodCurve, pod: float) -> float:
 LINKS = ("logit", "probit")
 LEAST_RATIO = 1.2
 """Least ratio of the deepest to the shallowest damage for which a coefficient of depth can be estimated."""
-STEPS = 25
-"""Number of diameters at which the depth found is drawn, in equal ratios over those inspected."""
+STEPS = 25  # number of diameters at which the depth found is drawn, in equal ratios over those inspected
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,8 +251,7 @@ def _separated(design: np.ndarray, hit: np.ndarray) -> bool:
 
 ALL_FOUND = int(np.ceil(np.log(1 - CONFIDENCE) / np.log(POD)))
 """29: with a POD below 90 %, this many targets are all found in less than 5 % of studies (0.9^29 = 0.047)."""
-WIDER = 1.1
-"""Boards matter if the limit over boards exceeds a90/95 by more than this factor."""
+WIDER = 1.1  # boards matter if the limit over boards exceeds a90/95 by more than this factor
 
 
 @dataclass(frozen=True, eq=False)
