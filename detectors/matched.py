@@ -183,19 +183,24 @@ def _judged(
     window_px = whitening.window_of(covariance)
     worths = whitening.worths(whitening.spectrum(covariance, (whitening.GRID, whitening.GRID)), window_px)
     noise = whitening.filters(covariance, values.shape), window_px, worths
-    tamed = _tamed(values)
-    # strong residuals, as seen by round templates
-    signed, by, solved = _scored(tamed, known, noise, rough=True)
+    tamed, heard = _tamed(values), np.zeros(known.shape, np.uint8)
+    signed, by, solved, _ = _scored(tamed, known, noise)
     radius_px = np.array([each.radius_px for each in whitening.bank(window_px)], np.float32)
     size = np.abs(signed)
     peaks = np.argwhere((size > STRONG) & _highest(size))
-    core, taken = _cores(peaks, size, radius_px[by], values, known)
+    peaks = peaks[np.argsort(size[tuple(peaks.T)], kind="stable")]
+    strong, strong_by = size[tuple(peaks.T)], by[tuple(peaks.T)]
+    for (row, column), radius in zip(peaks.tolist(), radius_px[strong_by].tolist(), strict=True):
+        cv2.circle(heard, (column, row), round(radius), 1, cv2.FILLED)
+    core, heights, peak_of = _cores(peaks, radius_px[strong_by], values, known)
     seen = known & ~grown(core, MARGIN_PX) if core.any() else known
     # where much is removed, the first solution is a poor start
-    signed, by, _ = _scored(tamed * seen, seen, noise, start=None if core.any() else solved)
+    signed, by, _, spread = _scored(tamed * seen, seen, noise, heard > 0, None if core.any() else solved)
+    # only now are deviations known; that of the narrowest template is known best
+    strong = strong / spread
     _fill_discs(signed, radius_px[by])
     signed *= known
-    signed[core] = taken[core]
+    signed[core] = heights[core] * strong[peak_of[core]]
     reach = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
     low, high = (np.asarray(of(signed, reach)) for of in (cv2.erode, cv2.dilate))
     lobe = (signed < -LOBE_SHARE * low) & (signed > -LOBE_SHARE * high)
@@ -214,26 +219,26 @@ def _scored(
     values: np.ndarray,
     seen: np.ndarray,
     noise: tuple[whitening.Filters, int, Sequence[whitening.Worth]],
+    heard: np.ndarray | None = None,
     start: np.ndarray | None = None,
-    rough: bool = False,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Return each pixel's strongest score (r, c) with its sign, the index of its template, and C^-1 r, from the pixels
-    ``seen`` (r, c). ``noise``: its `whitening.filters`, the window's side, and each template's `Worth`. ``start``: an
-    approximate solution. ``rough``: only round templates at the centres of pixels, without the scatter of scores, which
-    strong residuals would spoil."""
-    filters, window_px, worths = noise
+    ``seen`` (r, c); and the deviation of the narrowest template. ``noise``: its `whitening.filters`, the window's side,
+    and each template's `Worth`. ``heard`` (r, c) bool: strong findings, which the scatter of scores ignores; None to
+    seek them, at the centres of pixels and with deviations of 1. ``start``: an approximate solution."""
+    (filters, window_px, worths), rough = noise, heard is None
     solved = whitening.inverse_times(values, seen, filters, start, ROUGH if rough else whitening.CONVERGED)
     spectra, visible, tail = [whitening.transformed(solved, filters[0].shape)], {}, 1.0
-    views = [(seen.astype(np.float32), seen if rough else _depth_px(seen))]
-    if not rough:
-        spectra.append(whitening.halved(spectra[0]))
-        views.append((_halved(views[0][0]), _halved(views[0][1])))
+    views = [(seen.astype(np.float32), _depth_px(seen))]
+    spectra.append(whitening.halved(spectra[0]))
+    views.append((_halved(views[0][0]), _halved(views[0][1])))
     zones = [] if rough else [_zones(*view) for view in views]
     scores, products = [np.empty_like(there) for there, _ in views], [np.empty_like(each) for each in spectra]
-    best = [(np.zeros_like(there), np.zeros(there.shape, np.uint8)) for there, _ in views]
-    templates = whitening.bank(window_px)
+    # of fine, coarse and slots' scores
+    best = [(np.zeros_like(there), np.zeros(there.shape, np.uint8)) for there, _ in (*views, views[1])]
+    templates, spread = whitening.bank(window_px), 1.0
     for pair, numbers in whitening.spectra(filters[0].shape, window_px):
-        wanted = [not rough or not (templates[number].coarse or any(templates[number].halves)) for number in numbers]
+        wanted = [not rough or not any(templates[number].halves) for number in numbers]
         if not any(wanted):
             continue
         coarse = templates[numbers[0]].coarse
@@ -249,21 +254,23 @@ def _scored(
             cv2.extractChannel(both, channel, dst=score)
             cv2.multiply(score, visible[key], dst=score, scale=worth.energy**-0.5)
             deviation = 1.0
-            if not rough:
-                deviation = _evened(score, template, *zones[coarse])
+            if heard is not None:
+                deviation = _evened(score, template, *zones[coarse], heard)
                 if template.radius_px <= TAIL_PX:
                     tail = tail if any(template.halves) else _tail(score, deviation)
                     deviation *= tail
-            _keep_stronger(*best[coarse], score, 1.0 / deviation, worth.raised, *template.halves, number)
+            spread = spread if number else deviation
+            _keep_stronger(*best[coarse + template.slot], score, 1 / deviation, worth.raised, *template.halves, number)
     signed, by = best[0]
-    for half, half_by in best[1:]:
+    # linear interpolation would lower the narrow ridges of slots' scores by a seventh
+    for (half, half_by), smooth in zip(best[1:], (cv2.INTER_LINEAR, cv2.INTER_NEAREST), strict=True):
         wide, wide_by = (
             np.ascontiguousarray(cv2.resize(each, None, fx=2, fy=2, interpolation=how)[: len(seen), : seen.shape[1]])
-            for each, how in ((half, cv2.INTER_LINEAR), (half_by, cv2.INTER_NEAREST))
+            for each, how in ((half, smooth), (half_by, cv2.INTER_NEAREST))
         )
         wider = (np.abs(wide) > np.abs(signed)).view(np.uint8)
         cv2.copyTo(wide, wider, signed), cv2.copyTo(wide_by, wider, by)
-    return signed * seen, by, solved
+    return signed * seen, by, solved, spread
 
 
 @numba.njit(**PLAIN)
@@ -291,14 +298,19 @@ def _halved(image: np.ndarray) -> np.ndarray:
     return np.asarray(cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
 
 
-def _evened(score: np.ndarray, template: whitening.Template, rim: np.ndarray, zones: np.ndarray) -> float:
+def _evened(
+    score: np.ndarray, template: whitening.Template, rim: np.ndarray, zones: np.ndarray, heard: np.ndarray
+) -> float:
     """Return the deviation of the scores (r, c) in the last zone, and divide the scores where others scatter more: in
     the ``zones`` (n,) of the pixels ``rim`` (n,), and where the squares around scatter by more than `UNEVEN` deviations
-    because the noise there differs from elsewhere. Scores next to strong ones of wide templates do not count."""
-    step, round_px = 1 + template.coarse, 0.0 if template.slot else template.radius_px
+    because the noise there differs from elsewhere. Scores next to ``heard`` (r, c) and strong ones do not count."""
+    step, loud = 1 + template.coarse, heard[:: 1 + template.coarse, :: 1 + template.coarse]
     found, sums, counts = _scatter(score, rim, zones)
-    if round_px >= WIDE_PX and cv2.norm(score, cv2.NORM_INF) > FAINT * found[-1]:
-        quiet = score * ~grown(np.abs(score) > FAINT * found[-1], round(round_px / step))
+    is_wide = template.radius_px >= WIDE_PX and not template.slot
+    if is_wide and cv2.norm(score, cv2.NORM_INF) > FAINT * found[-1]:
+        loud = loud | (np.abs(score) > FAINT * found[-1])
+    if loud.any():
+        quiet = score * ~grown(loud, round(template.radius_px / step) if is_wide else 0)
         again, sums, counts = _scatter(quiet, rim, zones)
         found = again if counts.sum() > FEWEST else found
     deviation, half_px = float(found[-1]), max(WINDOW_RADII * template.radius_px, local.LEAST_WINDOW) / step
@@ -405,23 +417,22 @@ def _highest(size: np.ndarray) -> np.ndarray:
 
 
 def _cores(
-    peaks: np.ndarray, size: np.ndarray, radius_px: np.ndarray, values: np.ndarray, known: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return (r, c) bool: the loud pixels under ``peaks`` (n, 2) of the scores' ``size``, and what lies between them,
-    where they fill a disc of the template's ``radius_px`` (r, c). Also return their signed scores (r, c), in proportion
-    to the values over 3 x 3 pixels, so that two holes that touch keep two peaks."""
-    core, signed = np.zeros(size.shape, bool), np.zeros(size.shape)
+    peaks: np.ndarray, radius_px: np.ndarray, values: np.ndarray, known: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (r, c) bool: the loud pixels under ``peaks`` (n, 2), weakest first, and what lies between them, where they
+    fill a disc of the template's ``radius_px`` (n,). Also return their signed heights (r, c), up to 1, in proportion to
+    the values over 3 x 3 pixels, so that two holes that touch keep two peaks; and each pixel's peak (r, c)."""
+    core, signed, peak_of = np.zeros(known.shape, bool), np.zeros(known.shape), np.zeros(known.shape, np.intp)
     loud = known & (np.abs(values) > LOUD_SIGMAS)
     around = (cv2.blur(each, (3, 3)) for each in (values, known.astype(np.float32)))
     smooth = next(around) / np.maximum(next(around), 0.1)
     count, parts, stats, _ = cv2.connectedComponentsWithStats(grown(loud, 1).astype(np.uint8))
-    score = np.zeros(count)
-    for row, column in peaks.tolist():
+    highest = np.full(count, -1)
+    for peak, (row, column) in enumerate(peaks.tolist()):
         for number in np.unique(parts[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]):
-            least = LOUD_SHARE * np.pi * radius_px[row, column] ** 2
-            if number > 0 and stats[number, cv2.CC_STAT_AREA] > least:
-                score[number] = max(score[number], size[row, column])
-    for number in np.flatnonzero(score):
+            if number > 0 and stats[number, cv2.CC_STAT_AREA] > LOUD_SHARE * np.pi * radius_px[peak] ** 2:
+                highest[number] = peak
+    for number in np.flatnonzero(highest >= 0):
         left, top, width, height = stats[number, :4]
         cut = np.s_[top : top + height, left : left + width]
         part = (parts[cut] == number) & known[cut]
@@ -429,9 +440,9 @@ def _cores(
         # quiet pixels between loud ones are not a finding of the other sign
         side = np.sign(heights[np.abs(heights).argmax()])
         heights = np.where(np.abs(heights) > LOUD_SIGMAS, heights, side * np.maximum(side * heights, 0.0))
-        signed[cut][part] = score[number] * heights / np.abs(heights).max()
+        signed[cut][part], peak_of[cut][part] = heights / np.abs(heights).max(), highest[number]
         core[cut] |= part
-    return core, signed
+    return core, signed, peak_of
 
 
 def _depth_px(known: np.ndarray) -> np.ndarray:

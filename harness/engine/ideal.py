@@ -1,13 +1,16 @@
 """Noise of random units and the signature of each damage: the input of the ideal observer for a study's set-ups.
 
-Noise is the difference between a unit's average and a camera without noise, unit errors and rounding, away from damage
-and rim, minus a cubic. The signature is what that camera shows near damage, minus a cubic through the rest."""
+Noise is a unit's average away from damage and rim, minus a cubic; so errors that the board's grain causes are noise.
+The signature is what a camera without noise, unit errors and rounding shows near damage, minus what it shows of the
+undamaged board."""
+
+from dataclasses import replace
 
 import numpy as np
 from scipy import ndimage
 
 from detectors.surface import Chebyshev
-from harness.engine.plan import Batch, SweepPlan
+from harness.engine.plan import Batch, RenderJob, SweepPlan
 from harness.engine.run import carried_out, render_missing
 from harness.engine.setup import SetUp, load_set_up
 from harness.engine.trial import averages_of
@@ -34,7 +37,7 @@ def ideal_of_set_ups(plan: SweepPlan, engine: JobEngine, calls_per_m2: float) ->
     found = {}
     for group in plan.groups:
         batches = [batch for batch in group.then if batch.role == "damaged"]
-        lost = render_missing((job for batch in batches for job in batch.renders), engine)
+        lost = render_missing((job for batch in batches for job in (*batch.renders, _undamaged(batch))), engine)
         jobs = [Job(f"noise of board {batch.board}", "trials", board_views, (batch, group.points)) for batch in batches]
         ends = {} if lost else {job.name: ended for job, ended in carried_out(jobs, engine)}
         if bug := next((end.why for end in ends.values() if end.is_bug), None):
@@ -50,9 +53,15 @@ def ideal_of_set_ups(plan: SweepPlan, engine: JobEngine, calls_per_m2: float) ->
     return found
 
 
+def _undamaged(batch: Batch) -> RenderJob:
+    """Return the render of a batch's first view without its damage."""
+    return replace(batch.renders[0], target=batch.renders[0].target.hole_free())
+
+
 def board_views(batch: Batch, points: tuple[Point, ...]) -> dict[int, BoardView]:
     """Return a damaged board as the ideal observer sees it, by the numbers of frames of the points."""
     set_up = load_set_up(batch.set_ups[0])
+    undamaged = load_set_up(replace(batch.set_ups[0], view_path=str(_undamaged(batch).path), damaged=False))
     clear_z_m = noise_free_z_m(set_up)
     intact = set_up.intact & np.isfinite(clear_z_m)
     rows, columns = np.nonzero(set_up.on_board)
@@ -63,14 +72,17 @@ def board_views(batch: Batch, points: tuple[Point, ...]) -> dict[int, BoardView]
     basis = Chebyshev.over(places, DEGREE).basis(places)
     surface = np.zeros((len(basis), *set_up.on_board.shape))
     surface[:, set_up.on_board] = basis
-    signals_m = _signatures_m(set_up, clear_z_m, surface, intact)
+    reach_m = REACH_PX * max(set_up.pitch_mm) * MM
+    x, y = np.moveaxis(set_up.board_xy_m, -1, 0)
+    near = [damage.within(x, y, reach_m) for damage in set_up.truth]
+    signals_m = np.where(near, clear_z_m - noise_free_z_m(undamaged), 0.0)
     seen = ndimage.binary_erosion(set_up.on_board, iterations=2) & np.isfinite(clear_z_m)
     inside = np.concatenate(list(set_up.outlines.values()))
     board, names = batch.board or 0, tuple(str(damage.id) for damage in set_up.truth)
     facts = (float(np.prod(set_up.pitch_mm)) * MM**2, float((~np.isfinite(clear_z_m.ravel()[inside])).mean()))
     shown, views = (np.nan_to_num(signals_m[:, *cut]), surface[:, *cut]), {}
     for point in {point.config.capture.frames: point for point in points}.values():
-        noise_m, known = _noise_m(set_up, clear_z_m, board, point, surface, intact)
+        noise_m, known = _noise_m(set_up, board, point, surface, intact)
         deviation_m = _deviation_m(noise_m, known)
         sums = noise_sums(noise_m[:, *cut] / deviation_m[cut], known[:, *cut])
         view = BoardView(board, names, seen[cut], deviation_m[cut], *shown, sums, UNITS_A_BOARD, *facts)
@@ -95,7 +107,7 @@ def _unit(set_up: SetUp, **changes: object) -> SimulatedUnit:
 
 
 def _noise_m(
-    set_up: SetUp, clear_z_m: np.ndarray, board: int, point: Point, surface: np.ndarray, intact: np.ndarray
+    set_up: SetUp, board: int, point: Point, surface: np.ndarray, intact: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the noise (k, h, w) of `UNITS_A_BOARD` units, each minus its cubic fit, and where it is known."""
     capture, fields = point.config.capture, []
@@ -104,11 +116,11 @@ def _noise_m(
         seed = int(random_stream(point.config.seed, *labels).integers(2**31))
         frames = _unit(set_up, unit_seed=seed).capture(capture.frames, point.config.seed, *labels)
         cloud = averages_of(frames, [capture.frames], capture.average, exact=capture.exact)[capture.frames]
-        noise = cloud.points_m[..., 2] - clear_z_m
-        known = intact & np.isfinite(noise)
+        noise = np.where(intact, cloud.points_m[..., 2], np.nan)
+        known = np.isfinite(noise)
         basis = surface[:, known].T
         noise[known] -= basis @ np.linalg.lstsq(basis, noise[known], rcond=None)[0]
-        fields.append(np.where(known, noise, np.nan))
+        fields.append(noise)
     noise_m = np.array(fields)
     return np.nan_to_num(noise_m), np.isfinite(noise_m)
 
@@ -119,14 +131,3 @@ def _deviation_m(noise_m: np.ndarray, known: np.ndarray) -> np.ndarray:
     enough = count > 0.5 * len(noise_m) / SMOOTHED_PX
     nearest = ndimage.distance_transform_edt(~enough, return_distances=False, return_indices=True)
     return np.asarray(np.sqrt(square[tuple(nearest)] / count[tuple(nearest)]))
-
-
-def _signatures_m(set_up: SetUp, clear_z_m: np.ndarray, surface: np.ndarray, intact: np.ndarray) -> np.ndarray:
-    """Return the residual (n, h, w) of each damage from the surface, 0 away from it."""
-    fitted = np.tensordot(np.linalg.lstsq(surface[:, intact].T, clear_z_m[intact], rcond=None)[0], surface, 1)
-    residual_m, pitch_m = clear_z_m - fitted, max(set_up.pitch_mm) * MM
-    signals = []
-    for damage in set_up.truth:
-        near = damage.within(set_up.board_xy_m[..., 0], set_up.board_xy_m[..., 1], REACH_PX * pitch_m)
-        signals.append(np.where(near, residual_m, 0.0))
-    return np.array(signals)

@@ -12,8 +12,7 @@ from scipy import special
 
 from harness.vocabulary.errors import UserError
 
-CONFIDENCE = 0.95
-"""Two-sided confidence of every interval in tables and reports."""
+CONFIDENCE = 0.95  # two-sided confidence of every interval in tables and reports
 UPPER = 0.5 + CONFIDENCE / 2
 RESAMPLES = 2000
 """Bootstrap resamples: the 2.5 % quantile is then the 50th smallest, stable to about 3 % of the interval's width."""
@@ -134,8 +133,7 @@ def percentiles(draws: np.ndarray, confidence: float = CONFIDENCE) -> Interval:
     return Interval(float(low), float(high))
 
 
-SITES_PER_TARGET = 3
-"""Fewest unflawed sites per flawed one, by MIL-HDBK-1823A."""
+SITES_PER_TARGET = 3  # fewest unflawed sites per flawed one, by MIL-HDBK-1823A
 
 
 @dataclass(frozen=True)

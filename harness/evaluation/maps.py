@@ -21,13 +21,10 @@ from harness.vocabulary.path_names import value_text
 VIEWS, REGISTRATION, MERGE = "mapping.views", "mapping.registration.method", "mapping.merge.kind"
 """Axes with a special meaning in studies of maps."""
 CAMERA_UNIT = "source.camera.unit_seed"
-MANY = 50
-"""Number of frames per view at which maps are compared, if they have as many."""
+MANY = 50  # number of frames per view at which maps are compared, if they have as many
 THESIS_REGISTRATION, THESIS_MERGE = "cpd", "grid"
-LARGE_MM = 25.4 * 3 / 8
-"""Diameter from which two views are claimed to measure sizes better than one view."""
-FEWEST_BOTH = 2
-"""Fewest repeats in which both maps must measure a hole to compare it."""
+LARGE_MM = 25.4 * 3 / 8  # diameter from which two views are claimed to measure sizes better than one view
+FEWEST_BOTH = 2  # fewest repeats in which both maps must measure a hole to compare it
 
 
 @dataclass(frozen=True)

@@ -18,15 +18,12 @@ from harness.evaluation.pod.curve import Bound, PodCurve, ascend
 from harness.evaluation.pod.hit_miss import rows_of_target
 from harness.vocabulary.errors import UserError
 
-LEAST_TARGETS = 40
-"""Least number of independent targets of an a-hat study, by MIL-HDBK-1823A."""
+LEAST_TARGETS = 40  # least number of independent targets of an a-hat study, by MIL-HDBK-1823A
 SAME = 1e-9
 """Relative difference to the largest signal that is only rounding. A scatter below this share of the signals' largest
 deviation is a line drawn by rounding, which has no likelihood."""
-LEVEL = 0.05
-"""A diagnostic with a smaller p-value rejects its assumption."""
-LEAST = 8
-"""Fewest signals between the limits for which Anderson and Darling's approximation of p holds."""
+LEVEL = 0.05  # a diagnostic with a smaller p-value rejects its assumption
+LEAST = 8  # fewest signals between the limits for which Anderson and Darling's approximation of p holds
 
 
 @dataclass(frozen=True, eq=False)

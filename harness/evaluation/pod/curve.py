@@ -104,10 +104,8 @@ class Bound:
 
 STEPS, PLAIN_STEPS = 200, 12
 """Most steps, with halvings, of a problem; number of plain Newton steps before: five or six usually suffice."""
-TOLERANCE = 1e-7
-"""A search ends with a smaller step: every Newton step squares the error."""
-CLIMBED = 6
-"""Number of steep starts that are tried in the search for a penalised maximum."""
+TOLERANCE = 1e-7  # a search ends with a smaller step: every Newton step squares the error
+CLIMBED = 6  # number of steep starts that are tried in the search for a penalised maximum
 PENALISED_SLOPES = np.linspace(np.log(1e-8), np.log(1e4), 140)
 """Natural logarithms of the slopes at which the search of a penalised profile starts."""
 

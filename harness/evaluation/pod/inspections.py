@@ -23,8 +23,7 @@ SEPARATORS = (",", ";", "\t")
 HITS = dict.fromkeys(("1", "yes", "y", "true", "t", "hit", "h", "found", "detected"), 1.0)
 HITS |= dict.fromkeys(("0", "no", "n", "false", "f", "miss", "m", "missed", "not found", "not detected"), 0.0)
 """Words for a hit and a miss, in upper or lower case."""
-NOTHING = ("", "na", "n/a", "nan", "null", "none", "-", "#n/a")
-"""Cells that mean "no value", in upper or lower case."""
+NOTHING = ("", "na", "n/a", "nan", "null", "none", "-", "#n/a")  # cells that mean "no value", in upper or lower case
 NUMBER = re.compile(r"[+-]?(\d[\d.,'\u2019\u00a0\u202f ]*|[.,]\d+)([eE][+-]?\d+)?")
 GROUPED = re.compile(r"[+-]?\d{1,3}([.,])\d{3}")
 LEGAL = "a header row with column names, then one row per inspection"

@@ -33,10 +33,8 @@ from harness.vocabulary.seeds import random_stream
 FREEDOM = 3.0
 PRIOR_SIZE, PRIOR_WIDTH = 1.5, 2.0
 """Scales of the prior: factors by which a simulation may well be wrong in size and in the width of the rise."""
-REACH, NODES = 8.0, (241, 61)
-"""Half the grid's side in scales, and its nodes along ln k and ln w."""
-DRAWS = 999
-"""Simulated campaigns for the p-values of the tests of agreement: 5 % is then known to 0.7 %."""
+REACH, NODES = 8.0, (241, 61)  # half the grid's side in scales, and its nodes along ln k and ln w
+DRAWS = 999  # simulated campaigns for the p-values of the tests of agreement: 5 % is then known to 0.7 %
 ENOUGH = 1.2
 """Stop rule: the ratio of a90/95 to a90 at which no further board can lower a90/95 by more than this factor."""
 LIMIT_AT = float(stats.norm.cdf(np.sqrt(criterion(CONFIDENCE))))
@@ -175,8 +173,7 @@ def quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
     return float(np.interp(share * sorted_weights.sum(), below, values[order]))
 
 
-DISAGREES = 0.05
-"""Probability of agreement below which the real hits contradict the simulation."""
+DISAGREES = 0.05  # probability of agreement below which the real hits contradict the simulation
 
 
 @dataclass(frozen=True, eq=False)

@@ -69,8 +69,7 @@ def _shuffled(places: pd.DataFrame, runs: pd.DataFrame, findings: pd.DataFrame, 
     return near / laid if laid else np.nan, laid
 
 
-PRO_LIMIT = 0.3
-"""False-positive rate up to which per-region overlap is integrated, as in MVTec AD."""
+PRO_LIMIT = 0.3  # false-positive rate up to which per-region overlap is integrated, as in MVTec AD
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,8 +20,7 @@ from harness.vocabulary.errors import UserError
 LINK = "probit"
 LEAST_INDEX = 0.05
 """Least value of d': smaller ones are raised to it: such damage is never found and must not decide the curve."""
-HARDLY = 0.5
-"""Fewest expected hits, and misses, for a curve."""
+HARDLY = 0.5  # fewest expected hits, and misses, for a curve
 HEAVY = 1.0
 """Excess kurtosis from which the noise no longer counts as Gaussian."""
 MOST_LOST = 0.01
