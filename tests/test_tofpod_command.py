@@ -42,6 +42,8 @@ def test_an_experiment_is_named_by_path_or_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     by_name = load_experiment(Path("averaging"))
     assert by_name.digest == load_experiment(ROOT / "experiments" / "averaging.yaml").digest
+    (tmp_path / "detectors").mkdir()
+    assert load_experiment(Path("detectors")).config.name == "detectors", "though a folder has this name"
     # a file of this name in the current folder counts first
     (tmp_path / "averaging.yaml").write_text((ROOT / "experiments" / "smoke.yaml").read_text())
     assert load_experiment(Path("averaging.yaml")).config.name == "smoke"

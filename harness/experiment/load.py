@@ -69,11 +69,12 @@ def _quick(data: Any) -> list[str]:
 
 
 def _experiment_file(path: Path) -> Path:
-    """Return the file for a path, or for the name of tofpod's own experiment (``averaging``). Raises UserError."""
-    if path.exists() or path.name != str(path):
+    """Return the file for a path, or for the name of tofpod's own experiment, which may also be that of a folder here
+    (``detectors``). Raises UserError."""
+    if path.is_file() or path.name != str(path):
         return path
     own = shipped("experiments") / f"{path.name.removesuffix('.yaml')}.yaml"
-    if not own.is_file() and not path.suffix:
+    if not (own.is_file() or path.suffix or path.exists()):
         names = ", ".join(sorted(each.stem for each in own.parent.glob("*.yaml")))
         raise UserError(f"{path}: there is no such file or experiment", legal=f"a YAML file, or one of {names}")
     return own if own.is_file() else path
