@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 from harness.tables.outputs import ATLAS_PAGE, ATLAS_PICTURE
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import shipped, write_text
-from harness.vocabulary.meshes import UNITS_M
 from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
@@ -179,6 +178,8 @@ def _chosen(options: argparse.Namespace, surfaces: Sequence[LimitSurface], kind:
 
 def length_m(option: str, text: str) -> float:
     """Convert a length with its unit to metres. Raises UserError that names the option."""
+    from harness.vocabulary.meshes import UNITS_M
+
     match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*([a-z]+)\s*", text)
     if match is None or match[2] not in UNITS_M or not float(match[1]) > 0:
         raise UserError(f"{option} {text}: is not a length with a unit", legal="such as 5mm, 0.5cm, 1m or 0.25in")
