@@ -269,7 +269,8 @@ def _scored(
             for each, how in ((half, smooth), (half_by, cv2.INTER_NEAREST))
         )
         wider = (np.abs(wide) > np.abs(signed)).view(np.uint8)
-        cv2.copyTo(wide, wider, signed), cv2.copyTo(wide_by, wider, by)
+        cv2.copyTo(wide, wider, signed)
+        cv2.copyTo(wide_by, wider, by)
     return signed * seen, by, solved, spread
 
 
@@ -278,10 +279,10 @@ def _visible(share: np.ndarray, judged: np.ndarray) -> np.ndarray:
     """Return 1 / sqrt(share) (r, c) where ``judged`` is not 0 and enough of a template is visible, 0 elsewhere."""
     found, least = np.empty(share.shape, np.float32), np.float32(LEAST_SEEN)
     for i in range(share.shape[0]):
-        of, ok, to = share[i], judged[i], found[i]
-        for j in range(len(to)):
-            root = np.float32(1.0) / np.sqrt(max(of[j], least))
-            to[j] = root if (of[j] > least) & (ok[j] > 0) else np.float32(0.0)
+        shares, is_judged, factors = share[i], judged[i], found[i]
+        for j in range(len(factors)):
+            factor = np.float32(1.0) / np.sqrt(max(shares[j], least))
+            factors[j] = factor if (shares[j] > least) & (is_judged[j] > 0) else np.float32(0.0)
     return found
 
 
@@ -340,10 +341,10 @@ def _scatter(score: np.ndarray, rim: np.ndarray, zones: np.ndarray) -> tuple[np.
     for row in range(rows):
         sizes, numbers = np.zeros(w, np.float32), np.zeros(w, np.int32)
         for i in range(row * h // rows, (row + 1) * h // rows):
-            of = score[i]
+            values = score[i]
             for j in range(w):
-                sizes[j] += min(abs(of[j]), most)
-                numbers[j] += of[j] != 0
+                sizes[j] += min(abs(values[j]), most)
+                numbers[j] += values[j] != 0
         for part in range(columns):
             for j in range(part * w // columns, (part + 1) * w // columns):
                 sums[row, part] += sizes[j]
