@@ -28,6 +28,11 @@ def _options(parser: argparse.ArgumentParser) -> None:
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 1 if trials failed, 2 for a user's mistake, 130 after Ctrl-C."""
+    run_options = engine_options(options)
+    if not (options.dry_run or run_options.serial or run_options.scheduler):
+        from harness.engine.processes import start_server
+
+        start_server()
     from harness.experiment.load import load_experiment
     from harness.experiment.schema import CaptureSource
 
@@ -39,10 +44,10 @@ def main(options: argparse.Namespace, command: str) -> int:
     if options.dry_run:
         from harness.engine.estimate import dry_run
 
-        return dry_run(experiment, options.out, engine_options(options))
+        return dry_run(experiment, options.out, run_options)
     from harness.engine.study import run_study
 
-    return run_study(experiment, options.out, engine_options(options), command)
+    return run_study(experiment, options.out, run_options, command)
 
 
 if __name__ == "__main__":

@@ -180,7 +180,7 @@ class ShownDamage(NamedTuple):
     half_m: float
 
 
-def shown_in(plan: SweepPlan, limits: Sequence[SetUpLimit]) -> Iterator[ShownDamage]:
+def shown_in(plan: SweepPlan, limits: Sequence[SetUpLimit]) -> Iterator[list[ShownDamage]]:
     """Yield, for the first set-ups with single views, the damages closest to 0.75, 1 and 1.25 of the limit."""
     places = [(group, point) for group in plan.groups for point in group.points]
     by_place = {(point.variant, point.config.capture.frames): (group, point) for group, point in places}
@@ -198,12 +198,17 @@ def shown_in(plan: SweepPlan, limits: Sequence[SetUpLimit]) -> Iterator[ShownDam
             rows[where] = int(apart.argmin())
         half_m = (max(seen.diameter_mm[row] for row in rows.values()) / 2 + ROOM_MM) * MM
         batches = {batch.board: batch for batch in group.then if batch.role == "damaged"}
-        for where, row in rows.items():
-            yield ShownDamage(group, batches[int(seen.board[row])], point, limit, where, row, half_m)
+        shown = [(batches[int(seen.board[row])], point, limit, where, row) for where, row in rows.items()]
+        yield [ShownDamage(group, *each, half_m) for each in shown]
 
 
-def study_example(shown: ShownDamage, thresholds: Mapping[str, float]) -> StudyExample:
-    """Return the picture of a damage whose board has been rendered. The trial is repeated exactly."""
+def study_examples(shown: Sequence[ShownDamage], thresholds: Mapping[str, float]) -> list[StudyExample]:
+    """Return the pictures of damages whose boards have been rendered."""
+    return [_example(damage, thresholds) for damage in shown]
+
+
+def _example(shown: ShownDamage, thresholds: Mapping[str, float]) -> StudyExample:
+    """Return the picture of a damage. The trial is repeated exactly."""
     group, batch, point, limit, where, row, half_m = shown
     seen = limit.record.inspected
     (task,) = (task for _, task in group.trials(batch, thresholds) if task.repeat == int(seen.repeat[row]))

@@ -46,6 +46,15 @@ if CAN_FORK:
     PROCESSES.set_forkserver_preload(["harness.engine.run", "scenes.render.view"])
 
 
+def start_server() -> None:
+    """Start the server process, which then imports its modules while this process imports its own."""
+    if CAN_FORK:
+        from multiprocessing import forkserver
+
+        with _starting():
+            forkserver.ensure_running()
+
+
 @dataclass(eq=False)
 class Answers:
     """Queue for the ends of jobs, or for an error that ends all of them. ``is_dropped``: it is no longer read."""

@@ -193,12 +193,23 @@ def _draw(plan: SweepPlan, outcome: Outcome, engine: JobEngine, stored: set[Path
         for number, group in enumerate(groups)
         if not any(_lost_view(path.name) in lost for path in group.damaged.paths)
     ]
-    ends = {job.name: ended for job, ended in carried_out(jobs, engine)}
-    for job in jobs:
-        if ends[job.name].state == "done":
-            outcome.examples += ends[job.name].value
-        else:
-            outcome.failures.append(_failure(job.name, ends[job.name]))
+    outcome.examples += pictures_from(jobs, engine, outcome)
+
+
+def pictures_from(jobs: Sequence[Job], engine: JobEngine, outcome: Outcome) -> Iterator[Any]:
+    """Start jobs that draw pictures again; return an iterator over all pictures in the order of the jobs. While it is
+    used, jobs that failed are added to the outcome."""
+    ends = carried_out(jobs, engine)
+
+    def pictures() -> Iterator[Any]:
+        by_name = {job.name: ended for job, ended in ends}
+        for job in jobs:
+            if by_name[job.name].state == "done":
+                yield from by_name[job.name].value
+            else:
+                outcome.failures.append(_failure(job.name, by_name[job.name]))
+
+    return pictures()
 
 
 def render_missing(jobs: Iterable[RenderJob], engine: JobEngine) -> list[Failure]:
@@ -213,15 +224,24 @@ def _lost_view(name: str) -> str:
 
 
 def carried_out(jobs: Iterable[Job], engine: JobEngine) -> Iterator[tuple[Job, Ended]]:
-    """Run jobs; yield each with its end, in the order in which they end."""
-    waiting, under_way = deque(jobs), 0
-    while waiting or under_way:
+    """Run jobs; yield each with its end, in the order in which they end. The first jobs start with this call."""
+    waiting = deque(jobs)
+
+    def started() -> int:
+        """Start the jobs for which there is room, and return their number."""
+        count = len(waiting)
         while waiting and engine.room(waiting[0].stage) > 0:
             engine.submit(waiting.popleft())
-            under_way += 1
-        for job, ended in engine.ended():
-            under_way -= 1
-            yield job, ended
+        return count - len(waiting)
+
+    def ends(under_way: int) -> Iterator[tuple[Job, Ended]]:
+        while waiting or under_way:
+            for job, ended in engine.ended():
+                under_way -= 1
+                yield job, ended
+            under_way += started()
+
+    return ends(started())
 
 
 def _render_job(job: RenderJob) -> Job:

@@ -12,11 +12,11 @@ import pandas as pd
 
 from harness.engine.estimate import progress_display
 from harness.engine.journal import Journal
-from harness.engine.pictures import shown_in, study_example
+from harness.engine.pictures import shown_in, study_examples
 from harness.engine.plan import PACKAGES, Group, SweepPlan, plan_of
-from harness.engine.run import render_missing, run_plan
+from harness.engine.run import pictures_from, render_missing, run_plan
 from harness.engine.tables import tables_of, write_tables
-from harness.engine.work import STATES, EngineOptions, Failure, JobEngine, Outcome, engine_of, locked
+from harness.engine.work import STATES, EngineOptions, Failure, Job, JobEngine, Outcome, engine_of, locked
 from harness.evaluation.study.record import Calibrated, Inspected, SetUpRecord, StudyRecord, Unflawed, record_text
 from harness.evaluation.study.result import evaluate_study
 from harness.experiment.load import resolved_yaml
@@ -130,9 +130,12 @@ def _write_study(
     result = evaluate_study(study, tables, experiment.data)
     shown = list(shown_in(plan, result.limits))
     # trials that ran on other machines may have no views here
-    lost = render_missing((job for damage in shown for job in damage.batch.renders), engine)
-    outcome.failures += lost
-    examples = [study_example(damage, outcome.thresholds) for damage in shown if not lost]
+    views = (job for damages in shown for damage in damages for job in damage.batch.renders)
+    outcome.failures += (lost := render_missing(views, engine))
+    # other processes draw the damages again while this process draws the figures
+    arguments = [] if lost else [(damages, outcome.thresholds) for damages in shown]
+    jobs = [Job(f"pictures of set-up {n}", "trials", study_examples, each) for n, each in enumerate(arguments)]
+    examples = pictures_from(jobs, engine, outcome)
     write_tables(folder, {table: table.frame(rows) for table, rows in study_tables(result).items()}, provenance)
     page = study_html(result, examples, provenance, resolved_yaml(experiment), title_of(experiment))
     write_text(folder / REPORT.name, page)

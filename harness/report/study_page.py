@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from textwrap import fill, shorten
 from typing import TYPE_CHECKING, Any
 
@@ -230,9 +230,9 @@ def study_parts(result: StudyResult) -> list[str | Grid]:
 
 
 def study_html(
-    result: StudyResult, examples: Sequence[StudyExample], provenance: Mapping[str, Any], resolved_yaml: str, title: str
+    result: StudyResult, examples: Iterable[StudyExample], provenance: Mapping[str, Any], resolved_yaml: str, title: str
 ) -> str:
-    """Return the page as text; the same input gives the same bytes."""
+    """Return the page as text; the same input gives the same bytes. ``examples`` are used after the other figures."""
     limits, rows = result.limits, study.study_tables(result)
     inspections = [limit.record.inspected for limit in limits]
     groups = {f"axis-{number}": group for number, group in enumerate(study.axis_groups(result.axes), 1)}
@@ -244,7 +244,7 @@ def study_html(
         figures["overlay"] = overlay_figure(inspected)
     figures |= {"depth-limits": depth_limits_figure(shown)} if any(set_up.surface for set_up in shown) else {}
     figures |= {"operating": operating_figure(curved)} if curved else {}
-    named: list[tuple[str, str]] = []
+    named, examples = list[tuple[str, str]](), list(examples)
     for limit in (set_up.limit for set_up in shown):
         record = limit.record
         own = [example for example in examples if (example.variant, example.frames) == (record.variant, record.frames)]
