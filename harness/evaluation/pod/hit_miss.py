@@ -263,7 +263,7 @@ def rows_of_target(size: np.ndarray, inspections: ArrayLike | None) -> np.ndarra
 
 
 FARTHEST = 2.0**40  # largest distance from the estimate, in spreads of the sizes, at which a bound is sought
-DIRECTIONS = 720  # points on the outline of the confidence set that determine a band
+DIRECTIONS = 240  # points on the outline of the confidence set that determine a band
 REACH = 10  # most doublings of a distance, from 2 to 2000 standard errors
 
 
