@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Annotated, Literal, NamedTuple
 
 import cv2
@@ -349,6 +349,7 @@ def crop(cloud: Cloud, config: AnyCrop) -> np.ndarray:
     raise UserError(what, legal=legal, fix="change the crop or lower crop.inset_px")
 
 
+@lru_cache(maxsize=2)  # several detectors judge the same averages of 1 and of more frames
 def choice_of(cloud: Cloud, config: AutoCrop) -> Choice:
     """Return the automatic crop of a cloud with a valid point, and all candidates. UserError without ``target``."""
     grid, smooth_px, inset_px, wanted = cloud, config.smooth_px, config.inset_px, config.target
@@ -369,6 +370,7 @@ def choice_of(cloud: Cloud, config: AutoCrop) -> Choice:
     if not cloud.organised:
         kept, mask = mask, cloud.valid.copy()
         mask[mask] = kept[rows, columns]
+    mask.flags.writeable = False
     return Choice(candidates, taken, mask, grid, () if wanted else tuple(doubts))
 
 

@@ -230,7 +230,7 @@ class MapViews:
     pixel_m: tuple[float, float]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Cloud:
     """The average of frames as points in the camera's frame: the input of a detector. ``points_m`` (h, w, 3) float64 is
     NaN where invalid. ``reason`` (h, w) uint8 holds `Reason` (the most frequent one, if no sample was valid). ``count``
