@@ -157,18 +157,23 @@ class LocalDetector:
         peak_of = np.full(sizes.size, -1, dtype=np.int64)
         peak_of[order] = _peaks(evidence.signed, order, SADDLE, PROMINENCE)
         pixels = above(evidence, thresholds[0])
-        peaks, scores = peak_of[evidence.cell.reshape(-1)[pixels]], evidence.score.reshape(-1)[pixels]
+        scores = evidence.score.reshape(-1)[pixels]
+        peaks, held = peak_of[evidence.cell.reshape(-1)[pixels]], np.zeros(len(order), dtype=bool)
+        held[peaks] = True
+        labels, strengths = (np.cumsum(held) - 1)[peaks], np.zeros(np.count_nonzero(held))
+        np.maximum.at(strengths, labels, scores)
+        # by level and peak, the sums over pixels above the level's threshold: first over those not above the next one
+        level, shape = np.searchsorted(thresholds, scores) - 1, (len(thresholds), len(strengths))
+        excess, points_m = np.maximum(scores - CORE * strengths[labels], 0.0), cloud.points_m.reshape(-1, 3)[pixels]
+        by_level = level * len(strengths) + labels
+        sums = [np.bincount(by_level, excess * each, shape[0] * shape[1]) for each in (1.0, *points_m.T)]
+        weights, *moments = (np.cumsum(each.reshape(shape)[::-1], axis=0)[::-1] for each in sums)
         found = []
-        for threshold in thresholds:
-            kept = scores > threshold
-            pixels, peaks, scores = pixels[kept], peaks[kept], scores[kept]
-            labels = np.unique(peaks, return_inverse=True)[1]
-            strengths = np.zeros(int(labels.max(initial=-1)) + 1)
-            np.maximum.at(strengths, labels, scores)
-            excess = np.maximum(scores - CORE * strengths[labels], 0.0)
-            moments = (np.bincount(labels, excess * at) for at in cloud.points_m.reshape(-1, 3)[pixels].T)
-            centres_m = np.stack(list(moments), axis=-1) / np.bincount(labels, excess)[:, None]
-            found.append(Findings(strengths, pixels, labels, centres_m))
+        for n, threshold in enumerate(thresholds):
+            high, there = strengths > threshold, scores > threshold
+            centres_m = np.stack([moment[n, high] / weights[n, high] for moment in moments], axis=-1)
+            number = np.cumsum(high) - 1
+            found.append(Findings(strengths[high], pixels[there], number[labels[there]], centres_m))
         return found
 
     def quiet_threshold(self, cloud: Cloud, evidence: Evidence) -> float:
