@@ -37,12 +37,13 @@ def optics_of(width: int, height: int, focal_px: float) -> Optics:
 def its_phasors(lit, optics, paths, histogram):
     """(RUNS, f, h, w) from as many seeds, summed as phasors or from a time histogram."""
     pytest.importorskip("mitransient", exc_type=ImportError)
-    from validation.transport_oracle import oracle
+    from validation.transport_oracle import BIN_M, oracle
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        other = oracle(lit, optics, FREQUENCIES, histogram=histogram)
-        return np.stack([other.phasors(paths, seed, BOUNCES) for seed in range(RUNS)])
+        starts = [-BIN_M * run / RUNS if histogram else None for run in range(RUNS)]
+        others = [oracle(lit, optics, FREQUENCIES, histogram_from_m=start) for start in starts]
+        return np.stack([other.phasors(paths, seed, BOUNCES) for seed, other in enumerate(others)])
 
 
 def assert_agree(ours, theirs, here, largest_error):
