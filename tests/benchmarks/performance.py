@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import os
+import subprocess
 import sys
 import tempfile
 import time
@@ -349,10 +350,62 @@ def growth(runs: int) -> None:
         print(f"  workers: two processes do {rates[1] / rates[0]:.2f} times the trials of one, by the wall clock")
 
 
+def boards(runs: int) -> None:
+    """Print the processor time of a board's render, mesh included, by the board's damage."""
+    import drjit
+
+    from harness.engine.plan import plan_of
+    from harness.experiment.load import load_experiment
+    from scenes.render.view import render_view
+    from scenes.sensor.camera import camera_of
+    from scenes.target.mesh import build_target
+
+    print("\nrender of a board of detection_limit.yaml, a second and core")
+    plan, by_kind = plan_of(load_experiment(STUDY, []), Path()), dict[str, list[Any]]()
+    for group in plan.groups:
+        for batch in group.batches:
+            holes = batch.renders[0].target.holes
+            by_kind.setdefault(f"{len(holes)} holes, {holes[0].kind}" if holes else "hole-free", []).append(
+                batch.renders[0]
+            )
+
+    def drawn(job: Any) -> None:
+        render_view(build_target(job.target), camera_of(job.camera).optics, job.config)
+
+    for jobs in by_kind.values():
+        drawn(jobs[0])
+    drjit.set_thread_count(1)
+    for kind, jobs in by_kind.items():
+        spent = np.median([once(partial(drawn, job)) for job in jobs[:: max(1, len(jobs) // runs)][:runs]])
+        print(f"  {kind:24} {spent:8.2f} s", flush=True)
+
+
+def programs(runs: int) -> None:
+    """Print the wall-clock time of imports and of whole sweeps that find nothing stored, with two processes."""
+
+    def seconds_of(*arguments: str) -> float:
+        began = time.perf_counter()
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        subprocess.run([sys.executable, *arguments], cwd=ROOT, check=True, **quiet)
+        return time.perf_counter() - began
+
+    print("\nwhole programs, by the wall clock")
+    names = [path.stem for path in (ROOT / "harness").glob("[a-z]*.py") if "\n@program(" in path.read_text()]
+    bare = min(seconds_of("-c", "") for _ in range(3))
+    times = {name: min(seconds_of("-c", f"import harness.{name}") for _ in range(3)) - bare for name in names}
+    slowest = max(times, key=lambda name: times[name])
+    print(f"  import of any program: at most {times[slowest]:.2f} s (harness.{slowest})", flush=True)
+    sweeps = (("averaging", "--quick"), ("averaging",), ("detection_limit",))
+    for sweep in sweeps[:1] if runs < 9 else sweeps:
+        with tempfile.TemporaryDirectory() as folder:
+            spent = seconds_of("-m", "harness.sweep", *sweep, "--out", folder)
+            print(f"  sweep {' '.join(sweep):24} {spent:8.1f} s", flush=True)
+
+
 def main() -> None:
     """Run the parts that are named, or all."""
     peers = (peers_of_frames, peers_of_surfaces, peers_of_clusters, peers_of_curves, peers_of_registration)
-    parts = (*peers, peers_of_renders, trials, growth)
+    parts = (*peers, peers_of_renders, boards, trials, growth, programs)
     known = {part.__name__.removeprefix("peers_of_"): part for part in parts}
     parser = argparse.ArgumentParser(description="Compare speed with other libraries and show how cost grows.")
     parser.add_argument("parts", nargs="*", metavar="PART", choices=[*known, []], help=", ".join(known))
