@@ -15,7 +15,7 @@ import numba
 import numpy as np
 
 from detectors.clusters import PLAIN
-from detectors.whitening import correlated_products, whitener
+from detectors.whitening import correlated_products, covariance_factor
 
 STRIPS = 64
 """Strips that approximate the disc: the total coverage is exact, that of a pixel right to 0.001 for a blur of 3."""
@@ -26,6 +26,7 @@ STEP = 1e-3
 MOST_STEPS, TOLERANCE = 40, 1e-5  # limits of a descent: the number of steps, and the relative gain below which it ends
 DAMPING, LEAST_M, SMALLEST = 1e-3, 1e-9, 1e-18
 """Damping of the first step; size of a deviation that is only rounding error, and its square."""
+THIN_PX = 4  # far pixels tell the offset alone: of 16, one nearly suffices
 MODEL_ERROR, RADIUS_ERROR_PX, DEPTH_ERROR = 0.02, 0.05, 0.05
 """Errors by light between wall and floor on simulated clouds: shares of a pixel's depth and of the fitted sizes."""
 MOST_MISFIT = 1.5
@@ -75,7 +76,8 @@ def straight_sight(per_px_m: np.ndarray) -> np.ndarray:
 class HolePatch:
     """Residuals around one detection. ``metric_m2`` (2, 2): its quadratic form is the squared length of a pixel offset
     (du, dv). ``blur_px`` (along u, along v): sides of the rectangle over which the image is averaged. ``noise_m``:
-    standard deviation beside the hole. ``sights``: (s, 8). ``whitener`` (n, n): of the used pixels' errors."""
+    standard deviation beside the hole. ``sights``: (s, 8). ``factor`` (n, n): lower triangular L of the covariance L L'
+    of the used pixels' errors, if known. ``left_out``: number of pixels beside them that would add too little."""
 
     residual_m: np.ndarray
     used: np.ndarray
@@ -83,7 +85,8 @@ class HolePatch:
     blur_px: tuple[float, float]
     noise_m: float
     sights: np.ndarray
-    whitener: np.ndarray | None = None
+    factor: np.ndarray | None = None
+    left_out: int = 0
 
     @property
     def prior_weight(self) -> float:
@@ -192,32 +195,39 @@ class HoleFit:
     misfit: float
 
 
-def whitened(patch: HolePatch, by_lag: np.ndarray | None, offset_m: float) -> HolePatch:
-    """Return the patch with the whitener of its errors: noise with the correlation ``by_lag`` (odd, odd), and errors of
-    the model, which are shares of the depth beyond ``offset_m``."""
+def whitened(patch: HolePatch, by_lag: np.ndarray | None, offset_m: float, near: np.ndarray) -> HolePatch:
+    """Return the patch with the covariance of its errors: noise with the correlation ``by_lag`` (odd, odd), and errors
+    of the model, which are shares of the depth beyond ``offset_m``. Of the pixels that are not ``near`` (h, w) bool,
+    those of every `THIN_PX`-th row and column are used. Without a covariance, the patch stays as it is."""
+    used, step = patch.used & near, (slice(None, None, THIN_PX),) * 2
+    used[step] = patch.used[step]
     error_m = MODEL_ERROR * np.abs(patch.residual_m - offset_m)
-    return replace(patch, whitener=whitener(patch.used, by_lag, max(patch.noise_m, LEAST_M), error_m))
+    factor = covariance_factor(used, by_lag, max(patch.noise_m, LEAST_M), error_m)
+    left_out = int(np.count_nonzero(patch.used) - np.count_nonzero(used))
+    return patch if factor is None else replace(patch, used=used, factor=factor, left_out=left_out)
 
 
 def fit_hole(patch: HolePatch, u: float, v: float, radius_m: float, depth_m: float, offset_m: float) -> HoleFit:
-    """Fit a hole to at least six used pixels by least squares (Levenberg and Marquardt) from start values. With a
-    whitener in the patch, the fit has maximum likelihood; else the covariance is that of `sandwich_covariance`.
+    """Fit a hole to at least six used pixels by least squares (Levenberg and Marquardt) from start values. With the
+    covariance in the patch, the fit has maximum likelihood; else the covariance is that of `sandwich_covariance`.
 
     Fitted are (u, v, ln radius, depth * radius^2, offset, x) with the wall sin^2(pi x / 2), which has `WALL_PRIOR`. The
     fourth is the hole's volume. The blur preserves it, so that only the radius of a small hole is ill-determined."""
-    used, data, known = patch.used, patch.residual_m[patch.used], patch.whitener is not None
+    used, data, known = patch.used, patch.residual_m[patch.used], patch.factor is not None
     weight = 1.0 / WALL_PRIOR[1] if known else patch.prior_weight
     start = np.array([u, v, math.log(radius_m), depth_m * radius_m**2, offset_m, WALL_PRIOR[0]])
     optics = patch.sights, patch.metric_m2, *patch.blur_px, *used.shape
-    whitening = patch.whitener if known else np.zeros((0, 0))
-    hole, offset, rows, converged = _descent(data, np.flatnonzero(used), whitening, weight, start, *optics)
+    factor = patch.factor if known else np.zeros((0, 0))
+    hole, offset, rows, converged = _descent(data, np.flatnonzero(used), factor, weight, start, *optics)
     by, left = rows[:6], rows[6]
     u, v, radius, depth, wall = hole.tolist()
     square = float(left @ left)
     if not known:
         return HoleFit(u, v, radius, depth, offset, wall, sandwich_covariance(patch, by, square), converged, 0.0)
     # the inverse of the information, times the residual variance, plus the model's errors
-    variance, information = square / max(len(data) - 6, 1), by @ by.T
+    # pixels that are left out have the noise that is known
+    variance = (square + patch.left_out) / max(len(data) + patch.left_out - 6, 1)
+    information = by @ by.T
     information[5, 5] += WALL_PRIOR[1] ** -2
     covariance = np.linalg.pinv(information, hermitian=True) * variance
     covariance[2, 2] += RADIUS_ERROR_PX**2 * float(np.trace(patch.metric_m2)) / 2.0
@@ -227,11 +237,11 @@ def fit_hole(patch: HolePatch, u: float, v: float, radius_m: float, depth_m: flo
 
 @numba.njit(**PLAIN)
 def _descent(  # type: ignore[no-untyped-def]
-    data, places, whitening, weight, start, sights, metric, blur_u, blur_v, h, w
+    data, places, factor, weight, start, sights, metric, blur_u, blur_v, h, w
 ):
     """Return the best hole (5,), its offset, rows (8, n) and whether the descent from ``start`` (6,) has converged. The
     first rows are derivatives of the used pixels, at flat ``places`` (n,), by (u, v, radius, depth, offset, wall); the
-    seventh is ``data`` (n,) minus the hole. A ``whitening`` (n, n) that is not empty multiplies them."""
+    seventh is ``data`` (n,) minus the hole. With a ``factor`` (n, n) that is not empty, they are whitened."""
     n, q, step, damping, converged = len(data), start, np.zeros(6), 10.0 * DAMPING, False
     square = promised = np.inf
     rows, products, best, holes, sizes = np.zeros((8, n)), np.zeros((7, 7)), np.zeros(5), np.zeros((6, 5)), np.zeros(5)
@@ -248,7 +258,7 @@ def _descent(  # type: ignore[no-untyped-def]
         image = _painted(holes[:1], sights, metric, blur_u, blur_v, h, w).ravel()
         for i in range(n):
             left[0, i] = image[places[i]] + at[4] - data[i]
-        _whiten(left, whitening)
+        _whiten(left, factor)
         prior = weight * (holes[0, 4] - WALL_PRIOR[0])
         new_square, enough = prior**2, TOLERANCE * square + SMALLEST
         for i in range(n):
@@ -271,7 +281,7 @@ def _descent(  # type: ignore[no-untyped-def]
                     rows[row, i] = (images[k * h * w + places[i]] - image[places[i]]) * per_step
             for i in range(n):
                 rows[4, i], rows[6, i] = 1.0, left[0, i]
-            _whiten(rows[:6], whitening)
+            _whiten(rows[:6], factor)
             products = np.zeros((7, 7))
             for i in range(n):
                 for j in range(7):
@@ -293,14 +303,17 @@ def _descent(  # type: ignore[no-untyped-def]
     return best, q[4], rows, converged
 
 
-@numba.njit(**PLAIN)
-def _whiten(rows: np.ndarray, whitening: np.ndarray) -> None:
-    """Multiply rows (k, n) by a matrix (n, n) where it is not empty; assignment to a slice takes 8 s to compile."""
-    if len(whitening):
-        white = np.dot(rows, whitening)
+# sums in any order, so that the compiler uses vectors
+@numba.njit(fastmath={"reassoc", "contract", "nsz"}, **PLAIN)
+def _whiten(rows: np.ndarray, factor: np.ndarray) -> None:
+    """Solve L x = r for each of the rows r (k, n) with a lower triangular ``factor`` L (n, n), unless it is empty."""
+    for i in range(len(factor)):
+        by, per_pivot = factor[i], 1.0 / factor[i, i]
         for k in range(len(rows)):
-            for i in range(len(whitening)):
-                rows[k, i] = white[k, i]
+            row, total = rows[k], 0.0
+            for j in range(i):
+                total += by[j] * row[j]
+            row[i] = (row[i] - total) * per_pivot
 
 
 @numba.njit(**PLAIN)

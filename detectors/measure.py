@@ -35,6 +35,9 @@ OTHER_DAMAGE_SIGMAS = 5.0
 OPEN_M = 20.0 * MM
 """The contour clips deeper residuals to this depth, to follow an oblique hole's mouth, not what shows through."""
 CONTOUR_ZOOM = 4  # sub-pixels of the half-depth contour along each axis
+NEAR_BLURS = 1.4
+"""Distance from a detection, in sides of the blur, up to which all pixels count if the noise's correlation is known.
+Leaving out 15 of 16 farther pixels raises the standard errors of diameter and depth by 0.5 to 1.5 %."""
 EXPLAINED = 0.5
 """Least share of a detection's mean residual that its fit must explain: correlated noise may absorb a smooth dent."""
 SHARPER_PX, SHARPER_GAIN = (1.0, 2.0, 3.0, 5.0), 9.0
@@ -288,8 +291,9 @@ def _modelled(around: _Surroundings, config: HoleModelConfig, by_lag: np.ndarray
     if patch.used.sum() < 6:
         return None, "the model of a blurred hole does not fit"
     start = (u0, v0, radius, around.sign * around.peak_m, around.offset_m)
-    patch = whitened(patch, by_lag, around.offset_m)
-    fit, seen_by, pixels = fit_hole(patch, *start), patch, int(patch.used.sum())
+    known_by = grown(own, round(NEAR_BLURS * max(patch.blur_px)), cv2.MORPH_ELLIPSE)
+    patch = whitened(patch, by_lag, around.offset_m, known_by)
+    fit, seen_by, pixels = fit_hole(patch, *start), patch, int(patch.used.sum()) + patch.left_out
     for side in around.sharper_px if fit.misfit else ():
         narrower = replace(patch, blur_px=(side, side))
         other = fit_hole(narrower, *start)

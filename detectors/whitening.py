@@ -340,30 +340,32 @@ def bank(window_px: int) -> tuple[Template, ...]:
     return tuple(sorted(found, key=lambda template: template.coarse))
 
 
-def whitener(
+def covariance_factor(
     used: np.ndarray, correlation: np.ndarray | None, deviation: float, model_error: np.ndarray
 ) -> np.ndarray | None:
-    """Return the matrix (n, n) that turns rows (k, n) of errors at the ``used`` pixels (r, c) into independent errors
-    of variance 1. None if there are too many pixels, or if the correlation is unknown or zero. Errors are noise of one
-    ``deviation`` and the model's own (r, c), both with the ``correlation`` by lag (odd, odd)."""
-    count, (h, w) = int(used.sum()), used.shape
-    if correlation is None or count > MOST_WHITENED:
+    """Return the lower triangular L (n, n) of the covariance L L' of the errors at the ``used`` pixels (r, c). None if
+    there are too many pixels, or if the correlation is unknown or zero. Errors are noise of one ``deviation`` and the
+    model's own (r, c), both with the ``correlation`` by lag (odd, odd)."""
+    if correlation is None or np.count_nonzero(used) > MOST_WHITENED:
         return None
-    # the correlation at all lags of the patch: the lag of two pixels is the difference of their flat indices
-    lags, (down, right) = np.zeros((2 * h - 1, 2 * w - 1)), (side // 2 for side in correlation.shape)
-    reach = min(down, h - 1), min(right, w - 1)
-    within = tuple(slice(middle - far, middle + far + 1) for middle, far in zip((h - 1, w - 1), reach, strict=True))
-    known = tuple(slice(middle - far, middle + far + 1) for middle, far in zip((down, right), reach, strict=True))
-    lags[within] = correlation[known]
-    rows, columns = np.nonzero(used)
-    places, error = rows * lags.shape[1] + columns, model_error[used]
-    covariance = lags.ravel()[places[:, None] - places + (h - 1) * lags.shape[1] + w - 1]
-    covariance *= deviation**2 + np.outer(error, error)
-    try:
-        lower = scipy.linalg.cholesky(covariance.T, lower=True, overwrite_a=True, check_finite=False)
-    except np.linalg.LinAlgError:
-        return None
-    return np.ascontiguousarray(scipy.linalg.lapack.dtrtri(lower, lower=1)[0].T)
+    matrix = _lower_covariance(*np.nonzero(used), model_error[used], deviation**2, correlation)
+    # in LAPACK's order of elements its transpose is an upper triangle, which needs no copy
+    _, failed = scipy.linalg.lapack.dpotrf(matrix.T, lower=False, clean=False, overwrite_a=True)
+    return None if failed else matrix
+
+
+@numba.njit(**PLAIN)
+def _lower_covariance(  # type: ignore[no-untyped-def]
+    rows, columns, error, variance, correlation
+):
+    """Return the lower triangle (n, n) of the covariance of pixels, 0 above it."""
+    found, (down, right) = np.zeros((len(rows), len(rows))), (len(correlation) // 2, correlation.shape[1] // 2)
+    for i in range(len(rows)):
+        for j in range(i + 1):
+            row, column = rows[i] - rows[j] + down, columns[i] - columns[j] + right
+            if row < len(correlation) and 0 <= column < correlation.shape[1]:
+                found[i, j] = correlation[row, column] * (variance + error[i] * error[j])
+    return found
 
 
 def correlated_products(columns: np.ndarray, across: int, down: int) -> np.ndarray:
