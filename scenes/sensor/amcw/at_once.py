@@ -23,7 +23,7 @@ from scipy import ndimage
 from harness.vocabulary.geometry import MM, Reason
 from scenes.sensor.amcw import kernels, ranging
 from scenes.sensor.amcw.certainty import Certainty, certainty, even_pixels, fill_even
-from scenes.sensor.amcw.kernels import LANES, FilterSettings
+from scenes.sensor.amcw.kernels import LANES
 from scenes.sensor.amcw.linear import DEVIATIONS, Light, light_of_samples, linearised, unknown_filtered
 from scenes.sensor.normals import EXACT_SUMS, FAST, standard_normals
 from scenes.sensor.unit import N_REASONS, FrameTotals
@@ -197,23 +197,22 @@ def at_once(imager: AmcwImager, exposure: AmcwExposure, pixels: np.ndarray) -> A
     # without noise that hides the converter's steps, frames differ from the linear model
     if wild.any() or not (exposure.sigma > LEAST_DITHER * step).all():
         return None
-    space, concentration, dim, *rules = imager.filter_settings
-    window = FilterSettings(space.astype(float), float(concentration), float(dim), *rules)
+    window = imager.filter_settings
     shape, n, unit = exposure.shape, exposure.sigma.size, imager.camera.unit
     light = light_of_samples(exposure, float(knee), imager.gains)
 
     # each requested pixel after the filter, and its change by noise
-    noise_free = np.stack([light.phasor.real, light.phasor.imag]).astype(f4)
+    noise_free = np.stack([light.phasor.real, light.phasor.imag])
     noise_free[:, :, lost] = 0
     strength = light.amplitude if window.by_amplitude else light.bright
-    alone, edge32 = imager.filter(noise_free, np.where(lost, kernels.OUTSIDE, strength).astype(f4), shape)
-    edge = edge32.reshape(len(edge32), n).astype(float)
-    even = even_pixels(edge, light, window, shape, wild | lost)
+    alone, edge = imager.filter(noise_free, np.where(lost, kernels.OUTSIDE, strength), shape)
+    edge = edge.reshape(len(edge), n)
+    even = even_pixels(edge, light, window, shape, lost)
     filtered = unknown_filtered(len(light.turn), n)
     of_even = fill_even(even, alone.reshape(len(alone), 3, n), edge, light, window, shape, filtered)
     # in the finished image, the engine looks one pixel beyond the requested ones
-    rest = np.flatnonzero(~even & ndimage.binary_dilation(pixels, np.ones((3, 3), bool)).ravel())
-    moved = linearised(rest, light, window, shape, wild, lost, filtered)
+    rest = np.flatnonzero(~(even | lost) & ndimage.binary_dilation(pixels, np.ones((3, 3), bool)).ravel())
+    moved = linearised(rest, light, window, shape, lost, filtered)
     farthest_m = (unit.jump_mm.value + JITTERS * unit.jitter_mm.value + abs(unit.drift_mm.value)) * MM
     certain = certainty(filtered, imager.engine, lost, shape, farthest_m)
     wanted = ~(certain.always | certain.never) & pixels.ravel()
@@ -226,7 +225,7 @@ def at_once(imager: AmcwImager, exposure: AmcwExposure, pixels: np.ndarray) -> A
     if window.by_amplitude:
         pull = metres * light.amplitude / np.median(light.amplitude, axis=1, keepdims=True)
     linear = _linear(imager, light, certain, pull, (np.flatnonzero(even), *of_even), (rest, moved))
-    listing = _listed(wanted.reshape(shape), space.shape[0], imager.engine.flying is not None)
+    listing = _listed(wanted.reshape(shape), window.space.shape[0], imager.engine.flying is not None)
     halo = Light(*(np.ascontiguousarray(part[:, listing.halo]) for part in light))
     each = (pull[:, listing.halo] * halo.turn).T
     shares = (each / np.sqrt((each**2).sum(axis=1, keepdims=True))).astype(f4)

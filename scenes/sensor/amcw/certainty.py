@@ -8,16 +8,17 @@ surface, noise lowers the weight of all neighbours by the same share, which a ta
 from typing import NamedTuple
 
 import cv2
+import numba
 import numpy as np
 from scipy import ndimage
 
 from scenes.sensor.amcw import ranging
 from scenes.sensor.amcw.kernels import FilterSettings
 from scenes.sensor.amcw.linear import DEVIATIONS, Filtered, Light, linearised, unknown_filtered
+from scenes.sensor.normals import FAST
 
 f4 = np.float32
 MOST_LEFT_OUT = 0.025  # most variance not of first order: it is then right to 1 %; beyond, frames are simulated
-STEP_M = 1e-3  # displacement of half a path from which that of z is found
 MOST_TURNED, MOST_SPREAD = 1e3, 1e9  # in place of an unknown deviation: of a phase in radians, of an amplitude in units
 
 
@@ -42,35 +43,33 @@ def certainty(
     """Sort the pixels of a view of ``shape`` whose frames are displaced by at most ``farthest_error_m``."""
     gates, lattice, amplitude = engine.gates, engine.lattice, filtered.amplitude
     f, n = amplitude.shape
-    turns = np.minimum(filtered.turned, MOST_TURNED) / (2 * np.pi)
-    spread = np.minimum(filtered.spread, MOST_SPREAD)
+    turns = np.minimum(filtered.turned, f4(MOST_TURNED)) / f4(2 * np.pi)
+    spread = np.minimum(filtered.spread, f4(MOST_SPREAD))
 
-    # the engine on the mean phasors, and the change of z by half a path
-    planes = np.stack([filtered.phasor.real, filtered.phasor.imag, amplitude], axis=1).astype(f4)
-    edge = filtered.edge_least.astype(f4)
-    (z_m, reason, _), up, down = (
-        ranging.ranges_of(planes, edge, lost.astype(np.uint8), engine, np.full(n, error_m))
-        for error_m in (0.0, STEP_M, -STEP_M)
-    )
-    mean_m, up_m, down_m = (each.astype(float) for each in (z_m, up[0], down[0]))
-    by_path = (up_m - down_m) / (2 * STEP_M)
-    weights = lattice.metres_per_turn.astype(float)[:, None]
+    # the engine on the mean phasors, and the change of z by half a path: the range is that at which range and distance
+    # to the emitter come to twice as much
+    planes = np.stack([filtered.phasor.real, filtered.phasor.imag, amplitude], axis=1)
+    mean_m, reason, _ = ranging.ranges_of(planes, filtered.edge_least, lost.astype(np.uint8), engine, np.zeros(n))
+    (along, square, cosine), weights = engine.geometry, lattice.metres_per_turn[:, None]
+    range_m = mean_m / cosine
+    emitter_m = np.sqrt(range_m * range_m - 2 * range_m * along + square)
+    by_path = cosine * 2 * emitter_m / (range_m + emitter_m - along)
     deviation_m = by_path * np.sqrt(((weights * turns) ** 2).sum(axis=0))
 
     # the lattice residual of the mean phases in turns, and whether the wrap counts are certain
-    turn = (np.angle(filtered.phasor) / (2 * np.pi) % 1.0).astype(f4)
-    sums = lattice.combination.astype(float) @ turn
-    sway = np.sqrt(lattice.combination.astype(float) ** 2 @ turns**2)
+    turn = np.angle(filtered.phasor) / f4(2 * np.pi)
+    turn[turn < 0] += 1
+    sums = lattice.combination @ turn
+    sway = np.sqrt(lattice.combination**2 @ turns**2)
     margin = (0.5 - np.abs(sums - np.round(sums)) > DEVIATIONS * sway).all(axis=0)
     residual2 = np.empty(n, f4)
     ranging.half_path(turn, n, lattice, np.empty(n, f4), residual2)
-    residual, unwraps = np.sqrt(residual2.astype(float)), margin & np.isfinite(residual2)
+    residual, unwraps = np.sqrt(residual2), margin & np.isfinite(residual2)
 
     # each gate at the worst (-1) and the best (+1) values that noise and displacements allow
     both = DEVIATIONS * np.sqrt((spread**2).sum(axis=0))
     reach = DEVIATIONS * turns.max(axis=0)
     slack_m = DEVIATIONS * deviation_m + farthest_error_m
-    range_m = mean_m / engine.geometry[2]
     far_m = mean_m if gates.axial > 0 else range_m
     if gates.edge_mean > 0:  # the frequencies' noise is independent
         steepest = filtered.edge.mean(axis=0) + DEVIATIONS * np.sqrt((filtered.edge_spread**2).sum(axis=0)) / f
@@ -80,7 +79,7 @@ def certainty(
     def first_failed(end: int) -> np.ndarray:
         low, high = amplitude + end * DEVIATIONS * spread, amplitude - end * DEVIATIONS * spread
         inputs = ranging.GateInputs(
-            edge=steepest if end < 0 else np.full(n, -np.inf),
+            edge=steepest if end < 0 else np.full(n, -np.inf, f4),
             least=low.min(axis=0),
             greatest=high.max(axis=0),
             total=amplitude.sum(axis=0) + end * both,
@@ -141,29 +140,27 @@ NOISES = np.linspace(0.0, MOST_NOISE, 33)
 
 def _shares_of(window: FilterSettings) -> tuple[np.ndarray, np.ndarray]:
     """Return a neighbour's share, and the variance of higher order over the noise's, by phase noise `NOISES`."""
-    side = window.space.shape[0]
-    k, middle = side * side, side * side // 2
+    # windows with one noise each, below one another
+    side, k, count = window.space.shape[0], window.space.size, len(NOISES)
     weights = window.space.ravel() / window.space.sum()
-    neighbours, rest = np.ones(len(NOISES)), np.zeros(len(NOISES))
-    bright = np.full((1, k), 1e3 * max(window.dim, 1.0))
-    none = np.zeros(k, bool)
-    for row, noise in enumerate(NOISES[1:], 1):
-        each = np.full((1, k), noise)
-        out = unknown_filtered(1, k)
-        light = Light(np.ones((1, k), complex), bright, bright, each, each / 1e3)
-        moved = linearised(np.array([middle]), light, window, (side, side), none, none, out)[0, 0] / noise
-        neighbours[row] = moved[0] / weights[0]
-        rest[row] = out.left_out[0, middle] * (out.turned[0, middle] / noise) ** 2
+    each, bright = np.repeat(NOISES, k)[None], np.full((1, count * k), 1e3 * max(window.dim, 1.0))
+    light = Light(np.ones_like(each, complex), bright, bright, each, each / 1e3)
+    middles, out = np.arange(count) * k + k // 2, unknown_filtered(1, count * k)
+    lost = np.zeros(count * k, bool)
+    moved = linearised(middles[1:], light, window, (count * side, side), lost, out)[0]
+    neighbours, rest = np.ones(count), np.zeros(count)
+    neighbours[1:] = moved[:, 0] / NOISES[1:] / weights[0]
+    rest[1:] = out.left_out[0, middles[1:]] * (out.turned[0, middles[1:]] / NOISES[1:]) ** 2
     return neighbours, rest
 
 
 def even_pixels(
-    edge: np.ndarray, light: Light, window: FilterSettings, shape: tuple[int, int], unsure: np.ndarray
+    edge: np.ndarray, light: Light, window: FilterSettings, shape: tuple[int, int], lost: np.ndarray
 ) -> np.ndarray:
-    """Return (n,) bool: pixels before one even surface. ``edge`` (f, n): noise-free edge sum; ``unsure`` (n,) bool."""
+    """Return (n,) bool: pixels before one even surface. ``edge`` (f, n): noise-free edge sum; ``lost`` (n,) bool."""
     size = window.space.shape[0]
     half = size // 2
-    unlike = unsure | (light.amplitude * (1 - DEVIATIONS * light.swell) <= window.dim).any(axis=0)
+    unlike = lost | (light.amplitude * (1 - DEVIATIONS * light.swell) <= window.dim).any(axis=0)
     unlike |= (light.turn > MOST_NOISE).any(axis=0)
     square = np.ones((size, size), np.uint8)
     even = np.asarray(cv2.dilate(unlike.reshape(shape).astype(np.uint8), square)) == 0
@@ -187,42 +184,65 @@ def fill_even(
     Return, (f, m) each, the change of the phase by a neighbour's noise at weight and amplitude 1, over its deviation,
     and by one deviation of the centre's noise in total."""
 
-    def summed(values: np.ndarray, space: np.ndarray) -> np.ndarray:
-        """Return values (f, n) summed over each window with weights ``space``, a product of rows and columns."""
-        middle = space.shape[0] // 2
-        planes, across = values.reshape(-1, *shape), space[middle] / np.sqrt(space[middle, middle])
-        border = cv2.BORDER_CONSTANT
-        return taken(np.stack([cv2.sepFilter2D(plane, -1, across, across, borderType=border) for plane in planes]))
-
-    def taken(values: np.ndarray) -> np.ndarray:
-        return values.reshape(len(values), -1).take(at, axis=1)
-
-    at = np.flatnonzero(even)
-    carried = light.amplitude if window.by_amplitude else np.ones(light.amplitude.shape)
+    space, at = window.space, np.flatnonzero(even)
+    each, centre = np.empty((2, len(edge), len(at)))
+    carried = light.amplitude if window.by_amplitude else np.ones_like(light.amplitude)
     of_neighbours, of_rest = _shares_of(window)
-    own, edge, own_carried = taken(light.turn), taken(edge), taken(carried)
-    weights = summed(carried, window.space)
-    share = np.interp(own, NOISES, of_neighbours)
-    squares = summed((carried * light.turn) ** 2, window.space**2)
-    spreads = summed((light.amplitude * light.swell) ** 2, window.space**2)
-    middle = window.space.ravel()[window.space.size // 2]
-    each = share / weights
-    mine = middle * own_carried / weights
-    rest = np.interp(own, NOISES, of_rest) * own**2
-    centre = np.sqrt((1 - share * (1 - mine)) ** 2 * own**2 + rest)
-    variance = each**2 * (squares - (middle * own_carried * own) ** 2) + centre**2
-    alone = taken(filtered[:, 0]) + 1j * taken(filtered[:, 1])
-    # noise moves the mean towards the centre's own phase, as it does the shares
-    mean = taken(light.phasor) * (1 - share) + alone * (share / np.abs(alone))
-    out.phasor[:, at] = mean / np.abs(mean)
-    # noise perpendicular to a mean phasor lengthens it
-    out.amplitude[:, at] = taken(filtered[:, 2]) * (1 + 0.5 * variance if window.by_amplitude else 1.0)
-    out.turned[:, at] = np.sqrt(variance)
-    out.spread[:, at] = np.sqrt(spreads) / window.space.sum()
-    out.left_out[:, at] = rest / variance
-    kept = window.space.size - 1
-    out.edge[:, at] = edge + 0.5 * kept * (1 - np.exp(-(own**2)))
-    quadratic = (kept * 6 / 16 + kept**2 / 8) * own**4
-    out.edge_spread[:, at] = np.sqrt(quadratic + (1 + kept) * edge * own**2)
-    out.edge_least[:, at], out.edge_loose[:, at] = out.edge[:, at], out.edge_spread[:, at]
+    for f in range(len(edge)):
+        sums = [carried[f], (carried[f] * light.turn[f]) ** 2, (light.amplitude[f] * light.swell[f]) ** 2]
+        for number, weights in enumerate((space, space**2, space**2)):
+            # the weights are a product of those along rows and along columns
+            across = weights[len(space) // 2] / np.sqrt(weights[len(space) // 2, len(space) // 2])
+            plane = sums[number].reshape(shape)
+            sums[number] = cv2.sepFilter2D(plane, -1, across, across, borderType=cv2.BORDER_CONSTANT).ravel()
+        ours, theirs = Light(*(part[f] for part in light)), Filtered(*(part[f] for part in out))
+        tables = (of_neighbours, of_rest)
+        _fill_even(
+            at,
+            filtered[f],
+            edge[f],
+            ours,
+            carried[f],
+            *sums,
+            space,
+            tables,
+            window.by_amplitude,
+            theirs,
+            each[f],
+            centre[f],
+        )
     return each, centre
+
+
+@numba.njit(**FAST)
+def _fill_even(  # type: ignore[no-untyped-def]
+    at, filtered, edge, light, carried, weights, squares, spreads, space, tables, by_amplitude, out, each, centre
+):
+    """Do the work of `fill_even` for one frequency; sums over windows are (n,)."""
+    middle, kept, whole = space[len(space) // 2, len(space) // 2], space.size - 1, space.sum()
+    (of_neighbours, of_rest), step = tables, MOST_NOISE / (len(tables[0]) - 1)
+    for m in range(at.size):
+        i = at[m]
+        own = light.turn[i]
+        own2, low = own * own, min(int(own / step), len(of_rest) - 2)
+        part = own / step - low
+        share = of_neighbours[low] + part * (of_neighbours[low + 1] - of_neighbours[low])
+        rest = own2 * (of_rest[low] + part * (of_rest[low + 1] - of_rest[low]))
+        each[m] = share / weights[i]
+        mine = middle * carried[i] / weights[i]
+        centre2 = (1 - share * (1 - mine)) ** 2 * own2 + rest
+        variance = each[m] ** 2 * (squares[i] - (middle * carried[i] * own) ** 2) + centre2
+        centre[m] = np.sqrt(centre2)
+        # noise moves the mean towards the centre's own phase, as it does the shares
+        re, im = filtered[0, i], filtered[1, i]
+        size = share / np.sqrt(re * re + im * im)
+        mean = light.phasor[i] * (1 - share) + complex(re * size, im * size)
+        out.phasor[i] = mean / np.sqrt(mean.real * mean.real + mean.imag * mean.imag)
+        # noise perpendicular to a mean phasor lengthens it
+        out.amplitude[i] = filtered[2, i] * (1 + 0.5 * variance if by_amplitude else 1.0)
+        out.turned[i] = np.sqrt(variance)
+        out.spread[i] = np.sqrt(spreads[i]) / whole
+        out.left_out[i] = rest / variance
+        out.edge[i] = edge[i] + 0.5 * kept * (1 - np.exp(-own2))
+        out.edge_spread[i] = np.sqrt((kept * 6 / 16 + kept**2 / 8) * own2 * own2 + (1 + kept) * edge[i] * own2)
+        out.edge_least[i], out.edge_loose[i] = out.edge[i], out.edge_spread[i]

@@ -12,7 +12,7 @@ from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
 
-import cv2
+import numba
 import numpy as np
 from scipy import ndimage
 
@@ -22,7 +22,7 @@ from scenes.sensor.amcw import kernels, ranging
 from scenes.sensor.amcw.at_once import windows_of
 from scenes.sensor.amcw.facts import AmcwCamera, ScatterFacts, unwrap_table
 from scenes.sensor.camera import CameraConfig
-from scenes.sensor.normals import standard_normals
+from scenes.sensor.normals import FAST, standard_normals
 from scenes.sensor.unit import DecodedFrame, UnitModel, light_of, rays_of, smooth_field
 
 f4 = np.float32
@@ -46,15 +46,30 @@ def with_harmonics(signal: np.ndarray, phases: int, residual: np.ndarray) -> np.
     (f,). Square light under square demodulation correlates to a triangle: odd harmonics n of 1/n^2. N equidistant
     samples see harmonic n as the fundamental if n = +1 mod N, and as its conjugate if n = -1. Approximation: a pixel
     that sees several paths has the harmonics of their sum, not the sum of their harmonics."""
-    size = np.abs(signal)
-    direction = np.divide(signal, size, out=np.zeros_like(signal), where=size > 0)
     apart = phases if phases % 2 == 0 else 2 * phases
-    wave = direction**apart
-    alias, power = np.zeros_like(signal), np.ones_like(signal)
-    for centre in range(apart, HIGHEST_HARMONIC, apart):
-        power = power * wave
-        alias = alias + power.conj() / (centre - 1) ** 2 + power / (centre + 1) ** 2
-    return np.asarray(signal * (1 + residual[:, None, None] * alias))
+    centres = np.arange(apart, HIGHEST_HARMONIC, apart, dtype=float)
+    parts = np.stack([1 / (centres - 1) ** 2, 1 / (centres + 1) ** 2])
+    changed = np.empty(signal.shape, complex)
+    for light, share, out in zip(signal, residual, changed, strict=True):
+        _add_harmonics(light.ravel(), share, apart, parts, out.reshape(-1))
+    return changed
+
+
+@numba.njit(**FAST)
+def _add_harmonics(signal, share, apart, parts, out):  # type: ignore[no-untyped-def]
+    """Write into ``out`` (n,) the signal (n,) with harmonics of parts (2, m): of the conjugate, and of the signal."""
+    for i in range(signal.size):
+        re, im = signal[i].real, signal[i].imag
+        size = max(np.sqrt(re * re + im * im), 1e-300)
+        direction = complex(re / size, im / size)
+        wave, power, alias_re, alias_im = 1.0 + 0.0j, 1.0 + 0.0j, 0.0, 0.0
+        for _ in range(apart):
+            wave *= direction
+        for k in range(parts.shape[1]):
+            power *= wave
+            alias_re += (parts[1, k] + parts[0, k]) * power.real
+            alias_im += (parts[1, k] - parts[0, k]) * power.imag
+        out[i] = signal[i] * complex(1.0 + share * alias_re, share * alias_im)
 
 
 def scattered(image: np.ndarray, facts: ScatterFacts) -> np.ndarray:
@@ -71,11 +86,17 @@ def scattered(image: np.ndarray, facts: ScatterFacts) -> np.ndarray:
 
 def pixel_spans(lens: Lens, slopes: np.ndarray) -> np.ndarray:
     """Return the area (h, w) of slopes that pixels cover at ``slopes`` (h, w, 2), relative to a pixel on the axis."""
-    places = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1).reshape(-1, 3)
-    _, by_motion = cv2.projectPoints(places, np.zeros(3), np.zeros(3), lens.matrix, np.array(lens.distortion))
-    # derivatives of u and v by the point's x and y; they follow the three by the rotation
-    (ux, uy), (vx, vy) = np.moveaxis(by_motion.reshape(*slopes.shape[:2], 2, -1)[..., 3:5], (2, 3), (0, 1))
-    return np.asarray(lens.fx * lens.fy / np.abs(ux * vy - uy * vx))
+    k1, k2, p1, p2, k3, k4, k5, k6 = lens.distortion
+    x, y = slopes[..., 0], slopes[..., 1]
+    r2 = x**2 + y**2
+    above, below = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    radial = above / below
+    # twice the radial factor's derivative by r^2
+    grows = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / below
+    # derivatives of u / fx and v / fy by the slopes
+    ux, vy = radial + x * x * grows + 2 * p1 * y + 6 * p2 * x, radial + y * y * grows + 6 * p1 * y + 2 * p2 * x
+    both = x * y * grows + 2 * p1 * x + 2 * p2 * y
+    return np.asarray(1 / np.abs(ux * vy - both**2))
 
 
 class AmcwImager(UnitModel[AmcwCamera]):
@@ -123,7 +144,9 @@ class AmcwImager(UnitModel[AmcwCamera]):
         contrast = np.array(camera.modulation.contrast.value)[:, None, None]
         # range errors that all frames share act as a delay of the light
         turns = np.array(camera.frequencies_hz)[:, None, None] * (2 * self.static_error_m / SPEED_OF_LIGHT_AIR)
-        signal = contrast * electrons * phasor * np.exp(2j * np.pi * turns)
+        delay = np.empty(phasor.shape, complex)
+        delay.real, delay.imag = np.cos(2 * np.pi * turns), np.sin(2 * np.pi * turns)
+        signal = phasor * delay * (contrast * electrons)
         if self.config.effects.wiggling:
             signal = with_harmonics(signal, phases, np.array(camera.modulation.wiggling_residual.value))
         both_wells = electrons * intensity + self.ambient_electrons(view, intensity)
@@ -133,9 +156,11 @@ class AmcwImager(UnitModel[AmcwCamera]):
             share = np.minimum(1.0, photons.exposure_ends_electrons.value / np.maximum(both_wells, 1e-9))
         variance = both_wells / share + 2 * (photons.read_noise_electrons.value / share) ** 2
         sigma = np.sqrt(variance) if self.config.effects.noise else np.zeros_like(variance)
-        # (f, k, h, w): the samples Re(S exp(-2 pi j k / N)) of the demodulated signal S (f, h, w) at N phases
-        steps = 2 * np.pi * np.arange(phases)[None, :, None, None] / phases
-        samples = signal.real[:, None] * np.cos(steps) + signal.imag[:, None] * np.sin(steps)
+        # the samples Re(S exp(-2 pi j k / N)) of the demodulated signal S (f, h, w) at N phases
+        samples = np.empty((len(signal), phases, both_wells.size), f4)
+        units = (signal / photons.electrons_per_unit.value).reshape(len(signal), -1)
+        for k, step in enumerate(2 * np.pi * np.arange(phases) / phases):
+            samples[:, k] = units.real * np.cos(step) + units.imag * np.sin(step)
         # the largest sample that fits: the fuller well holds half of both wells' electrons and half the sample
         limit = np.full(both_wells.shape, np.inf)
         if self.config.effects.saturation:
@@ -144,7 +169,7 @@ class AmcwImager(UnitModel[AmcwCamera]):
                 room = 2 * photons.full_well_electrons.value / share - both_wells
                 limit = np.clip(room / photons.electrons_per_unit.value, 0, limit)
         return AmcwExposure(
-            (samples / photons.electrons_per_unit.value).reshape(*samples.shape[:2], -1).astype(f4),
+            samples,
             (sigma / photons.electrons_per_unit.value).ravel().astype(f4),
             limit.ravel().astype(f4),
             intensity.shape,

@@ -9,26 +9,29 @@ of the window's sum, and a neighbour's for less by c s^2. Terms of second and th
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numba
 import numpy as np
 from scipy import special
 
 from scenes.sensor.amcw.kernels import FilterSettings
-from scenes.sensor.normals import FAST
+from scenes.sensor.normals import FAST, bits_float, float_bits
 
 if TYPE_CHECKING:
     from scenes.sensor.amcw.imager import AmcwExposure
 
 DEVIATIONS = 4.5  # a limit so far away counts as never met: 3e-6 a frame for pixels just that far off
 NOISY = 0.35  # phase noise in radians above which a pixel's phase is not a normal about its mean
-LITTLE = 0.004  # c s^2 below which (c s^2)^2 is negligible (phase noise of 0.033 rad); this halves the work
 SMALLEST = 1e-12
+MOST_TURN = 1e3  # limit of the phase noise in radians, which would be too large for float32 where there is no light
+f4 = np.float32
+LEAST, REACH, SQRT_3 = f4(SMALLEST), f4(DEVIATIONS), f4(np.sqrt(3.0))
+ZERO, QUARTER, HALF, ONE, TWO, THREE, FOUR, FIVE, SIX, TEN = (f4(x) for x in (0, 0.25, 0.5, 1, 2, 3, 4, 5, 6, 10))
 
 
 class Light(NamedTuple):
-    """Each pixel before the filter, all (f, n) float64. ``phasor``: of length 1. ``amplitude``: without noise;
+    """Each pixel before the filter, all (f, n) float32. ``phasor``: complex, of length 1. ``amplitude``: without noise;
     ``bright``: with it. ``turn``: deviation of the phase in radians. ``swell``: that of the amplitude, over it."""
 
     phasor: np.ndarray
@@ -38,24 +41,8 @@ class Light(NamedTuple):
     swell: np.ndarray
 
 
-class Near(NamedTuple):
-    """A pixel's window, (k,) each. ``at``: flat indices. ``between``: exp(i t) of their phases minus its own.
-    ``weight``: in the filter, without noise. ``slopes``, ``bends``: room for derivatives. ``kept``, ``others``: indices
-    of the neighbours that count, with and without the centre. ``c``: the concentration that holds here."""
-
-    space: np.ndarray
-    at: np.ndarray
-    between: np.ndarray
-    weight: np.ndarray
-    slopes: np.ndarray
-    bends: np.ndarray
-    kept: np.ndarray
-    others: np.ndarray
-    c: float
-
-
 class Filtered(NamedTuple):
-    """Each pixel after the filter, (f, n) float64: mean ``phasor`` (complex, length 1) and ``amplitude``; ``turned``
+    """Each pixel after the filter, (f, n) float32: mean ``phasor`` (complex, length 1) and ``amplitude``; ``turned``
     and ``spread``: deviations of the phase in radians and of the amplitude. ``left_out``: share of the phase's variance
     that is not of first order; infinite if neighbours are too noisy, or if it is uncertain whether they count.
     ``edge``, ``edge_spread``: mean and deviation of the sum over neighbours of (1 - cos)/2, with those of which it is
@@ -75,306 +62,443 @@ class Filtered(NamedTuple):
 
 def unknown_filtered(frequencies: int, n: int) -> Filtered:
     """Return n pixels with unknown values."""
-    start = (1.0 + 0.0j, 0.0, np.inf, np.inf, np.inf, np.inf, np.inf, 0.0, np.inf)
-    return Filtered(*(np.full((frequencies, n), value) for value in start))
+    shape, start = (frequencies, n), (0.0, np.inf, np.inf, np.inf, np.inf, np.inf, 0.0, np.inf)
+    return Filtered(np.ones(shape, np.complex64), *(np.full(shape, value, f4) for value in start))
+
+
+LENGTHS = np.linspace(0.0, 15.0, 1501)
+RICE = np.sqrt(np.pi / 2) * (
+    (1 + LENGTHS**2 / 2) * special.ive(0, LENGTHS**2 / 4) + LENGTHS**2 / 2 * special.ive(1, LENGTHS**2 / 4)
+)
+"""Mean length, by Rice, of a vector of `LENGTHS` plus normals of deviation 1 both ways; 1e-5 between them."""
+ABREAST = 32  # pixels that a loop does side by side, in vector registers
+W = np.uint64(ABREAST)
+BETWEEN, AMPLITUDE, BRIGHT, TURN, SWAY, SIZE, WEIGHT, SLOPE, BEND, MOVED, FIELDS = (
+    W * np.uint64(row) for row in (0, 2, 3, 4, 5, 6, 7, 8, 10, 12, 13)
+)
+"""Places of a neighbour's values in the room of `_linearise`, each for `ABREAST` pixels; the imaginary part of a complex
+value lies `W` behind. exp(i t) of the neighbour's phase minus the centre's; its `Light`, and its amplitude's deviation;
+its weight by distance, 0 if it does not count, and its weight in the filter; its part in the sum, differentiated by its
+phase once and twice; the change of the sum's phase."""
+C, LIT, SURE, NOISE, FIT, *ROWS_LEFT = (W * np.uint64(row) for row in range(16))
+ROWS = tuple(ROWS_LEFT)
+"""Places of a pixel's values: the concentration, 0 if the centre is dim; whether the centre is bright; whether it is
+certain which neighbours count; the largest phase noise; whether the linear model holds; and room for sums."""
 
 
 def light_of_samples(exposure: AmcwExposure, knee: float, gains: np.ndarray) -> Light:
     """Return the light of an exposure. Each sample has its own variance, plus step^2/12 by the converter's rounding."""
-    frequencies, phases, n = exposure.means.shape
-    angle = 2 * np.pi * np.arange(phases) / phases
-    phasor = np.empty((frequencies, n), complex)
-    size, across, along = (np.empty((frequencies, n)) for _ in range(3))
-    _moments(exposure.means, exposure.sigma, knee, np.cos(angle), np.sin(angle), phasor, size, across, along)
-    scale = gains.astype(float)[:, None] * 2.0 / phases
-    bright = np.sqrt(size**2 + across**2)
-    # the mean length of a vector plus normals of equal deviation in both directions (Rice)
-    near = size < 10 * along
-    deviation = np.sqrt((across[near] ** 2 + along[near] ** 2) / 2)
-    x = (size[near] / np.maximum(deviation, SMALLEST)) ** 2 / 4
-    bright[near] = deviation * np.sqrt(np.pi / 2) * ((1 + 2 * x) * special.ive(0, x) + 2 * x * special.ive(1, x))
-    return Light(phasor, scale * size, scale * bright, across / size, along / size)
+    phases = exposure.means.shape[1]
+    angle = (2 * np.pi * np.arange(phases) / phases).astype(f4)
+    shape = len(exposure.means), exposure.sigma.size
+    light = Light(np.empty(shape, np.complex64), *(np.empty(shape, f4) for _ in range(4)))
+    scales = gains * f4(2 / phases)
+    for means, scale, *parts in zip(exposure.means, scales, *light, strict=True):
+        _moments(means, exposure.sigma, f4(knee), np.cos(angle), np.sin(angle), scale, Light(*parts))
+    near = light.swell > 0.1
+    deviation = light.amplitude[near] * np.sqrt((light.turn[near] ** 2 + light.swell[near] ** 2) / 2)
+    light.bright[near] = deviation * np.interp(light.amplitude[near] / np.maximum(deviation, SMALLEST), LENGTHS, RICE)
+    return light
 
 
 @numba.njit(**FAST)
-def _moments(means, sigma, knee, cosines, sines, phasor, size, across, along):  # type: ignore[no-untyped-def]
-    """Write direction and length of each pixel's phasor, and its deviations across and along that direction."""
-    frequencies, phases, n = means.shape
-    for f in range(frequencies):
-        for i in range(n):
-            re, im = 0.0, 0.0
-            for k in range(phases):
-                re += cosines[k] * means[f, k, i]
-                im += sines[k] * means[f, k, i]
-            length = np.sqrt(re * re + im * im)
-            if length > SMALLEST:
-                re /= length
-                im /= length
-            else:  # without light there is no direction: any will do
-                re, im, length = 1.0, 0.0, SMALLEST
-            over, beside = 0.0, 0.0
-            for k in range(phases):
-                # the companding converter's step at a sample, in knees
-                knees, step = abs(means[f, k, i]) / knee, 1.0
-                while 2.0 * step <= knees:
-                    step *= 2.0
-                variance = np.float64(sigma[i]) ** 2 + step * step / 12.0
-                over += variance * (re * sines[k] - im * cosines[k]) ** 2
-                beside += variance * (re * cosines[k] + im * sines[k]) ** 2
-            phasor[f, i] = complex(re, im)
-            size[f, i] = length
-            across[f, i] = np.sqrt(over)
-            along[f, i] = np.sqrt(beside)
+def _moments(means, sigma, knee, cosines, sines, scale, light):  # type: ignore[no-untyped-def]
+    """Fill the light (n,) of one frequency from its samples ``means`` (k, n)."""
+    sums, per_knee, size = np.empty(ROWS[-1] + W, f4), ONE / knee, np.uint64(sigma.size)
+    re, im, squares, products, others = ROWS[:5]
+    for start in range(np.uint64(0), size, W):
+        count = min(W, size - start)
+        sums[re : others + W] = ZERO
+        for k in range(len(means)):
+            c, s = cosines[k], sines[k]
+            for x in range(count):
+                # the companding converter's step at a sample: its bits without the mantissa
+                sample, noise = means[k, start + x], sigma[start + x]
+                word: Any = float_bits(abs(sample) * per_knee)
+                step = max(bits_float(word & np.uint32(0x7F800000)), ONE)
+                variance = noise * noise + step * step * f4(1 / 12)
+                sums[re + x] += c * sample
+                sums[im + x] += s * sample
+                sums[squares + x] += variance * c * c
+                sums[products + x] += variance * c * s
+                sums[others + x] += variance * s * s
+        for x in range(count):
+            # direction and length of the phasor, and its deviations across and along that direction
+            cosine, sine = sums[re + x], sums[im + x]
+            length = np.sqrt(cosine * cosine + sine * sine)
+            # without light there is no direction: any will do
+            lit, inverse = length > LEAST, ONE / max(length, LEAST)
+            cosine, sine = cosine * inverse if lit else ONE, sine * inverse if lit else ZERO
+            cc, both, ss = cosine * cosine, TWO * cosine * sine, sine * sine
+            across = ss * sums[squares + x] - both * sums[products + x] + cc * sums[others + x]
+            along = cc * sums[squares + x] + both * sums[products + x] + ss * sums[others + x]
+            i, turn = start + x, np.sqrt(max(across, ZERO)) * inverse
+            light.phasor[i], light.amplitude[i] = complex(cosine, sine), scale * max(length, LEAST)
+            light.bright[i] = light.amplitude[i] * np.sqrt(ONE + turn * turn)
+            light.turn[i], light.swell[i] = turn, np.sqrt(max(along, ZERO)) * inverse
 
 
 def linearised(
-    pixels: np.ndarray,
-    light: Light,
-    window: FilterSettings,
-    shape: tuple[int, int],
-    wild: np.ndarray,
-    lost: np.ndarray,
-    out: Filtered,
+    pixels: np.ndarray, light: Light, window: FilterSettings, shape: tuple[int, int], lost: np.ndarray, out: Filtered
 ) -> np.ndarray:
-    """Fill ``out`` at the ``pixels`` (m,) of a view of ``shape``. Return (f, m, k): the change of a pixel's phase, in
-    radians, by one deviation of each neighbour's noise. ``window``: the filter, in float64. ``wild`` and ``lost`` (n,)
-    bool: pixels whose samples may saturate, and those where they always do."""
-    moved = np.zeros((len(light.turn), len(pixels), window.space.size))
+    """Fill ``out`` at the ``pixels`` (m,) of a view of ``shape``. None of them is ``lost`` (n,) bool: always saturated.
+    Return (f, m, k) float32: the change of a pixel's phase, in radians, by one deviation of each neighbour's noise."""
+    moved = np.zeros((len(light.turn), len(pixels), window.space.size), f4)
     for f, plane in enumerate(moved):
         ours, theirs = Light(*(part[f] for part in light)), Filtered(*(part[f] for part in out))
-        _linearise(pixels, ours, window, shape, wild, lost, theirs, plane)
+        _linearise(pixels, ours, window, shape, lost, theirs, plane)
     return moved
 
 
 @numba.njit(**FAST)
-def _linearise(pixels, light, window, shape, wild, lost, out, moved):  # type: ignore[no-untyped-def]
+def _linearise(pixels, light, window, shape, lost, out, moved):  # type: ignore[no-untyped-def]
     """Do the work of `linearised` for one frequency; arrays have no first axis."""
-    k, space = window.space.size, window.space.ravel()
-    (at, kept, others), weight, between = np.empty((3, k), np.int64), np.empty(k), np.empty(k, np.complex128)
-    room = Near(space, at, between, weight, np.empty_like(between), np.empty_like(between), kept, others, 0.0)
-    for row in range(pixels.size):
-        i = pixels[row]
-        near, sure, rule_known = _look_around(i, light, window, shape, wild, lost, room)
-        noisy, edge_known = _edge_of(i, light, window, near, out)
-        _amplitude_of(i, light, window.by_amplitude, near, out)
-        out.turned[i] = np.inf
-        out.left_out[i] = np.inf
-        if sure and rule_known and not (noisy or lost[i]):
-            _moves_of(i, light, window.by_amplitude, near, out, moved[row])
-            _rest_of(i, light, window.by_amplitude, near, out, moved[row])
-        if lost[i] or not (sure and edge_known):
-            out.edge[i] = np.inf
-            out.edge_spread[i] = np.inf
+    k, of_pixels = window.space.size, np.empty(ABREAST, np.int64)
+    room, sums = np.empty(np.uint64(k) * FIELDS, f4), np.empty(ROWS[-1] + W, f4)
+    for start in range(0, pixels.size, ABREAST):
+        # the last loop may have fewer pixels: it repeats the last one
+        at = of_pixels[: min(ABREAST, pixels.size - start)]
+        for x in range(ABREAST):
+            of_pixels[x] = pixels[min(start + x, pixels.size - 1)]
+        _gather(of_pixels, light, window.space, shape, lost, room)
+        _look_around(window, k, room, sums)
+        _edge_of(at, window, k, room, sums, out)
+        _amplitude_of(at, light.phasor, window.by_amplitude, k, room, sums, out)
+        if sums[FIT : FIT + W].max() > ZERO:
+            _moves_of(at, light.phasor, window.by_amplitude, k, room, sums, out)
+            _rest_of(at, window.by_amplitude, k, room, sums, out, moved[start : start + ABREAST])
+
+
+@numba.njit(**FAST)
+def _gather(at, light, space, shape, lost, room):  # type: ignore[no-untyped-def]
+    """Fill the room with the windows of pixels ``at`` (`ABREAST`,)."""
+    (h, w), side = shape, space.shape[0]
+    half = side // 2
+    for x in range(at.size):
+        i, place = at[x], np.uint64(x)
+        top, left = i // w - half, i % w - half
+        for dy in range(side):
+            for dx in range(side):
+                row, column = top + dy, left + dx
+                inside = (row >= 0) & (row < h) & (column >= 0) & (column < w)
+                j = row * w + column if inside else i
+                between = light.phasor[j] * light.phasor[i].conjugate()
+                room[place + BETWEEN] = between.real
+                room[place + BETWEEN + W] = between.imag
+                room[place + AMPLITUDE] = light.amplitude[j]
+                room[place + BRIGHT] = light.bright[j]
+                room[place + TURN] = min(light.turn[j], MOST_TURN)
+                room[place + SWAY] = light.amplitude[j] * light.swell[j]
+                room[place + SIZE] = space[dy, dx] if inside and not lost[j] else ZERO
+                room[place + MOVED] = ZERO
+                place += FIELDS
+
+
+@numba.njit(**FAST)
+def _look_around(window, k, room, sums):  # type: ignore[no-untyped-def]
+    """Find which neighbours count, their weights, whether that is certain (`SURE`), and whether the linear model holds
+    (`FIT`): certain, and not too noisy."""
+    dim, drop_dim, middle = window.dim, window.drop_dim, np.uint64(k // 2) * FIELDS
+    for x in range(W):
+        reach, amplitude = REACH * room[middle + SWAY + x], room[middle + AMPLITUDE + x]
+        lit = amplitude - reach > dim
+        known = lit | (room[middle + BRIGHT + x] + reach < dim)
+        sums[LIT + x] = ONE if lit else ZERO
+        sums[C + x] = window.concentration if lit else ZERO
+        sums[SURE + x] = ONE if known | (not drop_dim) else ZERO
+        sums[NOISE + x] = room[middle + TURN + x]
+        sums[FIT + x] = ONE if known else ZERO
+        room[middle + WEIGHT + x] = room[middle + SIZE + x]
+    for q in range(k):
+        place = np.uint64(q) * FIELDS
+        if place == middle:
+            continue
+        for x in range(W):
+            reach, size = REACH * room[place + SWAY + x], room[place + SIZE + x]
+            if drop_dim:
+                lit = sums[LIT + x] > ZERO
+                size = ZERO if lit & (room[place + BRIGHT + x] + reach < dim) else size
+                doubtful = lit & (size > ZERO) & (room[place + AMPLITUDE + x] - reach <= dim)
+                sums[SURE + x] = ZERO if doubtful else sums[SURE + x]
+                room[place + SIZE + x] = size
+            room[place + WEIGHT + x] = size * _exp(sums[C + x] * (room[place + BETWEEN + x] - ONE))
+            sums[NOISE + x] = max(sums[NOISE + x], room[place + TURN + x] if size > ZERO else ZERO)
+    for x in range(W):
+        sums[FIT + x] = sums[FIT + x] * sums[SURE + x] if sums[NOISE + x] <= f4(NOISY) else ZERO
+
+
+@numba.njit(inline="always", **FAST)
+def _exp(x):  # type: ignore[no-untyped-def]
+    """Return the exponential of -8 <= x <= 0, to 2e-5 of its value: the sixteenth power of a series."""
+    t = x * f4(1 / 16)
+    e = ONE + t * (ONE + t * (HALF + t * (f4(1 / 6) + t * (f4(1 / 24) + t * (f4(1 / 120) + t * f4(1 / 720))))))
+    e = e * e
+    e = e * e
+    e = e * e
+    return e * e
+
+
+@numba.njit(**FAST)
+def _edge_of(at, window, k, room, sums, out):  # type: ignore[no-untyped-def]
+    """Write the edge sum's mean, deviation and bounds."""
+    dim, dim_edges, middle = window.dim, window.dim_edges, np.uint64(k // 2) * FIELDS
+    mean, variance, sines, cosines, loose, counted, doubtful, longest = ROWS[:8]
+    sums[mean : longest + W + W] = ZERO
+    for q in range(k):
+        place = np.uint64(q) * FIELDS
+        if place == middle:
+            continue
+        for x in range(W):
+            turn, own = room[place + TURN + x], room[middle + TURN + x]
+            re, im, reach = room[place + BETWEEN + x], room[place + BETWEEN + W + x], REACH * room[place + SWAY + x]
+            counts = (room[place + SIZE + x] > ZERO) & (dim_edges | (room[place + BRIGHT + x] + reach >= dim))
+            certain = counts & (dim_edges | (room[place + AMPLITUDE + x] - reach > dim))
+            one, sure = ONE if counts else ZERO, ONE if certain else ZERO
+            turn2, own2 = turn * turn, own * own
+            sums[mean + x] += one * HALF * (ONE - re * max(ONE - HALF * (turn2 + own2), ZERO))
+            sums[sines + x] += one * HALF * im
+            sums[cosines + x] += one * QUARTER * re
+            across, along = HALF * im * turn, QUARTER * re
+            sums[variance + x] += one * (across * across + along * along * TWO * turn2 * (turn2 + TWO * own2))
+            sums[doubtful + x] += one - sure
+            sums[counted + x] += sure
+            # a phase's mean resultant length is concave in 1 / turn, so its slope at 0, sqrt(pi / 8), bounds it
+            length = sure * min(ONE, f4(0.6267) / max(turn, f4(1e-9)))
+            sums[longest + x] += re * length
+            sums[longest + W + x] += im * length
+            # (1 - cos)/2 of any phase scatters no more than that of a uniform one, 1/8; of a known phase, by half its
+            # noise
+            sums[loose + x] += sure * (QUARTER * turn2 if turn < f4(NOISY) else f4(0.125))
+    for x in range(at.size):
+        i, own, doubt = at[x], room[middle + TURN + x], sums[doubtful + x]
+        spread = np.sqrt(sums[variance + x] + (sums[sines + x] * own) ** 2 + 2.0 * (sums[cosines + x] * own * own) ** 2)
+        # ``edge`` and its deviation are right if no neighbour counts, or none is too noisy
+        known = sums[counted + x] + doubt == 0 or sums[NOISE + x] <= NOISY
+        sure = sums[SURE + x] > 0
+        out.edge[i] = sums[mean + x] if known and sure else np.inf
+        out.edge_spread[i] = spread if known and sure else np.inf
+        if known and doubt == 0:
+            out.edge_least[i], out.edge_loose[i] = sums[mean + x], spread
+        else:
+            # the centre's own noise turns it at most that far or, where that is large, to any angle
+            re, im = sums[longest + x], sums[longest + W + x]
+            away = max(abs(np.arctan2(im, re)) - DEVIATIONS * own, 0.0) if own < NOISY else 0.0
+            out.edge_least[i] = 0.5 * (sums[counted + x] - np.sqrt(re * re + im * im) * np.cos(away))
+            out.edge_loose[i] = np.sqrt(sums[loose + x])
         if not sure:
             out.edge_least[i] = 0.0
 
 
 @numba.njit(**FAST)
-def _look_around(i, light, window, shape, wild, lost, near):  # type: ignore[no-untyped-def]
-    """Return the window, and whether it is certain which neighbours count and if the centre is bright."""
-    h, w = shape
-    side = window.space.shape[0]
-    half = side // 2
-    y, x = i // w, i % w
-    reach = DEVIATIONS * light.amplitude[i] * light.swell[i]
-    is_bright = light.amplitude[i] - reach > window.dim
-    rule_known = is_bright or light.bright[i] + reach < window.dim
-    sure = not wild[i] and (rule_known or not window.drop_dim)
-    c, kept, others = window.concentration if is_bright else 0.0, 0, 0
-    for q in range(side * side):
-        near.at[q] = -1
-        v, u = y + q // side - half, x + q % side - half
-        if v < 0 or v >= h or u < 0 or u >= w:
-            continue
-        j = v * w + u
-        sure = sure and not wild[j]
-        if lost[j]:
-            continue
-        if window.drop_dim and is_bright and j != i:
-            reach = DEVIATIONS * light.amplitude[j] * light.swell[j]
-            if light.bright[j] + reach < window.dim:
-                continue
-            sure = sure and light.amplitude[j] - reach > window.dim
-        between = light.phasor[j] * light.phasor[i].conjugate()
-        near.at[q] = j
-        near.between[q] = between
-        near.weight[q] = near.space[q] * (np.exp(c * (between.real - 1.0)) if j != i else 1.0)
-        near.kept[kept], near.others[others] = q, q
-        kept, others = kept + 1, others + (j != i)
-    room = near.space, near.at, near.between, near.weight, near.slopes, near.bends
-    return Near(*room, near.kept[:kept], near.others[:others], c), sure, rule_known
-
-
-@numba.njit(**FAST)
-def _edge_of(i, light, window, near, out):  # type: ignore[no-untyped-def]
-    """Write the edge sum's mean, deviation and bounds. Return whether the window is too noisy for mean and deviation,
-    and whether they are right: no neighbour counts, or none is too noisy."""
-    own = light.turn[i]
-    noisy = own > NOISY
-    mean, variance, sines, cosines = 0.0, 0.0, 0.0, 0.0
-    longest, loose = 0.0j, 0.0
-    counted, doubtful = 0, 0
-    for q in near.others:
-        j, between = near.at[q], near.between[q]
-        turn = light.turn[j]
-        noisy = noisy or turn > NOISY
-        reach = 0.0 if window.dim_edges else DEVIATIONS * light.amplitude[j] * light.swell[j]
-        if not window.dim_edges and light.bright[j] + reach < window.dim:
-            continue
-        shrunk = 1.0 - 0.5 * (turn * turn + own * own)
-        mean += 0.5 * (1.0 - between.real * max(shrunk, 0.0))
-        sines += 0.5 * between.imag
-        cosines += 0.25 * between.real
-        variance += (0.5 * between.imag * turn) ** 2
-        variance += (0.25 * between.real) ** 2 * (2.0 * turn * turn * (turn * turn + 2.0 * own * own))
-        if not window.dim_edges and light.amplitude[j] - reach <= window.dim:
-            doubtful += 1
-            continue
-        counted += 1
-        # a phase's mean resultant length is concave in 1 / turn, so its slope at 0, sqrt(pi / 8), bounds it
-        longest += between * min(1.0, 0.6267 / max(turn, 1e-9))
-        # (1 - cos)/2 of any phase scatters no more than that of a uniform one, 1/8; of a known phase, by half its noise
-        loose += min(0.125, 0.25 * turn * turn) if turn < NOISY else 0.125
-    out.edge[i] = mean
-    out.edge_spread[i] = np.sqrt(variance + (sines * own) ** 2 + 2.0 * (cosines * own * own) ** 2)
-    known = counted + doubtful == 0 or not noisy
-    # the centre's own noise turns it at most that far or, where that is large, to any angle
-    away = max(abs(np.angle(longest)) - DEVIATIONS * own, 0.0) if own < NOISY else 0.0
-    exact = known and doubtful == 0
-    out.edge_least[i] = mean if exact else 0.5 * (counted - abs(longest) * np.cos(away))
-    out.edge_loose[i] = out.edge_spread[i] if exact else np.sqrt(loose)
-    return noisy, known
-
-
-@numba.njit(**FAST)
-def _amplitude_of(i, light, by_amplitude, near, out):  # type: ignore[no-untyped-def]
+def _amplitude_of(at, phasor, by_amplitude, k, room, sums, out):  # type: ignore[no-untyped-def]
     """Write the filtered amplitude and its deviation, and the filtered phasor if noise leaves the phases unchanged."""
-    total, c = 0.0j, near.c
-    weights, amplitudes, spread = 0.0, 0.0, 0.0
-    for q in near.kept:
-        j, between = near.at[q], near.between[q]
-        variance = 0.0 if j == i else light.turn[j] ** 2 + light.turn[i] ** 2
-        curved = (c * between.imag) ** 2 - c * between.real
-        mean = near.weight[q] * (1.0 + 0.5 * min(variance, 0.25) * curved)
-        weights += mean
-        amplitudes += mean * light.bright[j]
-        # noise across lengthens a phasor by what it takes from its mean
-        total += mean * light.amplitude[j] * between
-        spread += (mean * light.amplitude[j] * light.swell[j]) ** 2
-    weights = max(weights, SMALLEST)
-    out.amplitude[i] = (abs(total) if by_amplitude else amplitudes) / weights
-    out.phasor[i] = total * light.phasor[i] / max(abs(total), SMALLEST)
+    middle = np.uint64(k // 2) * FIELDS
+    weights, amplitudes, spread, common, size, total = ROWS[:6]
+    sums[weights : total + W + W] = ZERO
+    for q in range(k):
+        place = np.uint64(q) * FIELDS
+        other = ZERO if place == middle else ONE
+        for x in range(W):
+            c, turn, own = sums[C + x], room[place + TURN + x], room[middle + TURN + x]
+            re, im = room[place + BETWEEN + x], room[place + BETWEEN + W + x]
+            variance = other * min(turn * turn + own * own, QUARTER)
+            mean = room[place + WEIGHT + x] * (ONE + HALF * variance * (c * im * c * im - c * re))
+            sums[weights + x] += mean
+            sums[amplitudes + x] += mean * room[place + BRIGHT + x]
+            # noise across lengthens a phasor by what it takes from its mean
+            sums[total + x] += mean * room[place + AMPLITUDE + x] * re
+            sums[total + W + x] += mean * room[place + AMPLITUDE + x] * im
+            swayed = mean * room[place + SWAY + x]
+            sums[spread + x] += swayed * swayed
+    for x in range(W):
+        re, im, whole = sums[total + x], sums[total + W + x], max(sums[weights + x], LEAST)
+        length = np.sqrt(re * re + im * im)
+        sums[size + x] = max(length, LEAST)
+        sums[weights + x] = whole
+        sums[amplitudes + x] = (length if by_amplitude else sums[amplitudes + x]) / whole
     # noise of phases changes weights and how phasors add up: its variance, times the squared sum of weights
-    along = total.conjugate() / max(abs(total), SMALLEST)
-    common = 0.0
-    for q in near.others:
-        j, between, weight = near.at[q], near.between[q], near.weight[q]
-        change = -c * between.imag * weight * (light.bright[j] - out.amplitude[i])
-        if by_amplitude:
-            value = weight * light.amplitude[j] * between * complex(-c * between.imag, 1.0)
-            change = (along * value).real + c * between.imag * weight * out.amplitude[i]
-        spread += (change * min(light.turn[j], 0.5)) ** 2
-        common += change
-    out.spread[i] = np.sqrt(spread + (common * min(light.turn[i], 0.5)) ** 2) / weights
-
-
-@numba.njit(inline="always", **FAST)
-def _turned(c, between, v):  # type: ignore[no-untyped-def]
-    """Return F, F' and F'' at the angle t whose exp(i t) is ``between``."""
-    cosine = c * between.real
-    sine = c * between.imag
-    value = np.exp(cosine - c) * between
-    # derivatives of ln F: g, then -cosine, sine, cosine, -sine
-    g = complex(-sine, 1.0)
-    g2 = g * g
-    second = g2 - cosine
-    third = g * (g2 - 3.0 * cosine) + sine
-    if c * v < LITTLE:
-        return value * (1.0 + 0.5 * v * second), value * (g + 0.5 * v * third), value * second
-    fourth = g2 * (g2 - 6.0 * cosine) + 4.0 * g * sine + 3.0 * cosine * cosine + cosine
-    fifth = g * (g2 * (g2 - 10.0 * cosine) + 15.0 * cosine * cosine + 5.0 * cosine)
-    fifth += 10.0 * sine * (g2 - cosine) - sine
-    mean = value * (1.0 + 0.5 * v * (second + 0.25 * v * fourth))
-    first = value * (g + 0.5 * v * (third + 0.25 * v * fifth))
-    return mean, first, value * (second + 0.5 * v * fourth)
-
-
-@numba.njit(**FAST)
-def _moves_of(i, light, by_amplitude, near, out, moved):  # type: ignore[no-untyped-def]
-    """Write the mean phasor, and into ``moved`` (k,) the change of its phase by each neighbour's phase."""
-    own = light.turn[i]
-    little = near.c * own * own < LITTLE
-    far = own if little else np.sqrt(3.0) * own
-    phasor = 0.0j
-    for node in range(2 if little else 3):
-        away = far if node == 0 else (-far if node == 1 else 0.0)
-        share = 0.5 if little else (2.0 / 3.0 if node == 2 else 1.0 / 6.0)
-        turn = complex(np.cos(away), np.sin(away))
-        total = 0.0j
-        for q in near.kept:
-            j, size = near.at[q], near.space[q]
+    for q in range(k):
+        place = np.uint64(q) * FIELDS
+        if place == middle:
+            continue
+        for x in range(W):
+            re, im, weight = room[place + BETWEEN + x], room[place + BETWEEN + W + x], room[place + WEIGHT + x]
+            slope = sums[C + x] * im
             if by_amplitude:
-                # a phasor with noise across is longer: only with that does a cos t keep its mean
-                size *= light.amplitude[j] * (1.0 + 0.5 * light.turn[j] ** 2)
-            if j == i:
-                total += size
-                continue
-            value, first, second = _turned(near.c, near.between[q] * turn.conjugate(), light.turn[j] ** 2)
-            total += size * value
-            near.slopes[q] = size * first
-            near.bends[q] = size * second
-        inverse = _inverse(total)
-        squares = 0.0j
-        for q in near.others:
-            step = near.slopes[q] * inverse * light.turn[near.at[q]]
-            squares += step * step
-        for q in near.others:
-            # E[d arg S], with S and its derivative moving together: d^3 ln S has 2 S'^3 / S^3 and -3 S' S'' / S^2
-            own_turn = light.turn[near.at[q]]
-            slope = near.slopes[q] * inverse
-            slope *= 1.0 + squares - near.bends[q] * inverse * own_turn**2
-            moved[q] += share * slope.imag * own_turn
-        # E[arg S] = arg E[S] - Im(E[dS^2] / S^2) / 2
-        phasor += share * total * abs(inverse) * turn * complex(1.0, -0.5 * squares.imag)
-    out.phasor[i] = phasor * light.phasor[i] / max(abs(phasor), SMALLEST)
-
-
-@numba.njit(**FAST)
-def _rest_of(i, light, by_amplitude, near, out, moved):  # type: ignore[no-untyped-def]
-    """Write the phase's deviation, and the share of its variance that is not of first order in phases."""
-    own2, c, values = light.turn[i] * light.turn[i], near.c, near.slopes
-    total = 0.0j
-    for q in near.kept:
-        values[q] = near.weight[q] * (light.amplitude[near.at[q]] if by_amplitude else 1.0) * near.between[q]
-        total += values[q]
-    inverse = _inverse(total)
-    common, bends, rest, variance = 0.0, 0.0, 0.0, 0.0
-    for q in near.others:
-        j, value = near.at[q], values[q] * inverse
-        turn2 = light.turn[j] * light.turn[j]
-        cosine, g = c * near.between[q].real, complex(-c * near.between[q].imag, 1.0)
-        bend = (value * (g * g - cosine)).imag
-        third = (value * (g * (g * g - 3.0 * cosine) - g.real)).imag
-        bends += bend
-        rest += bend * bend * turn2 * (0.5 * turn2 + own2)
-        rest += third * third * turn2 * turn2 * (turn2 + 3.0 * own2) / 6.0
-        common += moved[q] / max(light.turn[j], SMALLEST)
-        if by_amplitude:
-            swollen = value.imag * light.swell[j]
-            moved[q] = np.copysign(np.sqrt(moved[q] * moved[q] + swollen * swollen), moved[q])
-        variance += moved[q] * moved[q]
-    rest += 0.5 * bends * bends * own2 * own2
-    # terms of higher order depend most on the centre, which is in all differences
-    centre2 = (1.0 - common) * (1.0 - common) * own2 + rest
-    moved[near.at.size // 2] = np.sqrt(centre2)
-    out.turned[i] = np.sqrt(variance + centre2)
-    if by_amplitude:
-        # noise across a mean phasor lengthens it
-        out.amplitude[i] *= 1.0 + 0.5 * (variance + centre2)
-    out.left_out[i] = rest / max(variance + centre2, SMALLEST)
+                value_re, value_im = -slope * re - im, re - slope * im
+                along = sums[total + x] * value_re + sums[total + W + x] * value_im
+                change = weight * (room[place + AMPLITUDE + x] * along / sums[size + x] + slope * sums[amplitudes + x])
+            else:
+                change = -slope * weight * (room[place + BRIGHT + x] - sums[amplitudes + x])
+            moved = change * min(room[place + TURN + x], HALF)
+            sums[spread + x] += moved * moved
+            sums[common + x] += change
+    for x in range(at.size):
+        i, own = at[x], sums[common + x] * min(room[middle + TURN + x], HALF)
+        out.amplitude[i] = sums[amplitudes + x]
+        out.phasor[i] = complex(sums[total + x], sums[total + W + x]) * phasor[i] / sums[size + x]
+        out.spread[i] = np.sqrt(sums[spread + x] + own * own) / sums[weights + x]
 
 
 @numba.njit(inline="always", **FAST)
-def _inverse(z):  # type: ignore[no-untyped-def]
-    """Return 1 / z, 0 where z is 0."""
-    return z.conjugate() / max(z.real * z.real + z.imag * z.imag, SMALLEST**2)
+def _turned(c, re, im, v):  # type: ignore[no-untyped-def]
+    """Return F, F' and F'', real and imaginary parts, at the angle t whose exp(i t) is (re, im)."""
+    cosine, s = c * re, c * im
+    e = _exp(cosine - c)
+    # the derivatives of ln F are g = i - s, then -cosine, s, cosine, -s; p + q i is g^2
+    p, q = s * s - ONE, -TWO * s
+    a, b = p - cosine, q
+    third_re, third_im = s * (FOUR + THREE * cosine - s * s), p - THREE * cosine + TWO * s * s
+    fourth_re = p * (p - SIX * cosine) - q * q - FOUR * s * s + THREE * cosine * cosine + cosine
+    fourth_im = q * (TWO * p - SIX * cosine) + FOUR * s
+    inner_re = p * (p - TEN * cosine) - q * q + FIVE * cosine * (THREE * cosine + ONE)
+    inner_im = q * (TWO * p - TEN * cosine)
+    fifth_re = TEN * s * (p - cosine) - s - s * inner_re - inner_im
+    fifth_im = inner_re - s * inner_im - TEN * TWO * s * s
+    half = HALF * v
+    quarter = HALF * half
+    mean_re, mean_im = ONE + half * (a + quarter * fourth_re), half * (b + quarter * fourth_im)
+    first_re = half * (third_re + quarter * fifth_re) - s
+    first_im = ONE + half * (third_im + quarter * fifth_im)
+    second_re, second_im = a + half * fourth_re, b + half * fourth_im
+    re, im = e * re, e * im
+    return (
+        re * mean_re - im * mean_im, re * mean_im + im * mean_re,
+        re * first_re - im * first_im, re * first_im + im * first_re,
+        re * second_re - im * second_im, re * second_im + im * second_re,
+    )  # fmt: skip
+
+
+@numba.njit(**FAST)
+def _moves_of(at, phasor, by_amplitude, k, room, sums, out):  # type: ignore[no-untyped-def]
+    """Write the mean phasor, and into the room the change of its phase by each neighbour's phase."""
+    middle = np.uint64(k // 2) * FIELDS
+    node, inverse, squares, total, mean = ROWS[:10:2]
+    sums[mean : mean + W + W] = ZERO
+    for number in range(3):
+        # without the centre's noise, then sqrt(3) deviations of it either way
+        share = f4(1 / 6) if number else f4(2 / 3)
+        for x in range(W):
+            away = SQRT_3 * room[middle + TURN + x]
+            cosine, sine = (sums[node + x], -sums[node + W + x]) if number == 2 else (np.cos(away), np.sin(away))
+            sums[node + x], sums[node + W + x] = (cosine, sine) if number else (ONE, ZERO)
+        sums[squares : squares + W + W] = ZERO
+        sums[total : total + W + W] = ZERO
+        for q in range(k):
+            place = np.uint64(q) * FIELDS
+            for x in range(W):
+                # a phasor with noise across is longer: only with that does a cos t keep its mean
+                turn2 = room[place + TURN + x] * room[place + TURN + x]
+                longer = room[place + AMPLITUDE + x] * (ONE + HALF * turn2) if by_amplitude else ONE
+                size = room[place + SIZE + x] * longer
+                if place == middle:
+                    sums[total + x] += size
+                else:
+                    re, im = room[place + BETWEEN + x], room[place + BETWEEN + W + x]
+                    cosine, sine = sums[node + x], sums[node + W + x]
+                    here_re, here_im = re * cosine + im * sine, im * cosine - re * sine
+                    v_re, v_im, s_re, s_im, b_re, b_im = _turned(sums[C + x], here_re, here_im, turn2)
+                    sums[total + x] += size * v_re
+                    sums[total + W + x] += size * v_im
+                    room[place + SLOPE + x], room[place + SLOPE + W + x] = size * s_re, size * s_im
+                    room[place + BEND + x], room[place + BEND + W + x] = size * b_re, size * b_im
+        for x in range(W):
+            re, im = sums[total + x], sums[total + W + x]
+            size = max(re * re + im * im, LEAST * LEAST)
+            sums[inverse + x], sums[inverse + W + x] = re / size, -im / size
+        for q in range(k):
+            place = np.uint64(q) * FIELDS
+            if place == middle:
+                continue
+            for x in range(W):
+                turn, re, im = room[place + TURN + x], sums[inverse + x], sums[inverse + W + x]
+                a, b = room[place + SLOPE + x], room[place + SLOPE + W + x]
+                slope_re, slope_im = a * re - b * im, a * im + b * re
+                room[place + SLOPE + x], room[place + SLOPE + W + x] = slope_re, slope_im
+                sums[squares + x] += turn * turn * (slope_re * slope_re - slope_im * slope_im)
+                sums[squares + W + x] += turn * turn * TWO * slope_re * slope_im
+        for q in range(k):
+            place = np.uint64(q) * FIELDS
+            if place == middle:
+                continue
+            for x in range(W):
+                # E[d arg S], with S and its derivative moving together: d^3 ln S has 2 S'^3 / S^3 and -3 S' S'' / S^2
+                turn2, re, im = (
+                    room[place + TURN + x] * room[place + TURN + x],
+                    sums[inverse + x],
+                    sums[inverse + W + x],
+                )
+                a, b = room[place + BEND + x], room[place + BEND + W + x]
+                more_re = ONE + sums[squares + x] - turn2 * (a * re - b * im)
+                more_im = sums[squares + W + x] - turn2 * (a * im + b * re)
+                slope = room[place + SLOPE + x] * more_im + room[place + SLOPE + W + x] * more_re
+                room[place + MOVED + x] += share * slope
+        for x in range(W):
+            # E[arg S] = arg E[S] - Im(E[dS^2] / S^2) / 2
+            re, im, cosine, sine = sums[total + x], sums[total + W + x], sums[node + x], sums[node + W + x]
+            size = share / max(np.sqrt(re * re + im * im), LEAST)
+            less = HALF * sums[squares + W + x]
+            re, im = size * (re + im * less), size * (im - re * less)
+            sums[mean + x] += re * cosine - im * sine
+            sums[mean + W + x] += re * sine + im * cosine
+    for x in range(at.size):
+        if sums[FIT + x] > ZERO:
+            re, im = sums[mean + x], sums[mean + W + x]
+            out.phasor[at[x]] = complex(re, im) * phasor[at[x]] / max(np.sqrt(re * re + im * im), LEAST)
+
+
+@numba.njit(**FAST)
+def _rest_of(at, by_amplitude, k, room, sums, out, moved):  # type: ignore[no-untyped-def]
+    """Write the phase's deviation, the share of its variance that is not of first order in phases, and its changes."""
+    middle = np.uint64(k // 2) * FIELDS
+    inverse, _, total, _, common, bends, rest, variance = ROWS[:8]
+    sums[total : variance + W] = ZERO
+    for q in range(k):
+        place = np.uint64(q) * FIELDS
+        for x in range(W):
+            size = room[place + WEIGHT + x] * (room[place + AMPLITUDE + x] if by_amplitude else ONE)
+            sums[total + x] += size * room[place + BETWEEN + x]
+            sums[total + W + x] += size * room[place + BETWEEN + W + x]
+    for x in range(W):
+        re, im = sums[total + x], sums[total + W + x]
+        size = max(re * re + im * im, LEAST * LEAST)
+        sums[inverse + x], sums[inverse + W + x] = re / size, -im / size
+    for q in range(k):
+        place = np.uint64(q) * FIELDS
+        if place == middle:
+            continue
+        for x in range(W):
+            c, turn, own = sums[C + x], room[place + TURN + x], room[middle + TURN + x]
+            re, im, weight = room[place + BETWEEN + x], room[place + BETWEEN + W + x], room[place + WEIGHT + x]
+            cosine, s, turn2, own2 = c * re, c * im, turn * turn, own * own
+            here_re = weight * (re * sums[inverse + x] - im * sums[inverse + W + x])
+            here_im = weight * (re * sums[inverse + W + x] + im * sums[inverse + x])
+            longer = room[place + AMPLITUDE + x] if by_amplitude else ONE
+            bend = longer * (here_im * (s * s - ONE - cosine) - here_re * TWO * s)
+            third_re, third_im = s * (FOUR + THREE * cosine - s * s), THREE * (s * s - cosine) - ONE
+            third = longer * (here_re * third_im + here_im * third_re)
+            sums[bends + x] += bend
+            higher = bend * bend * turn2 * (HALF * turn2 + own2)
+            sums[rest + x] += higher + third * third * turn2 * turn2 * (turn2 + THREE * own2) * f4(1 / 6)
+            change = room[place + MOVED + x]
+            sums[common + x] += change
+            change = change * turn
+            swollen = here_im * room[place + SWAY + x] if by_amplitude else ZERO
+            change = np.copysign(np.sqrt(change * change + swollen * swollen), change)
+            room[place + MOVED + x] = change
+            sums[variance + x] += change * change
+    for x in range(at.size):
+        if sums[FIT + x] == ZERO:
+            continue
+        i, own2 = at[x], room[middle + TURN + x] ** 2
+        # terms of higher order depend most on the centre, which is in all differences
+        higher = sums[rest + x] + 0.5 * (sums[bends + x] * own2) ** 2
+        centre2 = (1.0 - sums[common + x]) ** 2 * own2 + higher
+        room[middle + MOVED + x] = np.sqrt(centre2)
+        for q in range(k):
+            moved[x, q] = room[np.uint64(q) * FIELDS + MOVED + np.uint64(x)]
+        both = sums[variance + x] + centre2
+        out.turned[i], out.left_out[i] = np.sqrt(both), higher / max(both, SMALLEST)
+        if by_amplitude:
+            # noise across a mean phasor lengthens it
+            out.amplitude[i] *= 1.0 + 0.5 * both
