@@ -2,7 +2,7 @@
 `REFERENCE_FRAMES` are the reference: mostly bad first frames, or a moving camera, are not corrected."""
 
 from collections.abc import Iterator, Sequence
-from itertools import chain, islice
+from itertools import chain, combinations, islice
 from typing import Literal
 
 import numba
@@ -20,6 +20,7 @@ SAMPLED_PIXELS = 4096
 """Pixels on which a frame is judged: they show a changed fraction of 5 % to 0.35 %, and a shift to 0.02 sigma."""
 CORRELATED_PIXELS = 25  # pixels that share one noise value in the worst case: a depth engine with a 5x5 filter
 
+MOST_INSERTED = 16  # most samples of a pixel that insertion sorts as fast as other ways
 NOT_FINITE = int(Reason.NOT_FINITE)
 
 
@@ -135,7 +136,10 @@ class FrameSums:
         self.sample = usable[:: max(1, -(-len(usable) // SAMPLED_PIXELS))]
         sampled = stack[:, self.sample]
         # the frame closest in range to the others (the earliest on a tie), and each frame's shift against it
-        between = np.array([[_median_finite(a - b) for b in sampled] for a in sampled])
+        between = np.diag(np.where(np.isfinite(sampled).any(axis=1), 0.0, np.nan))
+        for i, j in combinations(range(len(sampled)), 2):
+            between[i, j] = _median_finite(sampled[i] - sampled[j])
+            between[j, i] = -between[i, j]
         distances = np.sort(np.where(np.isfinite(between), np.abs(between), np.inf), axis=1)
         middle = int(np.argmin(distances[:, len(sampled) // 2]))
         # robust standard deviation of one frame's z, at least that of rounding
@@ -153,13 +157,11 @@ class FrameSums:
         # the reference frames differ less than others, because they determined the judged pixels
         usual = [self._change(row)[1] for row in agreeing]
         self.fraction = min(config.disturbed_fraction + 1.5 * float(np.median(usual)) if usual else 1.0, 1.0)
-        self.gate: np.ndarray | None = None
-        if config.method == "clipped":
-            self.gate = np.full(z.shape, np.inf, dtype=np.float32)
-            if len(agreeing) > 2:
-                # some sigmas of the frame or, if larger, of the pixel itself
-                own = pixel_medians(np.abs(agreeing - z)) / np.float32(0.6745)
-                self.gate = (config.clip_sigmas * np.fmax(own, np.float32(sigma))).astype(np.float32)
+        self.gate = np.full(z.shape, np.inf, dtype=np.float32)
+        if config.method == "clipped" and len(agreeing) > 2:
+            # some sigmas of the frame or, if larger, of the pixel itself
+            own = pixel_medians(np.abs(agreeing - z)) / np.float32(0.6745)
+            self.gate = (config.clip_sigmas * np.fmax(own, np.float32(sigma))).astype(np.float32)
         return z.size
 
     def _change(self, z_m: np.ndarray) -> tuple[float, float]:
@@ -206,15 +208,14 @@ class FrameSums:
                 raise UserError(what, legal=f"up to {kept} frames", fix=fix)
             self.stack.append(z.astype(np.float32))
         self.frames += 1
-        gate = np.full(1, np.nan, np.float32) if self.gate is None else self.gate
         sums = self.offset, self.count, self.total, self.squares, self.reasons
-        used = _added(z, frame.reason.ravel(), gate, *sums)
+        used = _added(z, frame.reason.ravel(), self.gate, *sums)
         # further channels, over the samples that depth uses
         for name, values, width in (("xy", frame.xy_m, 2), ("amplitude", frame.amplitude, 1)):
             if values is not None:
-                empty = np.zeros((z.size, width)), np.zeros((z.size, width), dtype=np.int32)
-                total, count = self.channels.setdefault(name, empty)
-                _add_where(values.reshape(-1, width), used, total, count)
+                if name not in self.channels:
+                    self.channels[name] = np.zeros(z.size * width), np.zeros(z.size * width, dtype=np.int32)
+                _add_where(values.ravel(), used if width == 1 else np.repeat(used, width), *self.channels[name])
         if frame.rgb is not None:
             self.rgb_total = frame.rgb.astype(np.uint32) if self.rgb_total is None else self.rgb_total + frame.rgb
             self.rgb_frames += 1
@@ -228,23 +229,21 @@ class FrameSums:
             fix = "check the files, their unit and the camera's mode"
             raise UserError(what, legal="at least one frame with valid depth", fix=fix)
         with np.errstate(invalid="ignore", divide="ignore"):
-            z = self.offset + self.total / count
-            variance = (self.squares - self.total**2 / count) / (count - 1)
             means = {name: total / known for name, (total, known) in self.channels.items()}
-        if self.config.method == "median":
-            z = pixel_medians(np.stack(self.stack)).astype(np.float64)
-        z = z.reshape(self.shape)
         if source.slopes is None and "xy" not in means:
             raise ValueError("a source without slopes must give each frame its xy_m")
-        xy = means["xy"].reshape(*self.shape, 2) if source.slopes is None else source.slopes * z[..., None]
+        middle = pixel_medians(np.stack(self.stack)).astype(np.float64) if self.config.method == "median" else None
+        across = means["xy"].reshape(-1, 2) if source.slopes is None else source.slopes.reshape(-1, 2)
+        sums = self.offset, count, self.total, self.squares
+        points_m, variance = _points(*sums, middle, across, source.slopes is not None)
         never = np.flatnonzero(count == 0)
         reason = np.zeros(count.shape, dtype=np.uint8)
         reason[never] = np.argmax(self.reasons[:, never], axis=0)
         return Cloud(
-            points_m=np.concatenate([xy, z[..., None]], axis=-1),
+            points_m=points_m.reshape(*self.shape, 3),
             reason=reason.reshape(self.shape),
             count=count.reshape(self.shape).copy(),
-            variance_m2=np.where(count > 1, np.maximum(variance, 0.0), np.nan).reshape(self.shape),
+            variance_m2=variance.reshape(self.shape),
             region=source.region,
             z_step_m=source.z_step_m,
             n_frames=self.frames,
@@ -260,32 +259,48 @@ class FrameSums:
 def _added(  # type: ignore[no-untyped-def]
     z, reason, gate, offset, count, total, squares, reasons
 ):
-    """Add a frame's z (n,) minus the ``offset`` to the sums. Return (n,) bool where it counts: within the ``gate``
-    (n,); NaN, for a pixel or for all, means no gate."""
-    used = np.zeros(len(z), np.bool_)
+    """Add a frame's z (n,) minus the ``offset`` to the sums. Return (n,) bool where it counts: within the ``gate``."""
+    used = np.empty(len(z), np.bool_)
     for i in range(len(z)):
-        if not np.isfinite(z[i]):
-            reasons[reason[i] if reason[i] > 0 else NOT_FINITE, i] += 1
-            continue
-        if np.isnan(offset[i]):
-            offset[i] = z[i]
         deviation = z[i] - offset[i]
-        if abs(deviation) > gate[i if len(gate) > 1 else 0]:
-            continue
-        used[i] = True
-        count[i] += 1
+        # neither comparison holds for NaN, of z or of the offset
+        used[i] = (abs(deviation) < np.inf) & (abs(deviation) <= gate[i])
+        deviation = deviation if used[i] else 0.0
+        count[i] += used[i]
         total[i] += deviation
         squares[i] += deviation * deviation
+    for i in range(len(z)):
+        if used[i]:
+            continue
+        if not np.isfinite(z[i]):
+            reasons[reason[i] if reason[i] > 0 else NOT_FINITE, i] += 1
+        elif np.isnan(offset[i]):
+            offset[i], used[i] = z[i], True
+            count[i] += 1
     return used
+
+
+@numba.njit(**PLAIN)
+def _points(offset, count, total, squares, middle, across, slopes):  # type: ignore[no-untyped-def]
+    """Return mean points (n, 3) and the variance (n,) of z, NaN where there are no samples or fewer than two. Medians
+    (n,) replace the mean z if ``middle`` is not None. ``across`` (n, 2): x and y, or their ``slopes``."""
+    points, variance = np.empty((len(count), 3)), np.empty(len(count))
+    for i in range(len(count)):
+        n = count[i]
+        mean = total[i] / n if n > 0 else np.nan
+        z = offset[i] + mean if middle is None else middle[i]
+        scale = z if slopes else 1.0
+        points[i, 0], points[i, 1], points[i, 2] = scale * across[i, 0], scale * across[i, 1], z
+        variance[i] = max((squares[i] - total[i] ** 2 / n) / (n - 1), 0.0) if n > 1 else np.nan
+    return points, variance
 
 
 @numba.njit(**PLAIN)
 def _add_where(values: np.ndarray, used: np.ndarray, total: np.ndarray, count: np.ndarray) -> None:
     for i in range(len(values)):
-        for k in range(values.shape[1]):
-            if used[i] and np.isfinite(values[i, k]):
-                total[i, k] += values[i, k]
-                count[i, k] += 1
+        counts = used[i] & np.isfinite(values[i])
+        total[i] += values[i] if counts else 0.0
+        count[i] += counts
 
 
 def _median_finite(values: np.ndarray) -> float:
@@ -294,8 +309,27 @@ def _median_finite(values: np.ndarray) -> float:
 
 
 def pixel_medians(stack: np.ndarray) -> np.ndarray:
-    """Return the median (n,) of each pixel's finite samples in (r, n); NaN where there is none."""
-    ordered, count = np.sort(stack, axis=0), np.isfinite(stack).sum(axis=0)
-    places = (np.maximum(count - 1, 0) // 2, count // 2)
-    low, high = (np.take_along_axis(ordered, place[None], axis=0)[0] for place in places)
-    return np.asarray(0.5 * (low + high))
+    """Return the median (..) of each pixel's finite samples in (r, ..); NaN where there is none."""
+    return np.asarray(_medians(stack.reshape(len(stack), -1)).reshape(stack.shape[1:]))
+
+
+@numba.njit(**PLAIN)
+def _medians(stack):  # type: ignore[no-untyped-def]
+    few, medians = np.empty(len(stack), stack.dtype), np.empty(stack.shape[1], stack.dtype)
+    for i in range(stack.shape[1]):
+        known = 0
+        for sample in stack[:, i]:
+            if np.isfinite(sample):
+                few[known] = sample
+                known += 1
+        if known > MOST_INSERTED:
+            few[:known].sort()
+        else:
+            for k in range(1, known):
+                sample, place = few[k], k
+                while place > 0 and few[place - 1] > sample:
+                    few[place] = few[place - 1]
+                    place -= 1
+                few[place] = sample
+        medians[i] = 0.5 * (few[(known - 1) // 2] + few[known // 2]) if known else np.nan
+    return medians
