@@ -93,12 +93,11 @@ class Chebyshev:
 
     def total(self, coefficients: np.ndarray, xy_m: np.ndarray) -> np.ndarray:
         """Return the sum (n,) of the products at places (n, 2), each times its coefficient (p,)."""
-        sums, places_m = np.zeros(len(xy_m)), np.ascontiguousarray(xy_m.T, np.float64)
-        _add_products(places_m, self.powers, self.middle_m, self.half_m, np.ascontiguousarray(coefficients), sums)
-        return sums
+        starts = range(0, max(len(xy_m), 1), AT_ONCE)
+        return np.concatenate([coefficients @ self.basis(xy_m[first : first + AT_ONCE]) for first in starts])
 
 
-BLOCK = 512  # places at a time: the orders of u and v stay in the processor's nearest cache
+AT_ONCE, BLOCK = 4096, 512  # places whose products, and whose orders of u and v, stay in the caches
 
 
 @numba.njit(**PLAIN)
@@ -124,20 +123,6 @@ def _write_products(xy_m, powers, middle_m, half_m, products):  # type: ignore[n
             u, v, product = orders[0, powers[j, 0]], orders[1, powers[j, 1]], products[j, first:last]
             for i in range(len(product)):
                 product[i] = u[i] * v[i]
-
-
-@numba.njit(**PLAIN)
-def _add_products(xy_m, powers, middle_m, half_m, coefficients, sums):  # type: ignore[no-untyped-def]
-    """Add the products at places (2, n), times their coefficients (p,), to ``sums`` (n,)."""
-    orders = np.empty((2, max(powers.max(), 1) + 1, BLOCK))
-    for first in range(0, xy_m.shape[1], BLOCK):
-        last = min(first + BLOCK, xy_m.shape[1])
-        for axis in range(2):
-            _write_orders(xy_m[axis, first:last], middle_m[axis], half_m[axis], orders[axis])
-        for j in range(len(powers)):
-            u, v, total, factor = orders[0, powers[j, 0]], orders[1, powers[j, 1]], sums[first:last], coefficients[j]
-            for i in range(len(total)):
-                total[i] += factor * u[i] * v[i]
 
 
 @dataclass(frozen=True)
