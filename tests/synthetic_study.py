@@ -15,6 +15,7 @@ import pandas as pd
 from scipy import stats
 
 from harness.evaluation.study.record import Calibrated, Inspected, SetUpRecord, StudyRecord, Unflawed
+from harness.tables.trials import ResultTables
 
 THRESHOLD = 5.0
 LOWEST = 3.0
@@ -191,23 +192,13 @@ def _calls(study: Study, one: SetUp, role: str) -> pd.DataFrame:
     )
 
 
-@dataclass(frozen=True)
-class Tables:
-    """Has the tables of `harness.tables.trials.ResultTables` that a study is judged by."""
-
-    holes: pd.DataFrame
-    sites: pd.DataFrame
-    runs: pd.DataFrame
-    findings: pd.DataFrame
-    operating: pd.DataFrame
-    pixels: pd.DataFrame
-
-
-def study_tables(study: Study | None = None) -> Tables:
+def study_tables(study: Study | None = None) -> ResultTables:
     """The tables of the same study as `study_record`'s: the same hits, false calls and signals."""
     study = study or Study()
     parts = [_tables(study, one) for one in study.set_ups]
-    return Tables(*(pd.concat([part[k] for part in parts], ignore_index=True) for k in range(6)))
+    names = ("holes", "sites", "runs", "findings", "operating", "pixels")
+    found = {name: pd.concat([part[k] for part in parts], ignore_index=True) for k, name in enumerate(names)}
+    return ResultTables(**dict.fromkeys(("probes", "variants", "noise", "axes"), pd.DataFrame()), **found)
 
 
 def _tables(study: Study, one: SetUp) -> tuple[pd.DataFrame, ...]:

@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from synthetic_study import SetUp, Study, Tables, study_record, study_tables
+from synthetic_study import SetUp, Study, study_record, study_tables
 from test_study_limits_text import example
 
 from harness.evaluation.study.record import StudyRecord, Unflawed
@@ -17,6 +17,7 @@ from harness.report.study_page import study_html, study_parts
 from harness.tables.limits import limit_sentence
 from harness.tables.study import DEPTH_LIMITS, depths_at
 from harness.tables.text import size, text_of, unbroken
+from harness.tables.trials import ResultTables
 
 PROVENANCE = {
     "command": "python -m harness.sweep experiments/x.yaml",
@@ -307,7 +308,7 @@ def test_given_thresholds_and_no_hole_free_boards() -> None:
     nothing = Unflawed(*(np.zeros(0, kind) for kind in (int, int, int, float)))
     one = replace(record.set_ups[0], unflawed=nothing, calibration_runs=0)
     record = replace(record, false_calls_per_m2=None, set_ups=(one,))
-    tables: Tables = study_tables(study)
+    tables: ResultTables = study_tables(study)
     damaged = {name: getattr(tables, name) for name in ("runs", "findings", "operating")}
     tables = replace(tables, sites=tables.sites.iloc[:0], **{n: t[t["role"] == "damaged"] for n, t in damaged.items()})
     page = html(evaluate_study(record, tables, {}, draws=40))

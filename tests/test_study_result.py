@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from synthetic_study import SetUp, Study, Tables, study_record, study_tables
+from synthetic_study import SetUp, Study, study_record, study_tables
 
 from harness.evaluation.study.limit import limit_of
 from harness.evaluation.study.record import read_record, record_text
 from harness.evaluation.study.result import StudyResult, conditions_of, difference, evaluate_study, validity_of
 from harness.tables.limits import notes_of
+from harness.tables.trials import ResultTables
 
 FACTS: dict[str, Any] = {
     "source": {
@@ -88,8 +89,8 @@ class TestStudy:
         assert again.validity == result.validity
 
     def test_nothing_but_the_record_is_enough_for_limits(self, study):
-        record, none = study_record(study), pd.DataFrame()
-        bare = evaluate_study(record, Tables(none, none, none, none, none, none), {})
+        record = study_record(study)
+        bare = evaluate_study(record, ResultTables(*[pd.DataFrame()] * 6), {})
         assert [one.limit.a90_95.demonstrated for one in bare.set_ups] == [True, True]
         first = bare.set_ups[0]
         assert (first.chance, first.free_response, first.pixels, first.roc) == (None,) * 4
@@ -129,7 +130,7 @@ class TestValidity:
 
     def test_a_limit_beyond_what_was_inspected_has_no_number(self):
         study = Study((SetUp(a50_mm=13.0),), boards=16, hole_free_boards=0)
-        result = evaluate_study(study_record(study), Tables(*[pd.DataFrame()] * 6), {}, draws=50)
+        result = evaluate_study(study_record(study), ResultTables(*[pd.DataFrame()] * 6), {}, draws=50)
         limit = result.limits[0]
         assert limit.beyond(limit.a90_95.value) and limit.a90_95.demonstrated
         assert "a90/95 lies beyond the largest size" in "; ".join(notes_of(limit))

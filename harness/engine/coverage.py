@@ -5,7 +5,7 @@ whole part, else measured nearby. The signal of damage and its scatter are learn
 boards of the family, in random poses as wide as those requested. Not modelled: the direction of the undamaged part's
 error at a place (the unit's pattern, the surface's misfit), light of other parts, sizes in missing returns."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,10 +17,10 @@ from harness.engine.estimate import progress_display
 from harness.engine.journal import Journal
 from harness.engine.judge import detector_of
 from harness.engine.plan import Batch, Group, SweepPlan, batch_of, plan_of, point_task
-from harness.engine.run import carried_out, render_missing, run_plan
+from harness.engine.run import render_missing, run_plan, values_of
 from harness.engine.setup import load_set_up
 from harness.engine.trial import PointTask, TrialTask, cloud_of
-from harness.engine.work import Job, JobEngine
+from harness.engine.work import JobEngine
 from harness.evaluation.coverage import Findable, Patches, ScoredDamage, Seen, findable
 from harness.experiment.schema import Experiment, ExperimentConfig, Point, SimulatedSource
 from harness.vocabulary.errors import UserError
@@ -79,11 +79,12 @@ def survey(experiment: Experiment, poses: Sequence[Pose], cache: Path, folder: P
                 why = next((failure.in_short for failure in outcome.failures), "no hole-free run ended")
                 raise UserError(f"{point.label or point.variant} has no threshold: {why}")
             task = point_task(point, outcome.thresholds[point.digest], group.learned.get(point.digest))
-            boards = _each(_board_seen, zip(group.then, wholes, strict=True), (task, group.seed), engine)
+            pairs = [(*pair, task, group.seed) for pair in zip(group.then, wholes, strict=True)]
+            boards = values_of(_board_seen, pairs, engine)
             inspections = _inspections([each for each in boards if each is not None], point, scores)
             found = findable(inspections, outcome.thresholds[point.digest])
             blind = np.full(len(patches.areas_m2), np.inf)
-            seen = _each(_part_seen, ((view,) for view in views), (task, group.seed, patches), engine)
+            seen = values_of(_part_seen, [(view, task, group.seed, patches) for view in views], engine)
             seen = [Seen(blind, np.ones(len(blind)), np.ones(len(blind))) if each is None else each for each in seen]
             surveys.append(Survey(point, task, patches, found, dict(zip(poses, seen, strict=True))))
     return surveys
@@ -144,17 +145,6 @@ def _bare(batch: Batch) -> Batch:
     job = replace(job, target=job.target.hole_free())
     ref = replace(ref, view_path=str(job.path), damaged=False)
     return replace(batch, role="hole_free", renders=(job,), set_ups=(ref,))
-
-
-def _each(
-    act: Callable[..., Any], asked: Iterable[tuple[Batch, ...]], further: tuple[Any, ...], engine: JobEngine
-) -> list[Any]:
-    """Return the values of a function of batches, None if the detector cannot judge any board. A bug is raised."""
-    jobs = [Job(str(n), "trials", act, (*batches, *further)) for n, batches in enumerate(asked)]
-    ends = {job.name: ended for job, ended in carried_out(jobs, engine)}
-    if bug := next((end.why for end in ends.values() if end.is_bug), None):
-        raise RuntimeError(bug)
-    return [ends[job.name].value for job in jobs]
 
 
 def _inspections(

@@ -244,6 +244,15 @@ def carried_out(jobs: Iterable[Job], engine: JobEngine) -> Iterator[tuple[Job, E
     return ends(started())
 
 
+def values_of(function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], engine: JobEngine) -> list[Any]:
+    """Return the values of a function of each of several arguments, None for a user's mistake. A bug is raised."""
+    jobs = [Job(str(number), "trials", function, each) for number, each in enumerate(arguments)]
+    ends = {job.name: ended for job, ended in carried_out(jobs, engine)}
+    if bug := next((end.why for end in ends.values() if end.is_bug), None):
+        raise RuntimeError(bug)
+    return [ends[job.name].value for job in jobs]
+
+
 def _render_job(job: RenderJob) -> Job:
     arguments = (job.target.to_data(), job.camera.to_data(), job.config.to_data(), str(job.folder))
     return Job(job.path.name, "renders", render_into_cache, arguments)

@@ -5,6 +5,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from harness.engine.estimate import progress_display
 from harness.engine.journal import Journal
 from harness.engine.pictures import shown_in, study_examples
 from harness.engine.plan import PACKAGES, Group, SweepPlan, plan_of
-from harness.engine.run import pictures_from, render_missing, run_plan
+from harness.engine.run import pictures_from, render_missing, run_plan, values_of
 from harness.engine.tables import tables_of, write_tables
 from harness.engine.work import STATES, EngineOptions, Failure, Job, JobEngine, Outcome, engine_of, locked
 from harness.evaluation.study.record import Calibrated, Inspected, SetUpRecord, StudyRecord, Unflawed, record_text
@@ -127,7 +128,7 @@ def _write_study(
         raise UserError(f"no damaged board of {experiment.config.name} was judged: {_reasons(outcome)}")
     provenance["warnings"] += without_limit(experiment.points, outcome, failed, study.set_ups)
     write_text(folder / STUDY.name, record_text(study))
-    result = evaluate_study(study, tables, experiment.data)
+    result = evaluate_study(study, tables, experiment.data, each_of=partial(values_of, engine=engine))
     shown = list(shown_in(plan, result.limits))
     # trials that ran on other machines may have no views here
     views = (job for damages in shown for damage in damages for job in damage.batch.renders)

@@ -481,6 +481,13 @@ class ResultTables:
     operating: pd.DataFrame = field(default_factory=_empty)
     pixels: pd.DataFrame = field(default_factory=_empty)
 
+    def of(self, variant: str, frames: int) -> ResultTables:
+        """Return the rows of one set-up."""
+        found = vars(self).items()
+        by_set_up = {name: table for name, table in found if {"variant", "frames"} <= set(table.columns)}
+        own = {n: t[(t["variant"] == variant) & (t["frames"] == frames)] for n, t in by_set_up.items()}
+        return replace(self, **own)
+
     def stored(self) -> dict[Table, pd.DataFrame]:
         """Return the tables that are written to files, in order."""
         return {table: getattr(self, "holes" if table is TRIALS else table.name) for table in STORED}

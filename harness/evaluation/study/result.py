@@ -4,10 +4,10 @@ Intervals of ratios are slightly narrow: 8 to 9 % of those of equal set-ups excl
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from itertools import pairwise, starmap
+from typing import Any
 
 import numpy as np
 
@@ -20,9 +20,6 @@ from harness.evaluation.study.record import SetUpRecord, StudyRecord
 from harness.tables.trials import ResultTables
 from harness.vocabulary.path_names import camera_title, in_words
 from harness.vocabulary.seeds import canonical_json
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 FRAMES = "capture.frames"
 """The dotted path of the axis that every experiment has."""
@@ -316,23 +313,27 @@ class StudyResult:
 
 
 def evaluate_study(
-    record: StudyRecord, tables: ResultTables, facts: Mapping[str, Any], *, draws: int = DRAWS
+    record: StudyRecord,
+    tables: ResultTables,
+    facts: Mapping[str, Any],
+    *,
+    draws: int = DRAWS,
+    each_of: Callable[..., Iterable[SetUpResult | None]] = starmap,
 ) -> StudyResult:
-    """Evaluate a study. ``facts``: its resolved experiment, plain data. Deterministic. A limit without a curve says
+    """Evaluate a study. ``facts``: its resolved experiment, plain data. ``each_of``: calls a function with each of
+    several arguments, such as in other processes, which may fail (None). Deterministic. A limit without a curve says
     why."""
-    set_ups = tuple(_set_up(each, tables, record.hit_radius_mm, draws) for each in record.set_ups)
+    radius_mm = record.hit_radius_mm
+    arguments = [(each, tables.of(each.variant, each.frames), radius_mm, draws) for each in record.set_ups]
+    set_ups = tuple(found or _set_up(*own) for found, own in zip(each_of(_set_up, arguments), arguments, strict=True))
     limits = tuple(set_up.limit for set_up in set_ups)
     validity = validity_of(record, limits, [set_up.chance for set_up in set_ups], facts)
     return StudyResult(record, set_ups, limits, axis_lines(limits), validity, facts)
 
 
 def _set_up(record: SetUpRecord, tables: ResultTables, radius_mm: float, draws: int) -> SetUpResult:
-    def own(table: pd.DataFrame) -> pd.DataFrame:
-        if table.empty:
-            return table
-        return table[(table["variant"] == record.variant) & (table["frames"] == record.frames)]
-
-    holes, sites, runs = own(tables.holes), own(tables.sites), own(tables.runs)
+    """Evaluate a set-up from its own ``tables``."""
+    holes, sites, runs = tables.holes, tables.sites, tables.runs
     limit, chance = limit_of(record, draws=draws, tested=True), None
     if not holes.empty and not runs.empty:
         column = "model_diameter_mm" if record.inspected.size_of == "diameter" else f"{record.inspected.size_of}_mm"
@@ -340,8 +341,8 @@ def _set_up(record: SetUpRecord, tables: ResultTables, radius_mm: float, draws: 
         typical_mm = float((sized[column] - sized["true_diameter_mm"]).abs().median())
         seconds = float(runs.loc[runs["role"] == "damaged", "seconds_detect"].median())
         limit = replace(limit, size_error_mm=typical_mm, sized=len(sized), seconds_detect=seconds)
-        chance = curves.chance_hits(holes, sites, runs, own(tables.findings), radius_mm, limit.false_calls)
+        chance = curves.chance_hits(holes, sites, runs, tables.findings, radius_mm, limit.false_calls)
     roc = curves.roc_curve(holes, sites, record.threshold)
-    response = curves.free_response(own(tables.operating), runs, holes, draws)
-    pixels = curves.pixel_curves(own(tables.pixels))
+    response = curves.free_response(tables.operating, runs, holes, draws)
+    pixels = curves.pixel_curves(tables.pixels)
     return SetUpResult(limit, chance, roc, response, pixels, *surface_of(record, draws))
