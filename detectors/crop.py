@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
-from typing import Annotated, Literal, NamedTuple
+from functools import cached_property
+from typing import Annotated, Literal, NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -349,9 +349,15 @@ def crop(cloud: Cloud, config: AnyCrop) -> np.ndarray:
     raise UserError(what, legal=legal, fix="change the crop or lower crop.inset_px")
 
 
-@lru_cache(maxsize=2)  # several detectors judge the same averages of 1 and of more frames
 def choice_of(cloud: Cloud, config: AutoCrop) -> Choice:
-    """Return the automatic crop of a cloud with a valid point, and all candidates. UserError without ``target``."""
+    """Return the automatic crop of a cloud with a valid point, and all candidates. UserError without ``target``. It is
+    computed once for a cloud."""
+    if config not in cloud.crops:
+        cloud.crops[config] = _choice_of(cloud, config)
+    return cast("Choice", cloud.crops[config])
+
+
+def _choice_of(cloud: Cloud, config: AutoCrop) -> Choice:
     grid, smooth_px, inset_px, wanted = cloud, config.smooth_px, config.inset_px, config.target
     if not cloud.organised:
         grid, rows, columns, spacings = raster(cloud.points_m[cloud.valid], cloud)

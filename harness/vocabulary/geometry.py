@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
-from functools import lru_cache
-from typing import Literal, Protocol
+from functools import cached_property, lru_cache
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
@@ -230,7 +230,7 @@ class MapViews:
     pixel_m: tuple[float, float]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Cloud:
     """The average of frames as points in the camera's frame: the input of a detector. ``points_m`` (h, w, 3) float64 is
     NaN where invalid. ``reason`` (h, w) uint8 holds `Reason` (the most frequent one, if no sample was valid). ``count``
@@ -257,6 +257,11 @@ class Cloud:
     mean_variance_m2: np.ndarray | None = None
     map_views: MapViews | None = None
     noise_reach_px: float = 0.0
+
+    @cached_property
+    def crops(self) -> dict[Any, Any]:
+        """Its automatic crops by their settings: several detectors share them."""
+        return {}
 
     @property
     def valid(self) -> np.ndarray:
