@@ -21,8 +21,9 @@ STRIPS = 64
 """Strips that approximate the disc: the total coverage is exact, that of a pixel right to 0.001 for a blur of 3."""
 NODES, WEIGHTS = np.array([0.5 - 0.15**0.5, 0.5, 0.5 + 0.15**0.5, 1.0]), np.array([5.0, 8.0, 5.0, 0.0]) / 18.0
 """Gauss-Legendre rule with three points on (0, 1) for the integral over the wall's depth, and the wall's end."""
-STEP = 1e-3
-"""Step of the finite differences: in pixels for the place, relative for radius and depth, absolute for the wall."""
+STEP = 1e-2
+"""Step of the finite differences: in pixels for the place, relative for radius and depth, absolute for the wall. With a
+tenth of it, kinks of the picture mislead more descents."""
 MOST_STEPS, TOLERANCE = 40, 1e-5  # limits of a descent: the number of steps, and the relative gain below which it ends
 DAMPING, LEAST_M, SMALLEST = 1e-3, 1e-9, 1e-18
 """Damping of the first step; size of a deviation that is only rounding error, and its square."""
@@ -246,6 +247,9 @@ def _descent(  # type: ignore[no-untyped-def]
     square = promised = np.inf
     rows, products, best, holes, sizes = np.zeros((8, n)), np.zeros((7, 7)), np.zeros(5), np.zeros((6, 5)), np.zeros(5)
     left, slope = rows[7:], np.zeros(7)
+    for i in range(n):
+        rows[4, i] = 1.0
+    _whiten(rows[4:5], factor)
     # no disc is larger than ten patches, so that a far trial step stays finite
     widest = math.log(10.0 * (h + w) * math.sqrt(max(metric[0, 0], metric[1, 1])))
     for trial in range(MOST_STEPS + 1):
@@ -280,8 +284,9 @@ def _descent(  # type: ignore[no-untyped-def]
                 for i in range(n):
                     rows[row, i] = (images[k * h * w + places[i]] - image[places[i]]) * per_step
             for i in range(n):
-                rows[4, i], rows[6, i] = 1.0, left[0, i]
-            _whiten(rows[:6], factor)
+                rows[6, i] = left[0, i]
+            _whiten(rows[:4], factor)
+            _whiten(rows[5:6], factor)
             products = np.zeros((7, 7))
             for i in range(n):
                 for j in range(7):
@@ -296,7 +301,7 @@ def _descent(  # type: ignore[no-untyped-def]
             products[5, 5] += (weight * bend) ** 2
             products[5, 6] += weight * bend * prior
         else:
-            damping *= 10.0
+            damping = max(10.0 * damping, 10.0 * DAMPING)
         if converged:
             break
         step, promised = _damped(products, damping)
@@ -307,10 +312,13 @@ def _descent(  # type: ignore[no-untyped-def]
 @numba.njit(fastmath={"reassoc", "contract", "nsz"}, **PLAIN)
 def _whiten(rows: np.ndarray, factor: np.ndarray) -> None:
     """Solve L x = r for each of the rows r (k, n) with a lower triangular ``factor`` L (n, n), unless it is empty."""
-    for i in range(len(factor)):
-        by, per_pivot = factor[i], 1.0 / factor[i, i]
+    first = 0
+    while first < len(factor) and not rows[:, first].any():
+        first += 1
+    for i in range(len(factor) - first):
+        by, per_pivot = factor[first + i, first:], 1.0 / factor[first + i, first + i]
         for k in range(len(rows)):
-            row, total = rows[k], 0.0
+            row, total = rows[k, first:], 0.0
             for j in range(i):
                 total += by[j] * row[j]
             row[i] = (row[i] - total) * per_pivot

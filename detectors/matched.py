@@ -30,7 +30,6 @@ from typing import ClassVar
 import cv2
 import numba
 import numpy as np
-import scipy.fft
 from scipy import special
 
 from detectors import local, whitening
@@ -121,11 +120,7 @@ class MatchedDetector(LocalDetector):
 
     def correlation(self, evidence: Evidence) -> np.ndarray:
         """Return the correlation of the noise by lag, learned or from the residuals."""
-        covariance = _own_covariance(evidence) if self._covariance is None else self._covariance
-        reach = np.arange(-whitening.LONGEST_LAG_PX, whitening.LONGEST_LAG_PX + 1)
-        grid = (whitening.GRID, whitening.GRID)
-        lags = scipy.fft.irfft2(whitening.spectrum(covariance, grid), grid)[np.ix_(reach, reach)]
-        return np.asarray(lags / lags[whitening.LONGEST_LAG_PX, whitening.LONGEST_LAG_PX], np.float64)
+        return _own_correlation(evidence) if self._covariance is None else whitening.correlation(self._covariance)
 
     def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
         """Return the mean covariance of the clouds' residuals by lag, in squared deviations of the local noise."""
@@ -160,11 +155,12 @@ def _in_deviations(
 
 
 @lru_cache(maxsize=1)
-def _own_covariance(evidence: Evidence) -> np.ndarray:
-    """Return the covariance of a cloud's residuals, in squared deviations, once for all findings of the cloud."""
-    known = np.isfinite(evidence.residual_m)
-    residual_m = np.where(known, evidence.residual_m, 0.0)
-    return _covariance(*_in_deviations(residual_m, known.astype(np.float32), (0.0, 0.0))[:3])
+def _own_correlation(evidence: Evidence) -> np.ndarray:
+    """Return the correlation of a cloud's residuals by lag, once for all findings of the cloud."""
+    rows, columns = np.nonzero(np.isfinite(evidence.residual_m))
+    residual_m = evidence.residual_m[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+    weights = np.isfinite(residual_m).astype(np.float32)
+    return whitening.correlation(_covariance(*_in_deviations(np.nan_to_num(residual_m), weights, (0.0, 0.0))[:3]))
 
 
 def _covariance(noise: np.ndarray, known: np.ndarray, depth_px: np.ndarray) -> np.ndarray:

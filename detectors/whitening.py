@@ -75,6 +75,13 @@ def spectrum(covariance: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return np.asarray(np.maximum(power, max(LEAST_POWER * float(power.mean()), 1e-12)).astype(np.float32))
 
 
+def correlation(covariance: np.ndarray) -> np.ndarray:
+    """Return the correlation (2 `LONGEST_LAG_PX` + 1, squared) by lag of noise with the `spectrum` of a covariance."""
+    reach = np.arange(-LONGEST_LAG_PX, LONGEST_LAG_PX + 1)
+    lags = scipy.fft.irfft2(spectrum(covariance, (GRID, GRID)), (GRID, GRID))[np.ix_(reach, reach)]
+    return np.asarray(lags / lags[LONGEST_LAG_PX, LONGEST_LAG_PX], np.float64)
+
+
 def window_of(covariance: np.ndarray) -> int:
     """Return the side of `WINDOWS_PX` that the noise indicates: averaging over a square makes the covariance fall
     steadily with the lag up to its side, and bend there. A correlation of neighbours below 0.5 means no averaging."""
