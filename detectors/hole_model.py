@@ -55,7 +55,7 @@ def sight(centre_m: np.ndarray, per_px_m: np.ndarray, emitter_m: np.ndarray, sha
     A circle at depth h along the normal has the image of the same circle on the surface, moved by h * drift / (1 + h *
     shrinking) and divided by that divisor. Light from depth h entered beam * h / (h + height) away from it."""
     normal = normal_of(per_px_m)
-    normal = normal / np.copysign(np.linalg.norm(normal), normal @ centre_m)
+    normal = normal / math.copysign(math.hypot(*normal), normal @ centre_m)
     ray, z = centre_m / centre_m[2], centre_m[2]
     slopes_per_px = ((per_px_m - np.outer(per_px_m[:, 2], ray)) / z)[:, :2].T
     drift = np.linalg.solve(slopes_per_px, (normal - normal[2] * ray)[:2]) / z
@@ -68,7 +68,7 @@ def sight(centre_m: np.ndarray, per_px_m: np.ndarray, emitter_m: np.ndarray, sha
 def straight_sight(per_px_m: np.ndarray) -> np.ndarray:
     """Return the viewpoint (8,) of a parallel projection of unknown origin: view and light are along z."""
     normal = normal_of(per_px_m)
-    normal = normal / np.copysign(np.linalg.norm(normal), normal[2])
+    normal = normal / math.copysign(math.hypot(*normal), normal[2])
     drift = np.linalg.solve(per_px_m[:, :2].T, normal[:2])
     return np.array([normal[2], *drift, 0.0, 0.0, 0.0, 1.0, 1.0])
 
@@ -245,8 +245,8 @@ def _descent(  # type: ignore[no-untyped-def]
     seventh is ``data`` (n,) minus the hole. With a ``factor`` (n, n) that is not empty, they are whitened."""
     n, q, step, damping, converged = len(data), start, np.zeros(6), 10.0 * DAMPING, False
     square = promised = np.inf
-    rows, products, best, holes, sizes = np.zeros((8, n)), np.zeros((7, 7)), np.zeros(5), np.zeros((6, 5)), np.zeros(5)
-    left, slope = rows[7:], np.zeros(7)
+    rows, products, best, holes, sizes = np.zeros((8, n)), np.eye(7), np.zeros(5), np.zeros((6, 5)), np.zeros(5)
+    left, turn = rows[7:], np.eye(7)
     for i in range(n):
         rows[4, i] = 1.0
     _whiten(rows[4:5], factor)
@@ -287,17 +287,9 @@ def _descent(  # type: ignore[no-untyped-def]
                 rows[6, i] = left[0, i]
             _whiten(rows[:4], factor)
             _whiten(rows[5:6], factor)
-            products = np.zeros((7, 7))
-            for i in range(n):
-                for j in range(7):
-                    slope[j] = rows[j, i]
-                # derivatives by q from those by the hole's parameters
-                slope[2] = radius * slope[2] - 2.0 * depth * slope[3]
-                slope[3] *= radius**-2.0
-                slope[5] *= bend
-                for j in range(7):
-                    for k in range(j, 7):
-                        products[j, k] += slope[j] * slope[k]
+            # derivatives by q from those by the hole's parameters
+            turn[2, 2], turn[2, 3], turn[3, 3], turn[5, 5] = radius, -2.0 * depth, radius**-2.0, bend
+            products = np.dot(np.dot(turn, np.dot(rows[:7], rows[:7].T)), turn.T)
             products[5, 5] += (weight * bend) ** 2
             products[5, 6] += weight * bend * prior
         else:
@@ -360,7 +352,7 @@ def sandwich_covariance(patch: HolePatch, by: np.ndarray, square_m2: float) -> n
     except np.linalg.LinAlgError:
         return np.full((6, 6), np.nan)
     meat = correlated_products(columns, across, down) / (across * down)
-    freedom = by.shape[1] - float(np.trace(bread @ meat))
+    freedom = by.shape[1] - float(np.vdot(bread, meat))
     if freedom <= 0:
         return np.full((6, 6), np.nan)
     prior_variance = patch.noise_m**2 * patch.blur_px[0] * patch.blur_px[1]
