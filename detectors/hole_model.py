@@ -22,8 +22,8 @@ STRIPS = 64
 NODES, WEIGHTS = np.array([0.5 - 0.15**0.5, 0.5, 0.5 + 0.15**0.5, 1.0]), np.array([5.0, 8.0, 5.0, 0.0]) / 18.0
 """Gauss-Legendre rule with three points on (0, 1) for the integral over the wall's depth, and the wall's end."""
 STEP = 1e-2
-"""Step of the finite differences: in pixels for the place, relative for radius and depth, absolute for the wall. With a
-tenth of it, kinks of the picture mislead more descents."""
+"""Step of finite differences: in pixels for the place, relative for radius and depth, absolute for the wall. Kinks of
+the picture mislead more descents if it is a tenth."""
 MOST_STEPS, TOLERANCE = 40, 1e-5  # limits of a descent: the number of steps, and the relative gain below which it ends
 DAMPING, LEAST_M, SMALLEST = 1e-3, 1e-9, 1e-18
 """Damping of the first step; size of a deviation that is only rounding error, and its square."""
@@ -245,10 +245,8 @@ def _descent(  # type: ignore[no-untyped-def]
     seventh is ``data`` (n,) minus the hole. With a ``factor`` (n, n) that is not empty, they are whitened."""
     n, q, step, damping, converged = len(data), start, np.zeros(6), 10.0 * DAMPING, False
     square = promised = np.inf
-    rows, products, best, holes, sizes = np.zeros((8, n)), np.eye(7), np.zeros(5), np.zeros((6, 5)), np.zeros(5)
+    rows, products, best, holes, sizes = np.ones((8, n)), np.eye(7), np.zeros(5), np.zeros((6, 5)), np.zeros(5)
     left, turn = rows[7:], np.eye(7)
-    for i in range(n):
-        rows[4, i] = 1.0
     _whiten(rows[4:5], factor)
     # no disc is larger than ten patches, so that a far trial step stays finite
     widest = math.log(10.0 * (h + w) * math.sqrt(max(metric[0, 0], metric[1, 1])))
@@ -341,8 +339,8 @@ def sandwich_covariance(patch: HolePatch, by: np.ndarray, square_m2: float) -> n
     noise. ``by`` (6, n): derivatives. ``square_m2``: sum of squared residuals. With A = J' J + W it is A^-1 (s^2 J' C J
     + p^2 W) A^-1. W is the prior's square weight on the wall, p^2 its variance; E[misfit' misfit] = s^2 (n - trace(A^-1
     J' C J))."""
-    columns = np.zeros((6, *patch.used.shape))
-    columns[:, patch.used] = by
+    columns = np.zeros((*patch.used.shape, 6))
+    columns[patch.used] = by.T
     # the odd numbers of pixels nearest to the blur: pixels this far apart share no noise
     across, down = (2 * max(round((blur - 1) / 2), 0) + 1 for blur in patch.blur_px)
     prior = np.zeros((6, 6))

@@ -257,7 +257,11 @@ def local_plane(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the surface's point at the detection's centroid (3,) and its derivatives by u and v (2, 3), by linear
     regression of directions (in a parallel projection of x and y) and of the surface's z; None if singular."""
-    sums = _plane_sums(points, surface_z, finite, own, projection == "parallel")
+    v0, u0 = (float(axis.mean()) for axis in np.nonzero(own))
+    (x, y, z), pixels = points[finite].T, np.nonzero(finite)
+    scale = 1.0 if projection == "parallel" else z
+    rows = np.stack([np.ones(len(x)), pixels[1] - u0, pixels[0] - v0, x / scale, y / scale, surface_z[finite]])
+    sums = rows[:3] @ rows.T
     try:
         beta = np.linalg.solve(sums[:, :3], sums[:, 3:])
     except np.linalg.LinAlgError:
@@ -270,30 +274,6 @@ def local_plane(
     if not math.hypot(*normal_of(per_px)) > 1e-12:
         return None
     return centre, per_px
-
-
-@numba.njit(**PLAIN)
-def _plane_sums(  # type: ignore[no-untyped-def]
-    points, surface_z, finite, own, is_parallel
-):
-    """Return the sums (3, 6) over finite pixels of the products of 1 and their offsets along u and v from the middle of
-    the ``own`` pixels with these, with two coordinates of points (of directions unless parallel), and with z."""
-    sums, row, u0, v0 = np.zeros((3, 6)), np.ones(6), 0.0, 0.0
-    for v in range(own.shape[0]):
-        for u in range(own.shape[1]):
-            if own[v, u]:
-                u0, v0 = u0 + u, v0 + v
-    u0, v0 = u0 / own.sum(), v0 / own.sum()
-    for v in range(finite.shape[0]):
-        for u in range(finite.shape[1]):
-            if finite[v, u]:
-                z = 1.0 if is_parallel else points[v, u, 2]
-                row[1], row[2], row[5] = u - u0, v - v0, surface_z[v, u]
-                row[3], row[4] = points[v, u, 0] / z, points[v, u, 1] / z
-                for i in range(3):
-                    for j in range(6):
-                        sums[i, j] += row[i] * row[j]
-    return sums
 
 
 def _modelled(around: _Surroundings, config: HoleModelConfig, by_lag: np.ndarray | None) -> tuple[HoleFit | None, str]:
