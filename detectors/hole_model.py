@@ -21,8 +21,9 @@ STRIPS = 64
 """Strips that approximate the disc: the total coverage is exact, that of a pixel right to 0.001 for a blur of 3."""
 NODES, WEIGHTS = np.array([0.5 - 0.15**0.5, 0.5, 0.5 + 0.15**0.5, 1.0]), np.array([5.0, 8.0, 5.0, 0.0]) / 18.0
 """Gauss-Legendre rule with three points on (0, 1) for the integral over the wall's depth, and the wall's end."""
-STEP = 1e-3
-"""Step of the finite differences: in pixels for the place, relative for radius and depth, absolute for the wall."""
+STEP = 1e-2
+"""Step of finite differences: in pixels for the place, relative for radius and depth, absolute for the wall. Kinks of
+the picture mislead more descents if it is a tenth."""
 MOST_STEPS, TOLERANCE = 40, 1e-5  # limits of a descent: the number of steps, and the relative gain below which it ends
 DAMPING, LEAST_M, SMALLEST = 1e-3, 1e-9, 1e-18
 """Damping of the first step; size of a deviation that is only rounding error, and its square."""
@@ -54,7 +55,7 @@ def sight(centre_m: np.ndarray, per_px_m: np.ndarray, emitter_m: np.ndarray, sha
     A circle at depth h along the normal has the image of the same circle on the surface, moved by h * drift / (1 + h *
     shrinking) and divided by that divisor. Light from depth h entered beam * h / (h + height) away from it."""
     normal = normal_of(per_px_m)
-    normal = normal / np.copysign(np.linalg.norm(normal), normal @ centre_m)
+    normal = normal / math.copysign(math.hypot(*normal), normal @ centre_m)
     ray, z = centre_m / centre_m[2], centre_m[2]
     slopes_per_px = ((per_px_m - np.outer(per_px_m[:, 2], ray)) / z)[:, :2].T
     drift = np.linalg.solve(slopes_per_px, (normal - normal[2] * ray)[:2]) / z
@@ -67,7 +68,7 @@ def sight(centre_m: np.ndarray, per_px_m: np.ndarray, emitter_m: np.ndarray, sha
 def straight_sight(per_px_m: np.ndarray) -> np.ndarray:
     """Return the viewpoint (8,) of a parallel projection of unknown origin: view and light are along z."""
     normal = normal_of(per_px_m)
-    normal = normal / np.copysign(np.linalg.norm(normal), normal[2])
+    normal = normal / math.copysign(math.hypot(*normal), normal[2])
     drift = np.linalg.solve(per_px_m[:, :2].T, normal[:2])
     return np.array([normal[2], *drift, 0.0, 0.0, 0.0, 1.0, 1.0])
 
@@ -244,8 +245,9 @@ def _descent(  # type: ignore[no-untyped-def]
     seventh is ``data`` (n,) minus the hole. With a ``factor`` (n, n) that is not empty, they are whitened."""
     n, q, step, damping, converged = len(data), start, np.zeros(6), 10.0 * DAMPING, False
     square = promised = np.inf
-    rows, products, best, holes, sizes = np.zeros((8, n)), np.zeros((7, 7)), np.zeros(5), np.zeros((6, 5)), np.zeros(5)
-    left, slope = rows[7:], np.zeros(7)
+    rows, products, best, holes, sizes = np.ones((8, n)), np.eye(7), np.zeros(5), np.zeros((6, 5)), np.zeros(5)
+    left, turn = rows[7:], np.eye(7)
+    _whiten(rows[4:5], factor)
     # no disc is larger than ten patches, so that a far trial step stays finite
     widest = math.log(10.0 * (h + w) * math.sqrt(max(metric[0, 0], metric[1, 1])))
     for trial in range(MOST_STEPS + 1):
@@ -280,23 +282,16 @@ def _descent(  # type: ignore[no-untyped-def]
                 for i in range(n):
                     rows[row, i] = (images[k * h * w + places[i]] - image[places[i]]) * per_step
             for i in range(n):
-                rows[4, i], rows[6, i] = 1.0, left[0, i]
-            _whiten(rows[:6], factor)
-            products = np.zeros((7, 7))
-            for i in range(n):
-                for j in range(7):
-                    slope[j] = rows[j, i]
-                # derivatives by q from those by the hole's parameters
-                slope[2] = radius * slope[2] - 2.0 * depth * slope[3]
-                slope[3] *= radius**-2.0
-                slope[5] *= bend
-                for j in range(7):
-                    for k in range(j, 7):
-                        products[j, k] += slope[j] * slope[k]
+                rows[6, i] = left[0, i]
+            _whiten(rows[:4], factor)
+            _whiten(rows[5:6], factor)
+            # derivatives by q from those by the hole's parameters
+            turn[2, 2], turn[2, 3], turn[3, 3], turn[5, 5] = radius, -2.0 * depth, radius**-2.0, bend
+            products = np.dot(np.dot(turn, np.dot(rows[:7], rows[:7].T)), turn.T)
             products[5, 5] += (weight * bend) ** 2
             products[5, 6] += weight * bend * prior
         else:
-            damping *= 10.0
+            damping = max(10.0 * damping, 10.0 * DAMPING)
         if converged:
             break
         step, promised = _damped(products, damping)
@@ -307,10 +302,13 @@ def _descent(  # type: ignore[no-untyped-def]
 @numba.njit(fastmath={"reassoc", "contract", "nsz"}, **PLAIN)
 def _whiten(rows: np.ndarray, factor: np.ndarray) -> None:
     """Solve L x = r for each of the rows r (k, n) with a lower triangular ``factor`` L (n, n), unless it is empty."""
-    for i in range(len(factor)):
-        by, per_pivot = factor[i], 1.0 / factor[i, i]
+    first = 0
+    while first < len(factor) and not rows[:, first].any():
+        first += 1
+    for i in range(len(factor) - first):
+        by, per_pivot = factor[first + i, first:], 1.0 / factor[first + i, first + i]
         for k in range(len(rows)):
-            row, total = rows[k], 0.0
+            row, total = rows[k, first:], 0.0
             for j in range(i):
                 total += by[j] * row[j]
             row[i] = (row[i] - total) * per_pivot
@@ -341,8 +339,8 @@ def sandwich_covariance(patch: HolePatch, by: np.ndarray, square_m2: float) -> n
     noise. ``by`` (6, n): derivatives. ``square_m2``: sum of squared residuals. With A = J' J + W it is A^-1 (s^2 J' C J
     + p^2 W) A^-1. W is the prior's square weight on the wall, p^2 its variance; E[misfit' misfit] = s^2 (n - trace(A^-1
     J' C J))."""
-    columns = np.zeros((6, *patch.used.shape))
-    columns[:, patch.used] = by
+    columns = np.zeros((*patch.used.shape, 6))
+    columns[patch.used] = by.T
     # the odd numbers of pixels nearest to the blur: pixels this far apart share no noise
     across, down = (2 * max(round((blur - 1) / 2), 0) + 1 for blur in patch.blur_px)
     prior = np.zeros((6, 6))
@@ -352,7 +350,7 @@ def sandwich_covariance(patch: HolePatch, by: np.ndarray, square_m2: float) -> n
     except np.linalg.LinAlgError:
         return np.full((6, 6), np.nan)
     meat = correlated_products(columns, across, down) / (across * down)
-    freedom = by.shape[1] - float(np.trace(bread @ meat))
+    freedom = by.shape[1] - float(np.vdot(bread, meat))
     if freedom <= 0:
         return np.full((6, 6), np.nan)
     prior_variance = patch.noise_m**2 * patch.blur_px[0] * patch.blur_px[1]

@@ -93,7 +93,7 @@ class LocalDetector:
 
     settings_type: ClassVar[type[FilterConfig]] = LocalConfig
     name = "local"
-    version = 2
+    version = 3
 
     def __init__(self, settings: FilterConfig) -> None:
         self.settings = settings

@@ -30,7 +30,6 @@ from typing import ClassVar
 import cv2
 import numba
 import numpy as np
-import scipy.fft
 from scipy import special
 
 from detectors import local, whitening
@@ -121,11 +120,7 @@ class MatchedDetector(LocalDetector):
 
     def correlation(self, evidence: Evidence) -> np.ndarray:
         """Return the correlation of the noise by lag, learned or from the residuals."""
-        covariance = _own_covariance(evidence) if self._covariance is None else self._covariance
-        reach = np.arange(-whitening.LONGEST_LAG_PX, whitening.LONGEST_LAG_PX + 1)
-        grid = (whitening.GRID, whitening.GRID)
-        lags = scipy.fft.irfft2(whitening.spectrum(covariance, grid), grid)[np.ix_(reach, reach)]
-        return np.asarray(lags / lags[whitening.LONGEST_LAG_PX, whitening.LONGEST_LAG_PX], np.float64)
+        return _own_correlation(evidence) if self._covariance is None else whitening.correlation(self._covariance)
 
     def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
         """Return the mean covariance of the clouds' residuals by lag, in squared deviations of the local noise."""
@@ -160,11 +155,12 @@ def _in_deviations(
 
 
 @lru_cache(maxsize=1)
-def _own_covariance(evidence: Evidence) -> np.ndarray:
-    """Return the covariance of a cloud's residuals, in squared deviations, once for all findings of the cloud."""
-    known = np.isfinite(evidence.residual_m)
-    residual_m = np.where(known, evidence.residual_m, 0.0)
-    return _covariance(*_in_deviations(residual_m, known.astype(np.float32), (0.0, 0.0))[:3])
+def _own_correlation(evidence: Evidence) -> np.ndarray:
+    """Return the correlation of a cloud's residuals by lag, once for all findings of the cloud."""
+    rows, columns = np.nonzero(np.isfinite(evidence.residual_m))
+    residual_m = evidence.residual_m[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+    weights = np.isfinite(residual_m).astype(np.float32)
+    return whitening.correlation(_covariance(*_in_deviations(np.nan_to_num(residual_m), weights, (0.0, 0.0))[:3]))
 
 
 def _covariance(noise: np.ndarray, known: np.ndarray, depth_px: np.ndarray) -> np.ndarray:
@@ -232,7 +228,8 @@ def _scored(
     views = [(seen.astype(np.float32), _depth_px(seen))]
     spectra.append(whitening.halved(spectra[0]))
     views.append((_halved(views[0][0]), _halved(views[0][1])))
-    zones = [] if rough else [_zones(*view) for view in views]
+    louds = () if heard is None else (heard, np.ascontiguousarray(heard[::2, ::2]))
+    zones = [_zones(*view, loud) for view, loud in zip(views, louds, strict=False)]
     scores, products = [np.empty_like(there) for there, _ in views], [np.empty_like(each) for each in spectra]
     # of fine, coarse and slots' scores
     best = [(np.zeros_like(there), np.zeros(there.shape, np.uint8)) for there, _ in (*views, views[1])]
@@ -255,7 +252,7 @@ def _scored(
             cv2.multiply(score, visible[key], dst=score, scale=worth.energy**-0.5)
             deviation = 1.0
             if heard is not None:
-                deviation = _evened(score, template, *zones[coarse], heard)
+                deviation = _evened(score, template, zones[coarse])
                 if template.radius_px <= TAIL_PX:
                     tail = tail if any(template.halves) else _tail(score, deviation)
                     deviation *= tail
@@ -286,11 +283,14 @@ def _visible(share: np.ndarray, judged: np.ndarray) -> np.ndarray:
     return found
 
 
-def _zones(there: np.ndarray, depth_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the flat indices (n,) of the known pixels outside the last zone, and their zones (n,)."""
+def _zones(there: np.ndarray, depth_px: np.ndarray, loud: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return ``loud`` (r, c) bool, the scores that do not count for the scatter; the flat indices (n,) of the known
+    pixels outside the last zone, in the order of their zones; and where each zone ends (z,) among them."""
     zone = ZONES[np.ceil(np.minimum(depth_px, len(ZONES) - 1)).astype(np.uint8)]
-    rim = np.flatnonzero((zone < N_ZONES - 1) & (there > 0))
-    return rim, zone.ravel()[rim]
+    zone[there == 0] = N_ZONES - 1
+    order = np.argsort(zone, axis=None, kind="stable")
+    ends = np.cumsum(np.bincount(zone.ravel(), minlength=N_ZONES))[:-1]
+    return loud, order[: ends[-1]], ends
 
 
 def _halved(image: np.ndarray) -> np.ndarray:
@@ -299,52 +299,54 @@ def _halved(image: np.ndarray) -> np.ndarray:
     return np.asarray(cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
 
 
-def _evened(
-    score: np.ndarray, template: whitening.Template, rim: np.ndarray, zones: np.ndarray, heard: np.ndarray
-) -> float:
+def _evened(score: np.ndarray, template: whitening.Template, zones: tuple[np.ndarray, ...]) -> float:
     """Return the deviation of the scores (r, c) in the last zone, and divide the scores where others scatter more: in
-    the ``zones`` (n,) of the pixels ``rim`` (n,), and where the squares around scatter by more than `UNEVEN` deviations
-    because the noise there differs from elsewhere. Scores next to ``heard`` (r, c) and strong ones do not count."""
-    step, loud = 1 + template.coarse, heard[:: 1 + template.coarse, :: 1 + template.coarse]
-    found, sums, counts = _scatter(score, rim, zones)
-    is_wide = template.radius_px >= WIDE_PX and not template.slot
-    if is_wide and cv2.norm(score, cv2.NORM_INF) > FAINT * found[-1]:
-        loud = loud | (np.abs(score) > FAINT * found[-1])
-    if loud.any():
-        quiet = score * ~grown(loud, round(template.radius_px / step) if is_wide else 0)
-        again, sums, counts = _scatter(quiet, rim, zones)
-        found = again if counts.sum() > FEWEST else found
+    other zones, and where the squares around scatter by more than `UNEVEN` deviations because the noise there differs
+    from elsewhere. Loud scores do not count, nor strong ones of wide templates, nor those next to them."""
+    step, (loud, *rim) = 1 + template.coarse, zones
+    if template.radius_px >= WIDE_PX and not template.slot:
+        most = FAINT * _scatter(score, np.zeros_like(loud), *rim)[0][-1]
+        strong = loud | (np.abs(score) > most) if cv2.norm(score, cv2.NORM_INF) > most else loud
+        loud = grown(strong, round(template.radius_px / step)) if strong.any() else loud
+    found, sums, counts = _scatter(score, loud, *rim)
+    if counts.sum() <= FEWEST:
+        found = _scatter(score, np.zeros_like(loud), *rim)[0]
     deviation, half_px = float(found[-1]), max(WINDOW_RADII * template.radius_px, local.LEAST_WINDOW) / step
     window = (2 * round(half_px / PART_PX) + 1,) * 2
     size = cv2.blur(sums, window) / np.maximum(cv2.blur(counts, window), 0.05 * PART_PX**2)
     if DEVIATION_OF[int(STEPS * size.max())] > UNEVEN * deviation:
         more = np.maximum(np.interp(size, CAPPED, DEVIATIONS) / (UNEVEN * deviation), 1.0).astype(np.float32)
         score /= cv2.resize(more, score.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    _even(score, rim, zones, (deviation / found).astype(np.float32))
+    _even(score, *rim, (deviation / found).astype(np.float32))
     return deviation
 
 
 @numba.njit(**PLAIN)
-def _even(score: np.ndarray, rim: np.ndarray, zones: np.ndarray, factors: np.ndarray) -> None:
-    flat = score.ravel()
-    for k in range(len(rim)):
-        flat[rim[k]] *= factors[zones[k]]
+def _even(score: np.ndarray, rim: np.ndarray, ends: np.ndarray, factors: np.ndarray) -> None:
+    flat, start = score.ravel(), 0
+    for zone in range(len(ends)):
+        for k in range(start, ends[zone]):
+            flat[rim[k]] *= factors[zone]
+        start = ends[zone]
 
 
 @numba.njit(**PLAIN)
-def _scatter(score: np.ndarray, rim: np.ndarray, zones: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the deviations (z,) of the scores (r, c) that are not 0 in each zone, at least that of the last, from
-    sizes up to `CAP`; and the sums of these sizes in squares of `PART_PX`, and their numbers."""
-    (h, w), most, flat, last = score.shape, np.float32(CAP), score.ravel(), N_ZONES - 1
+def _scatter(
+    score: np.ndarray, loud: np.ndarray, rim: np.ndarray, ends: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the deviations (z,) of the scores (r, c) that are neither 0 nor ``loud`` in each zone, at least that of
+    the last, from sizes up to `CAP`; and the sums of these sizes in squares of `PART_PX`, and their numbers."""
+    (h, w), most, last = score.shape, np.float32(CAP), N_ZONES - 1
     rows, columns = max(1, h // PART_PX), max(1, w // PART_PX)
     sums, counts, whole, number = np.zeros((rows, columns)), np.zeros((rows, columns)), 0.0, 0.0
     for row in range(rows):
         sizes, numbers = np.zeros(w, np.float32), np.zeros(w, np.int32)
         for i in range(row * h // rows, (row + 1) * h // rows):
-            values = score[i]
+            values, hidden = score[i], loud[i]
             for j in range(w):
-                sizes[j] += min(abs(values[j]), most)
-                numbers[j] += values[j] != 0
+                value = np.float32(0.0) if hidden[j] else values[j]
+                sizes[j] += min(abs(value), most)
+                numbers[j] += value != 0
         for part in range(columns):
             for j in range(part * w // columns, (part + 1) * w // columns):
                 sums[row, part] += sizes[j]
@@ -352,14 +354,15 @@ def _scatter(score: np.ndarray, rim: np.ndarray, zones: np.ndarray) -> tuple[np.
             whole += sums[row, part]
             number += counts[row, part]
     totals, known, found = np.zeros(N_ZONES), np.zeros(N_ZONES), np.zeros(N_ZONES)
-    size_there, number_there = 0.0, 0
-    for k in range(len(rim)):
-        size, one = min(abs(flat[rim[k]]), most), flat[rim[k]] != 0
-        totals[zones[k]] += size
-        known[zones[k]] += one
-        size_there += size
-        number_there += one
-    totals[last], known[last] = whole - size_there, number - number_there
+    flat, hides, start = score.ravel(), loud.ravel(), 0
+    for zone in range(last):
+        size, count = 0.0, 0
+        for k in range(start, ends[zone]):
+            value = np.float32(0.0) if hides[rim[k]] else flat[rim[k]]
+            size += min(abs(value), most)
+            count += value != 0
+        totals[zone], known[zone], start = size, count, ends[zone]
+    totals[last], known[last] = whole - totals.sum(), number - known.sum()
     if known[last] < FEWEST:
         totals[last], known[last] = whole, number
     for zone in range(last, -1, -1):

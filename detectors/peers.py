@@ -54,7 +54,7 @@ class PlaneRansacDetector(ScoreMapDetector[PlaneRansacConfig]):
 
     settings_type: ClassVar[type[PlaneRansacConfig]] = PlaneRansacConfig
     name = "plane_ransac"
-    version = 1
+    version = 2
 
     def analyse(self, cloud: Cloud) -> Evidence:
         """Score |residual| / deviation in the crop. Raises UserError if its points determine no plane."""
@@ -107,7 +107,7 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
 
     settings_type: ClassVar[type[M3c2Config]] = M3c2Config
     name = "m3c2"
-    version = 1
+    version = 2
 
     def analyse(self, cloud: Cloud) -> Evidence:
         """Score |distance| / deviation in the crop. Raises UserError if no point has a counterpart."""
@@ -221,7 +221,7 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
 
     settings_type: ClassVar[type[FpfhMemoryConfig]] = FpfhMemoryConfig
     name = "fpfh_memory"
-    version = 1
+    version = 2
 
     def __init__(self, settings: FpfhMemoryConfig, learned: Mapping[str, np.ndarray] | None = None) -> None:
         super().__init__(settings)

@@ -33,7 +33,7 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
 
     settings_type: ClassVar[type[ThesisConfig]] = ThesisConfig
     name = "thesis"
-    version = 5
+    version = 6
 
     @property
     def default_threshold(self) -> float | None:

@@ -57,8 +57,9 @@ def analyse() -> None:
     cloud = averages_of(capture, [FEWEST_FRAMES], AverageConfig(), exact=False)[FEWEST_FRAMES]
     surfaces = [{"method": method} for method in ("lar", "bisquare", "least_squares", "lts")]
     surfaces += [{"shape": shape} for shape in ("auto", "free_form")]
-    for settings in ({"crop": {"kind": "auto"}}, *({"crop": {"kind": "none"}, "surface": each} for each in surfaces)):
-        detector = load_detector("thesis", settings)
+    wanted = [{"crop": {"kind": "auto"}}, *({"crop": {"kind": "none"}, "surface": each} for each in surfaces)]
+    for name, settings in (("matched", wanted[1]), *(("thesis", each) for each in wanted)):
+        detector = load_detector(name, settings)
         with suppress(UserError):  # the crop may find no target in so small a capture, but its loops have run by then
             evidence = detector.analyse(cloud)
             for detection in detector.find(cloud, evidence, detector.quiet_threshold(cloud, evidence) / 2):

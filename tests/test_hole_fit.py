@@ -100,7 +100,9 @@ def test_correlated_products_equal_box_filters(window: tuple[int, int]) -> None:
     padded = np.pad(columns, ((0, 0), (down - 1, down - 1), (across - 1, across - 1)))
     filtered = [cv2.boxFilter(one, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT) for one in padded]
     summed = np.stack(filtered).reshape(6, -1)
-    np.testing.assert_allclose(correlated_products(columns, across, down), summed @ summed.T, rtol=1e-10, atol=1e-9)
+    np.testing.assert_allclose(
+        correlated_products(np.moveaxis(columns, 0, -1), across, down), summed @ summed.T, rtol=1e-10, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("projection", ["central", "parallel"])
