@@ -24,7 +24,7 @@ MOST_TURNED, MOST_SPREAD = 1e3, 1e9  # in place of an unknown deviation: of a ph
 
 class Certainty(NamedTuple):
     """Sorted pixels, (n,) bool: ``always`` a range, to first order in the noise; ``never`` a range. Without noise, (n,)
-    float64: ``z_m`` before rounding, and its change per metre of half path; ``deviation_m`` of a frame's z;
+    float32: ``z_m`` before rounding, and its change per metre of half path; ``deviation_m`` of a frame's z;
     ``amplitude``, the mean over frequencies, and its deviation; ``reason`` uint8."""
 
     always: np.ndarray
@@ -185,7 +185,7 @@ def fill_even(
     and by one deviation of the centre's noise in total."""
 
     space, at = window.space, np.flatnonzero(even)
-    each, centre = np.empty((2, len(edge), len(at)))
+    each, centre = np.empty((2, len(edge), len(at)), np.float32)
     carried = light.amplitude if window.by_amplitude else np.ones_like(light.amplitude)
     of_neighbours, of_rest = _shares_of(window)
     for f in range(len(edge)):

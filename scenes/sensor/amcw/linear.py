@@ -76,9 +76,9 @@ W = np.uint64(ABREAST)
 BETWEEN, AMPLITUDE, BRIGHT, TURN, SWAY, SIZE, WEIGHT, SLOPE, BEND, MOVED, FIELDS = (
     W * np.uint64(row) for row in (0, 2, 3, 4, 5, 6, 7, 8, 10, 12, 13)
 )
-"""Places of a neighbour's values in the room of `_linearise`, each for `ABREAST` pixels; the imaginary part of a complex
-value lies `W` behind. exp(i t) of the neighbour's phase minus the centre's; its `Light`, and its amplitude's deviation;
-its weight by distance, 0 if it does not count, and its weight in the filter; its part in the sum, differentiated by its
+"""Places of a neighbour's values in the room of `_linearise`, each for `ABREAST` pixels, an imaginary part `W` behind
+its real part. exp(i t) of the neighbour's phase minus the centre's; its `Light`, and its amplitude's deviation; its
+weight by distance, 0 if it does not count, and its weight in the filter; its part in the sum, differentiated by its
 phase once and twice; the change of the sum's phase."""
 C, LIT, SURE, NOISE, FIT, *ROWS_LEFT = (W * np.uint64(row) for row in range(16))
 ROWS = tuple(ROWS_LEFT)
