@@ -340,7 +340,9 @@ class AtOnce:
                 # the amplitude's noise in each frame is one deviation up or down
                 bits = np.uint64(sum(1 << lane for lane in np.flatnonzero(there).tolist()))
                 part += f4(2) * np.bitwise_count(signs & bits) - f4(there.sum())
-        running = (np.cumsum(values, axis=0, dtype=values.dtype) for values in (total, squares, sway, *sums))
+        running = (total, squares, sway, *sums)
+        for values in running:
+            np.add.accumulate(values, out=values)
         frames_in = np.cumsum([len(frames) for frames in parts]).tolist()
         return [self._finished(*each) for each in zip(frames_in, *running, strict=True)]
 
