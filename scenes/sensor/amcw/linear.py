@@ -9,14 +9,14 @@ of the window's sum, and a neighbour's for less by c s^2. Terms of second and th
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numba
 import numpy as np
 from scipy import special
 
 from scenes.sensor.amcw.kernels import FilterSettings
-from scenes.sensor.normals import FAST, bits_float, float_bits
+from scenes.sensor.normals import FAST
 
 if TYPE_CHECKING:
     from scenes.sensor.amcw.imager import AmcwExposure
@@ -89,53 +89,27 @@ certain which neighbours count; the largest phase noise; whether the linear mode
 def light_of_samples(exposure: AmcwExposure, knee: float, gains: np.ndarray) -> Light:
     """Return the light of an exposure. Each sample has its own variance, plus step^2/12 by the converter's rounding."""
     phases = exposure.means.shape[1]
-    angle = (2 * np.pi * np.arange(phases) / phases).astype(f4)
-    shape = len(exposure.means), exposure.sigma.size
+    angle = 2 * np.pi * np.arange(phases)[:, None] / phases
+    cosines, sines, shape = np.cos(angle).astype(f4), np.sin(angle).astype(f4), (len(gains), exposure.sigma.size)
     light = Light(np.empty(shape, np.complex64), *(np.empty(shape, f4) for _ in range(4)))
-    scales = gains * f4(2 / phases)
-    for means, scale, *parts in zip(exposure.means, scales, *light, strict=True):
-        _moments(means, exposure.sigma, f4(knee), np.cos(angle), np.sin(angle), scale, Light(*parts))
+    for f, means in enumerate(exposure.means):
+        # the companding converter's step at a sample, in knees: its bits without the mantissa
+        step = np.maximum((np.abs(means / f4(knee)).view(np.uint32) & np.uint32(0x7F800000)).view(f4), ONE)
+        variance = exposure.sigma**2 + step**2 / 12
+        # direction and length of the phasor; without light there is no direction: any will do
+        re, im = (means * cosines).sum(axis=0), (means * sines).sum(axis=0)
+        size = np.maximum(np.sqrt(re * re + im * im), LEAST)
+        re, im = np.where(size > LEAST, re / size, ONE), np.where(size > LEAST, im / size, ZERO)
+        light.phasor[f].real, light.phasor[f].imag = re, im
+        light.amplitude[f] = gains[f] * f4(2 / phases) * size
+        # deviations across and along that direction
+        light.turn[f] = np.sqrt((variance * (re * sines - im * cosines) ** 2).sum(axis=0)) / size
+        light.swell[f] = np.sqrt((variance * (re * cosines + im * sines) ** 2).sum(axis=0)) / size
+    light.bright[:] = light.amplitude * np.sqrt(ONE + light.turn**2)
     near = light.swell > 0.1
     deviation = light.amplitude[near] * np.sqrt((light.turn[near] ** 2 + light.swell[near] ** 2) / 2)
     light.bright[near] = deviation * np.interp(light.amplitude[near] / np.maximum(deviation, SMALLEST), LENGTHS, RICE)
     return light
-
-
-@numba.njit(**FAST)
-def _moments(means, sigma, knee, cosines, sines, scale, light):  # type: ignore[no-untyped-def]
-    """Fill the light (n,) of one frequency from its samples ``means`` (k, n)."""
-    sums, per_knee, size = np.empty(ROWS[-1] + W, f4), ONE / knee, np.uint64(sigma.size)
-    re, im, squares, products, others = ROWS[:5]
-    for start in range(np.uint64(0), size, W):
-        count = min(W, size - start)
-        sums[re : others + W] = ZERO
-        for k in range(len(means)):
-            c, s = cosines[k], sines[k]
-            for x in range(count):
-                # the companding converter's step at a sample: its bits without the mantissa
-                sample, noise = means[k, start + x], sigma[start + x]
-                word: Any = float_bits(abs(sample) * per_knee)
-                step = max(bits_float(word & np.uint32(0x7F800000)), ONE)
-                variance = noise * noise + step * step * f4(1 / 12)
-                sums[re + x] += c * sample
-                sums[im + x] += s * sample
-                sums[squares + x] += variance * c * c
-                sums[products + x] += variance * c * s
-                sums[others + x] += variance * s * s
-        for x in range(count):
-            # direction and length of the phasor, and its deviations across and along that direction
-            cosine, sine = sums[re + x], sums[im + x]
-            length = np.sqrt(cosine * cosine + sine * sine)
-            # without light there is no direction: any will do
-            lit, inverse = length > LEAST, ONE / max(length, LEAST)
-            cosine, sine = cosine * inverse if lit else ONE, sine * inverse if lit else ZERO
-            cc, both, ss = cosine * cosine, TWO * cosine * sine, sine * sine
-            across = ss * sums[squares + x] - both * sums[products + x] + cc * sums[others + x]
-            along = cc * sums[squares + x] + both * sums[products + x] + ss * sums[others + x]
-            i, turn = start + x, np.sqrt(max(across, ZERO)) * inverse
-            light.phasor[i], light.amplitude[i] = complex(cosine, sine), scale * max(length, LEAST)
-            light.bright[i] = light.amplitude[i] * np.sqrt(ONE + turn * turn)
-            light.turn[i], light.swell[i] = turn, np.sqrt(max(along, ZERO)) * inverse
 
 
 def linearised(
