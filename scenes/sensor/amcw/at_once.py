@@ -342,7 +342,8 @@ class AtOnce:
                 part += f4(2) * np.bitwise_count(signs & bits) - f4(there.sum())
         running = (total, squares, sway, *sums)
         for values in running:
-            np.add.accumulate(values, out=values)
+            for later in range(1, k):
+                values[later] += values[later - 1]
         frames_in = np.cumsum([len(frames) for frames in parts]).tolist()
         return [self._finished(*each) for each in zip(frames_in, *running, strict=True)]
 
