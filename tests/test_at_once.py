@@ -30,7 +30,6 @@ from scenes.sensor.amcw.imager import AmcwImager
 from scenes.sensor.amcw.kernels import LANES
 from scenes.sensor.amcw.linear import light_of_samples
 from scenes.sensor.camera import CameraConfig, EffectsConfig, camera_of
-from scenes.sensor.normals import standard_normals
 from scenes.sensor.source import SimulatedUnit
 
 REGIONS = {"azure_kinect_nfov": Region(306, 338, 296, 352), "kinect_v2_libfreenect2": Region(196, 228, 226, 282)}
@@ -298,10 +297,10 @@ def test_listed_pixels_go_through_the_same_chain_as_frames():
     summer, imager = unit.at_once, unit.model
     assert summer is not None and isinstance(imager, AmcwImager)
     light, places = summer.light, summer.list
-    normals = standard_normals(random_stream(1), (len(places.halo), 3, 2, LANES))
+    words = random_stream(1).integers(2**32, size=(len(places.halo), 3, LANES), dtype=np.uint32)
     planes = np.empty((len(places.halo) // kernels.BESIDE + 2, 3, 3, kernels.STRIDE), np.float32)
-    noise = np.zeros((len(places.halo), LANES), np.float32)
-    kernels.noisy_phasors(*light[:2], *light[3:], summer.shares, normals, planes, noise)
+    noise = np.empty((len(places.halo), LANES), np.float32)
+    kernels.noisy_phasors(*light[:2], *light[3:], summer.shares, words, planes, noise)
     filtered = np.empty((3, 3, len(places.range), LANES), np.float32)
     edge = np.empty((3, len(places.range), LANES), np.float32)
     kernels.filter_listed(planes, places.window, imager.filter_settings, filtered, edge)

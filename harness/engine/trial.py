@@ -33,7 +33,7 @@ from scenes.sensor.camera import CameraConfig, camera_of
 from scenes.sensor.source import SimulatedCapture, SimulatedUnit
 from scenes.sensor.unit import FrameTotals
 
-FEWEST_FRAMES = 20
+FEWEST_FRAMES = 10
 """Drawing fewer frames costs less than sorting a view's pixels. Results depend on the number only, not on the cost."""
 FLAT_ALBEDO = 0.6  # albedo of a flat field's plane: painted wood or paper, like the boards of the experiments
 MOST_DISTURBED = 0.5

@@ -32,6 +32,15 @@ def normals_from_bits(bits: np.ndarray, out: np.ndarray) -> None:
 
 
 @numba.njit(inline="always", **FAST)
+def normal_pair(word):  # type: ignore[no-untyped-def]
+    """Return two standard normals from a uniform word of 32 bits: from 65,536 radii, up to 4.9, and as many angles."""
+    u = (np.float32(word & np.uint32(0xFFFF)) + np.float32(0.5)) * np.float32(2.0**-16)
+    radius = np.sqrt(np.float32(-2) * _log(u))
+    sine, cosine = _sincos_turns(np.float32(word >> np.uint32(16)) * np.float32(2.0**-16))
+    return radius * cosine, radius * sine
+
+
+@numba.njit(inline="always", **FAST)
 def _log(u):  # type: ignore[no-untyped-def]
     """Return the natural logarithm of a positive float32: exponent from its bits, mantissa by an atanh series."""
     word: Any = float_bits(u)

@@ -16,16 +16,16 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
+import cv2
 import numba
 import numpy as np
-from scipy import ndimage
 
 from harness.vocabulary.geometry import MM, Reason
 from scenes.sensor.amcw import kernels, ranging
 from scenes.sensor.amcw.certainty import Certainty, certainty, even_pixels, fill_even
 from scenes.sensor.amcw.kernels import LANES
 from scenes.sensor.amcw.linear import DEVIATIONS, Light, light_of_samples, linearised, unknown_filtered
-from scenes.sensor.normals import EXACT_SUMS, FAST, standard_normals
+from scenes.sensor.normals import EXACT_SUMS, FAST
 from scenes.sensor.unit import N_REASONS, FrameTotals
 
 if TYPE_CHECKING:
@@ -171,13 +171,18 @@ class Listed(NamedTuple):
 
 
 def _listed(wanted: np.ndarray, side: int, flying: bool) -> Listed:
-    ranges = ndimage.binary_dilation(wanted, np.ones((3, 3), bool)) if flying else wanted
-    halo = ndimage.binary_dilation(ranges, np.ones((side, side), bool))
+    ranges = grown(wanted, 3) if flying else wanted
+    halo = grown(ranges, side)
     # running numbers of the pixels, -1 elsewhere
     in_range, in_halo = (np.where(m, np.cumsum(m).reshape(m.shape) - 1, -1).astype(np.int32) for m in (ranges, halo))
     range_, wanted_ = np.flatnonzero(ranges), np.flatnonzero(wanted)
     window, near = windows_of(in_halo, side, -1, range_), windows_of(in_range, 3, -1, wanted_)
     return Listed(np.flatnonzero(halo), range_, in_range.ravel()[wanted_], window, near)
+
+
+def grown(pixels: np.ndarray, side: int) -> np.ndarray:
+    """Return the pixels (h, w) bool whose window of ``side`` contains one of ``pixels`` (h, w) bool."""
+    return cv2.dilate(pixels.view(np.uint8), np.ones((side, side), np.uint8)).view(bool)
 
 
 def windows_of(image: np.ndarray, side: int, beyond: float, pixels: np.ndarray) -> np.ndarray:
@@ -211,7 +216,7 @@ def at_once(imager: AmcwImager, exposure: AmcwExposure, pixels: np.ndarray) -> A
     filtered = unknown_filtered(len(light.turn), n)
     of_even = fill_even(even, alone.reshape(len(alone), 3, n), edge, light, window, shape, filtered)
     # in the finished image, the engine looks one pixel beyond the requested ones
-    rest = np.flatnonzero(~(even | lost) & ndimage.binary_dilation(pixels, np.ones((3, 3), bool)).ravel())
+    rest = np.flatnonzero(~(even | lost) & grown(pixels, 3).ravel())
     moved = linearised(rest, light, window, shape, lost, filtered)
     farthest_m = (unit.jump_mm.value + JITTERS * unit.jitter_mm.value + abs(unit.drift_mm.value)) * MM
     certain = certainty(filtered, imager.engine, lost, shape, farthest_m)
@@ -219,7 +224,7 @@ def at_once(imager: AmcwImager, exposure: AmcwExposure, pixels: np.ndarray) -> A
     if wanted.mean() > MOST_LISTED:
         return None
 
-    metres = imager.engine.lattice.metres_per_turn.astype(float)[:, None] / (2 * np.pi)
+    metres = imager.engine.lattice.metres_per_turn[:, None] / f4(2 * np.pi)
     # metres of half path per radian of each phase, times the amplitude that carries it, over its median
     pull = np.broadcast_to(metres, light.turn.shape)
     if window.by_amplitude:
@@ -237,14 +242,14 @@ def _linear(
 ) -> Linear:
     """Return the linear pixels: even ones with the results of `fill_even`, the others with those of `linearised`."""
     (even, of_each, of_centre), (rest, moved) = at_even, at_rest
-    space, by_amplitude = imager.filter_settings.space.astype(float), imager.filter_settings.by_amplitude
+    space, by_amplitude = imager.filter_settings.space, imager.filter_settings.by_amplitude
     n, step_m, side = light.turn.shape[1], imager.camera.z_step_m, space.shape[0]
-    metres = imager.engine.lattice.metres_per_turn.astype(float)[:, None] / (2 * np.pi)
+    metres = imager.engine.lattice.metres_per_turn[:, None] / f4(2 * np.pi)
     by_path, always = certain.z_by_path, certain.always
-    z = np.where(always, certain.z_m / step_m, 0.0)
-    noise = np.sqrt(((pull * np.minimum(light.turn, 1.0)) ** 2).sum(axis=0))
+    z = np.where(always, certain.z_m / f4(step_m), f4(0))
+    noise = np.sqrt(((pull * np.minimum(light.turn, f4(1))) ** 2).sum(axis=0))
     kind, row = np.full(n, NONE, np.uint8), np.zeros(n, np.int32)
-    each, more = np.zeros(n), np.zeros(n)
+    each, more = np.zeros((2, n), f4)
     kind[even] = np.where(always[even], EVEN, NONE)
     carried = light.amplitude[:, even] if by_amplitude else 1.0
     moves = metres * of_each * carried * light.turn[:, even]
@@ -256,15 +261,14 @@ def _linear(
     at = rest[kept]
     kind[at], row[at] = UNEVEN, np.arange(len(at))
     pulls = metres[:, :, None] * moved[:, kept]
-    by_each = np.copysign(np.sqrt((pulls**2).sum(axis=0)), pulls.sum(axis=0)) * by_path[at, None] / step_m
+    by_each = np.copysign(np.sqrt((pulls**2).sum(axis=0)), pulls.sum(axis=0)) * by_path[at, None] / f4(step_m)
     by_each /= windows_of(noise.reshape(imager.region.shape), side, 1.0, at)
     taps = space[side // 2] / np.sqrt(space[side // 2, side // 2])
     rim = (10 * ((side + 4) // 10) + 5 - side) // 2
     taps, by_each = np.pad(taps, rim), np.pad(by_each.reshape(-1, side, side), ((0, 0), (rim, rim), (rim, rim)))
     by_each = by_each.reshape(-1, taps.size**2)
     base = np.round(z)
-    own, off, steps, others, rest_of = (values.astype(f4) for values in (noise, z - base, by_path, each, more))
-    return Linear(kind, own, base.astype(f4), off, steps, others, rest_of, row, by_each.astype(f4), taps.astype(f4))
+    return Linear(kind, noise, base, z - base, by_path, each, more, row, by_each, taps)
 
 
 @dataclass(frozen=True)
@@ -336,7 +340,10 @@ class AtOnce:
                 # the amplitude's noise in each frame is one deviation up or down
                 bits = np.uint64(sum(1 << lane for lane in np.flatnonzero(there).tolist()))
                 part += f4(2) * np.bitwise_count(signs & bits) - f4(there.sum())
-        running = (np.cumsum(values, axis=0, dtype=values.dtype) for values in (total, squares, sway, *sums))
+        running = (total, squares, sway, *sums)
+        for values in running:
+            for later in range(1, k):
+                values[later] += values[later - 1]
         frames_in = np.cumsum([len(frames) for frames in parts]).tolist()
         return [self._finished(*each) for each in zip(frames_in, *running, strict=True)]
 
@@ -345,9 +352,8 @@ class AtOnce:
     ) -> FrameTotals:
         """Return the sums over ``frames`` frames from those of the linear and of the listed pixels."""
         certain, taps, shape = self.certain, self.linear.taps, self.shape
-        noise = sway.reshape(shape)
-        for axis in (0, 1):
-            noise = ndimage.correlate1d(noise, taps / np.sqrt((taps**2).sum()), axis=axis, mode="constant")
+        even = taps / np.sqrt((taps**2).sum())
+        noise = cv2.sepFilter2D(sway.reshape(shape), -1, even, even, borderType=cv2.BORDER_CONSTANT)
         swaying = frames * certain.amplitude + certain.amplitude_deviation * noise.ravel()
         amplitude = np.where(certain.always, swaying, 0.0)
         count = np.where(certain.always, frames, 0).astype(np.int32)
@@ -368,9 +374,10 @@ class AtOnce:
         (g, lanes)."""
         light, flying_gate, wanted = self.light, self.imager.engine.flying, self.list.wanted
         g, m, n_frequencies = len(self.list.halo), len(self.list.range), len(light.turn)
-        normals, noise = standard_normals(rng, (g, n_frequencies, 2, LANES)), np.zeros((g, LANES), f4)
+        words = rng.bit_generator.random_raw(g * n_frequencies * LANES // 2).view(np.uint32)
+        words, noise = words.reshape(g, n_frequencies, LANES), np.empty((g, LANES), f4)
         planes = np.empty((g // kernels.BESIDE + 2, n_frequencies, 3, kernels.STRIDE), f4)
-        kernels.noisy_phasors(*light[:2], *light[3:], self.shares, normals, planes, noise)
+        kernels.noisy_phasors(*light[:2], *light[3:], self.shares, words, planes, noise)
         filtered, edge = np.empty((n_frequencies, 3, m, LANES), f4), np.empty((n_frequencies, m, LANES), f4)
         kernels.filter_listed(planes, self.list.window, self.imager.filter_settings, filtered, edge)
         flat, unsaturated = filtered.reshape(n_frequencies, 3, -1), np.zeros(m * LANES, np.uint8)

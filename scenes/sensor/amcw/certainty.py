@@ -24,7 +24,7 @@ MOST_TURNED, MOST_SPREAD = 1e3, 1e9  # in place of an unknown deviation: of a ph
 
 class Certainty(NamedTuple):
     """Sorted pixels, (n,) bool: ``always`` a range, to first order in the noise; ``never`` a range. Without noise, (n,)
-    float64: ``z_m`` before rounding, and its change per metre of half path; ``deviation_m`` of a frame's z;
+    float32: ``z_m`` before rounding, and its change per metre of half path; ``deviation_m`` of a frame's z;
     ``amplitude``, the mean over frequencies, and its deviation; ``reason`` uint8."""
 
     always: np.ndarray
@@ -183,34 +183,21 @@ def fill_even(
     """Fill ``out`` at the ``even`` pixels (n,) bool, from the noise-free ``filtered`` (f, 3, n) and ``edge`` (f, n).
     Return, (f, m) each, the change of the phase by a neighbour's noise at weight and amplitude 1, over its deviation,
     and by one deviation of the centre's noise in total."""
+    at, tables, middle = np.flatnonzero(even), _shares_of(window), len(window.space) // 2
+    each, centre = np.empty((2, len(edge), len(at)), f4)
+    # the weights are a product of those along rows and along columns
+    taps = window.space[middle] / np.sqrt(window.space[middle, middle])
 
-    space, at = window.space, np.flatnonzero(even)
-    each, centre = np.empty((2, len(edge), len(at)))
-    carried = light.amplitude if window.by_amplitude else np.ones_like(light.amplitude)
-    of_neighbours, of_rest = _shares_of(window)
+    def summed(values: np.ndarray, taps: np.ndarray) -> np.ndarray:
+        return cv2.sepFilter2D(values.reshape(shape), -1, taps, taps, borderType=cv2.BORDER_CONSTANT).ravel()
+
     for f in range(len(edge)):
-        sums = [carried[f], (carried[f] * light.turn[f]) ** 2, (light.amplitude[f] * light.swell[f]) ** 2]
-        for number, weights in enumerate((space, space**2, space**2)):
-            # the weights are a product of those along rows and along columns
-            across = weights[len(space) // 2] / np.sqrt(weights[len(space) // 2, len(space) // 2])
-            plane = sums[number].reshape(shape)
-            sums[number] = cv2.sepFilter2D(plane, -1, across, across, borderType=cv2.BORDER_CONSTANT).ravel()
         ours, theirs = Light(*(part[f] for part in light)), Filtered(*(part[f] for part in out))
-        tables = (of_neighbours, of_rest)
-        _fill_even(
-            at,
-            filtered[f],
-            edge[f],
-            ours,
-            carried[f],
-            *sums,
-            space,
-            tables,
-            window.by_amplitude,
-            theirs,
-            each[f],
-            centre[f],
-        )
+        carried = ours.amplitude if window.by_amplitude else np.ones_like(ours.amplitude)
+        squares, spreads = (carried * ours.turn) ** 2, (ours.amplitude * ours.swell) ** 2
+        sums = summed(carried, taps), summed(squares, taps**2), summed(spreads, taps**2)
+        inputs = at, filtered[f], edge[f], ours, carried, *sums, window.space, tables, window.by_amplitude
+        _fill_even(*inputs, theirs, each[f], centre[f])
     return each, centre
 
 
@@ -234,10 +221,9 @@ def _fill_even(  # type: ignore[no-untyped-def]
         variance = each[m] ** 2 * (squares[i] - (middle * carried[i] * own) ** 2) + centre2
         centre[m] = np.sqrt(centre2)
         # noise moves the mean towards the centre's own phase, as it does the shares
-        re, im = filtered[0, i], filtered[1, i]
-        size = share / np.sqrt(re * re + im * im)
-        mean = light.phasor[i] * (1 - share) + complex(re * size, im * size)
-        out.phasor[i] = mean / np.sqrt(mean.real * mean.real + mean.imag * mean.imag)
+        alone = complex(filtered[0, i], filtered[1, i])
+        mean = light.phasor[i] * (1 - share) + alone * (share / np.sqrt(alone.real**2 + alone.imag**2))
+        out.phasor[i] = mean / np.sqrt(mean.real**2 + mean.imag**2)
         # noise perpendicular to a mean phasor lengthens it
         out.amplitude[i] = filtered[2, i] * (1 + 0.5 * variance if by_amplitude else 1.0)
         out.turned[i] = np.sqrt(variance)

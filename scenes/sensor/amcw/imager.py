@@ -12,7 +12,6 @@ from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from scipy import ndimage
 
@@ -22,7 +21,7 @@ from scenes.sensor.amcw import kernels, ranging
 from scenes.sensor.amcw.at_once import windows_of
 from scenes.sensor.amcw.facts import AmcwCamera, ScatterFacts, unwrap_table
 from scenes.sensor.camera import CameraConfig
-from scenes.sensor.normals import FAST, standard_normals
+from scenes.sensor.normals import standard_normals
 from scenes.sensor.unit import DecodedFrame, UnitModel, light_of, rays_of, smooth_field
 
 f4 = np.float32
@@ -46,30 +45,20 @@ def with_harmonics(signal: np.ndarray, phases: int, residual: np.ndarray) -> np.
     (f,). Square light under square demodulation correlates to a triangle: odd harmonics n of 1/n^2. N equidistant
     samples see harmonic n as the fundamental if n = +1 mod N, and as its conjugate if n = -1. Approximation: a pixel
     that sees several paths has the harmonics of their sum, not the sum of their harmonics."""
-    apart = phases if phases % 2 == 0 else 2 * phases
-    centres = np.arange(apart, HIGHEST_HARMONIC, apart, dtype=float)
-    parts = np.stack([1 / (centres - 1) ** 2, 1 / (centres + 1) ** 2])
-    changed = np.empty(signal.shape, complex)
+    apart, changed = phases if phases % 2 == 0 else 2 * phases, np.ones_like(signal)
+    # frequency by frequency, so that all stays in the processor's cache
     for light, share, out in zip(signal, residual, changed, strict=True):
-        _add_harmonics(light.ravel(), share, apart, parts, out.reshape(-1))
-    return changed
-
-
-@numba.njit(**FAST)
-def _add_harmonics(signal, share, apart, parts, out):  # type: ignore[no-untyped-def]
-    """Write into ``out`` (n,) the signal (n,) with harmonics of parts (2, m): of the conjugate, and of the signal."""
-    for i in range(signal.size):
-        re, im = signal[i].real, signal[i].imag
-        size = max(np.sqrt(re * re + im * im), 1e-300)
-        direction = complex(re / size, im / size)
-        wave, power, alias_re, alias_im = 1.0 + 0.0j, 1.0 + 0.0j, 0.0, 0.0
-        for _ in range(apart):
+        direction = light / np.maximum(np.abs(light), 1e-300)
+        wave, power = direction.copy(), np.ones_like(light)
+        for _ in range(apart - 1):
             wave *= direction
-        for k in range(parts.shape[1]):
+        for centre in range(apart, HIGHEST_HARMONIC, apart):
             power *= wave
-            alias_re += (parts[1, k] + parts[0, k]) * power.real
-            alias_im += (parts[1, k] - parts[0, k]) * power.imag
-        out[i] = signal[i] * complex(1.0 + share * alias_re, share * alias_im)
+            of_conjugate, of_signal = share / (centre - 1) ** 2, share / (centre + 1) ** 2
+            out.real += (of_signal + of_conjugate) * power.real
+            out.imag += (of_signal - of_conjugate) * power.imag
+        out *= light
+    return changed
 
 
 def scattered(image: np.ndarray, facts: ScatterFacts) -> np.ndarray:

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from scenes.sensor.normals import FAST, bits_float, float_bits, fma
+from scenes.sensor.normals import FAST, bits_float, float_bits, fma, normal_pair
 
 f4 = np.float32
 ZERO, HALF, ONE = f4(0), f4(0.5), f4(1)
@@ -68,10 +68,11 @@ def _place(j, f, n_frequencies):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(**FAST)
-def noisy_phasors(phasor, amplitude, turn, swell, shares, normals, planes, noise):  # type: ignore[no-untyped-def]
-    """Write phasors (f, g) with noise of ``normals`` (g, f, 2, lanes) into ``planes`` (rows, f, 3, stride), at `_place`
-    re, im, size; and into ``noise`` (g, lanes), zeros before, the sum of the phases' normals by ``shares`` (g, f)."""
-    g, n_frequencies, _, _ = normals.shape
+def noisy_phasors(phasor, amplitude, turn, swell, shares, words, planes, noise):  # type: ignore[no-untyped-def]
+    """Write phasors (f, g) with noise of random ``words`` (g, f, lanes) uint32 into ``planes`` (rows, f, 3, stride), at
+    `_place` re, im, size; and into ``noise`` (g, lanes) the sum of the phases' normals by ``shares`` (g, f)."""
+    g, n_frequencies, _ = words.shape
+    noise[:] = ZERO
     flat, p1, p2 = planes.reshape(planes.size), np.uint64(STRIDE), np.uint64(2 * STRIDE)
     for j in range(g):
         for f in range(n_frequencies):
@@ -81,14 +82,14 @@ def noisy_phasors(phasor, amplitude, turn, swell, shares, normals, planes, noise
             beside = np.float32(amplitude[f, j] * swell[f, j])
             start = np.uint64(_place(j, f, n_frequencies))
             for t in range(np.uint64(LANES)):
-                along = size + beside * normals[j, f, 0, t]
-                across = over * normals[j, f, 1, t]
+                first, second = normal_pair(words[j, f, t])
+                along, across = size + beside * first, over * second
                 length = np.sqrt(along * along + across * across)
                 inverse = ONE / max(length, SMALLEST)
                 flat[start + t] = (c * along - s * across) * inverse
                 flat[start + p1 + t] = (s * along + c * across) * inverse
                 flat[start + p2 + t] = length
-                noise[j, t] += share * normals[j, f, 1, t]
+                noise[j, t] += share * second
 
 
 TOGETHER = 5  # neighbours that are summed in one pass, which holds the sums in registers

@@ -9,14 +9,14 @@ of the window's sum, and a neighbour's for less by c s^2. Terms of second and th
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numba
 import numpy as np
 from scipy import special
 
 from scenes.sensor.amcw.kernels import FilterSettings
-from scenes.sensor.normals import FAST, bits_float, float_bits
+from scenes.sensor.normals import FAST
 
 if TYPE_CHECKING:
     from scenes.sensor.amcw.imager import AmcwExposure
@@ -76,9 +76,9 @@ W = np.uint64(ABREAST)
 BETWEEN, AMPLITUDE, BRIGHT, TURN, SWAY, SIZE, WEIGHT, SLOPE, BEND, MOVED, FIELDS = (
     W * np.uint64(row) for row in (0, 2, 3, 4, 5, 6, 7, 8, 10, 12, 13)
 )
-"""Places of a neighbour's values in the room of `_linearise`, each for `ABREAST` pixels; the imaginary part of a complex
-value lies `W` behind. exp(i t) of the neighbour's phase minus the centre's; its `Light`, and its amplitude's deviation;
-its weight by distance, 0 if it does not count, and its weight in the filter; its part in the sum, differentiated by its
+"""Places of a neighbour's values in the room of `_linearise`, each for `ABREAST` pixels, an imaginary part `W` behind
+its real part. exp(i t) of the neighbour's phase minus the centre's; its `Light`, and its amplitude's deviation; its
+weight by distance, 0 if it does not count, and its weight in the filter; its part in the sum, differentiated by its
 phase once and twice; the change of the sum's phase."""
 C, LIT, SURE, NOISE, FIT, *ROWS_LEFT = (W * np.uint64(row) for row in range(16))
 ROWS = tuple(ROWS_LEFT)
@@ -89,53 +89,27 @@ certain which neighbours count; the largest phase noise; whether the linear mode
 def light_of_samples(exposure: AmcwExposure, knee: float, gains: np.ndarray) -> Light:
     """Return the light of an exposure. Each sample has its own variance, plus step^2/12 by the converter's rounding."""
     phases = exposure.means.shape[1]
-    angle = (2 * np.pi * np.arange(phases) / phases).astype(f4)
-    shape = len(exposure.means), exposure.sigma.size
+    angle = 2 * np.pi * np.arange(phases)[:, None] / phases
+    cosines, sines, shape = np.cos(angle).astype(f4), np.sin(angle).astype(f4), (len(gains), exposure.sigma.size)
     light = Light(np.empty(shape, np.complex64), *(np.empty(shape, f4) for _ in range(4)))
-    scales = gains * f4(2 / phases)
-    for means, scale, *parts in zip(exposure.means, scales, *light, strict=True):
-        _moments(means, exposure.sigma, f4(knee), np.cos(angle), np.sin(angle), scale, Light(*parts))
+    for f, means in enumerate(exposure.means):
+        # the companding converter's step at a sample, in knees: its bits without the mantissa
+        step = np.maximum((np.abs(means / f4(knee)).view(np.uint32) & np.uint32(0x7F800000)).view(f4), ONE)
+        variance = exposure.sigma**2 + step**2 / 12
+        # direction and length of the phasor; without light there is no direction: any will do
+        re, im = (means * cosines).sum(axis=0), (means * sines).sum(axis=0)
+        size = np.maximum(np.sqrt(re * re + im * im), LEAST)
+        re, im = np.where(size > LEAST, re / size, ONE), np.where(size > LEAST, im / size, ZERO)
+        light.phasor[f].real, light.phasor[f].imag = re, im
+        light.amplitude[f] = gains[f] * f4(2 / phases) * size
+        # deviations across and along that direction
+        light.turn[f] = np.sqrt((variance * (re * sines - im * cosines) ** 2).sum(axis=0)) / size
+        light.swell[f] = np.sqrt((variance * (re * cosines + im * sines) ** 2).sum(axis=0)) / size
+    light.bright[:] = light.amplitude * np.sqrt(ONE + light.turn**2)
     near = light.swell > 0.1
     deviation = light.amplitude[near] * np.sqrt((light.turn[near] ** 2 + light.swell[near] ** 2) / 2)
     light.bright[near] = deviation * np.interp(light.amplitude[near] / np.maximum(deviation, SMALLEST), LENGTHS, RICE)
     return light
-
-
-@numba.njit(**FAST)
-def _moments(means, sigma, knee, cosines, sines, scale, light):  # type: ignore[no-untyped-def]
-    """Fill the light (n,) of one frequency from its samples ``means`` (k, n)."""
-    sums, per_knee, size = np.empty(ROWS[-1] + W, f4), ONE / knee, np.uint64(sigma.size)
-    re, im, squares, products, others = ROWS[:5]
-    for start in range(np.uint64(0), size, W):
-        count = min(W, size - start)
-        sums[re : others + W] = ZERO
-        for k in range(len(means)):
-            c, s = cosines[k], sines[k]
-            for x in range(count):
-                # the companding converter's step at a sample: its bits without the mantissa
-                sample, noise = means[k, start + x], sigma[start + x]
-                word: Any = float_bits(abs(sample) * per_knee)
-                step = max(bits_float(word & np.uint32(0x7F800000)), ONE)
-                variance = noise * noise + step * step * f4(1 / 12)
-                sums[re + x] += c * sample
-                sums[im + x] += s * sample
-                sums[squares + x] += variance * c * c
-                sums[products + x] += variance * c * s
-                sums[others + x] += variance * s * s
-        for x in range(count):
-            # direction and length of the phasor, and its deviations across and along that direction
-            cosine, sine = sums[re + x], sums[im + x]
-            length = np.sqrt(cosine * cosine + sine * sine)
-            # without light there is no direction: any will do
-            lit, inverse = length > LEAST, ONE / max(length, LEAST)
-            cosine, sine = cosine * inverse if lit else ONE, sine * inverse if lit else ZERO
-            cc, both, ss = cosine * cosine, TWO * cosine * sine, sine * sine
-            across = ss * sums[squares + x] - both * sums[products + x] + cc * sums[others + x]
-            along = cc * sums[squares + x] + both * sums[products + x] + ss * sums[others + x]
-            i, turn = start + x, np.sqrt(max(across, ZERO)) * inverse
-            light.phasor[i], light.amplitude[i] = complex(cosine, sine), scale * max(length, LEAST)
-            light.bright[i] = light.amplitude[i] * np.sqrt(ONE + turn * turn)
-            light.turn[i], light.swell[i] = turn, np.sqrt(max(along, ZERO)) * inverse
 
 
 def linearised(
@@ -153,20 +127,22 @@ def linearised(
 @numba.njit(**FAST)
 def _linearise(pixels, light, window, shape, lost, out, moved):  # type: ignore[no-untyped-def]
     """Do the work of `linearised` for one frequency; arrays have no first axis."""
-    k, of_pixels = window.space.size, np.empty(ABREAST, np.int64)
+    k, of_pixels, by_amplitude = window.space.size, np.empty(ABREAST, np.int64), window.by_amplitude
     room, sums = np.empty(np.uint64(k) * FIELDS, f4), np.empty(ROWS[-1] + W, f4)
+    middle = np.uint64(k // 2) * FIELDS
+    others = np.array([np.uint64(q) * FIELDS for q in range(k) if q != k // 2], np.uint64)
     for start in range(0, pixels.size, ABREAST):
         # the last loop may have fewer pixels: it repeats the last one
         at = of_pixels[: min(ABREAST, pixels.size - start)]
         for x in range(ABREAST):
             of_pixels[x] = pixels[min(start + x, pixels.size - 1)]
         _gather(of_pixels, light, window.space, shape, lost, room)
-        _look_around(window, k, room, sums)
-        _edge_of(at, window, k, room, sums, out)
-        _amplitude_of(at, light.phasor, window.by_amplitude, k, room, sums, out)
+        _look_around(window, middle, others, room, sums)
+        _edge_of(at, window, middle, others, room, sums, out)
+        _amplitude_of(at, light.phasor, by_amplitude, middle, others, room, sums, out)
         if sums[FIT : FIT + W].max() > ZERO:
-            _moves_of(at, light.phasor, window.by_amplitude, k, room, sums, out)
-            _rest_of(at, window.by_amplitude, k, room, sums, out, moved[start : start + ABREAST])
+            _moves_of(at, light.phasor, by_amplitude, middle, others, room, sums, out)
+            _rest_of(at, by_amplitude, middle, others, room, sums, out, moved[start : start + ABREAST])
 
 
 @numba.njit(**FAST)
@@ -195,10 +171,10 @@ def _gather(at, light, space, shape, lost, room):  # type: ignore[no-untyped-def
 
 
 @numba.njit(**FAST)
-def _look_around(window, k, room, sums):  # type: ignore[no-untyped-def]
+def _look_around(window, middle, others, room, sums):  # type: ignore[no-untyped-def]
     """Find which neighbours count, their weights, whether that is certain (`SURE`), and whether the linear model holds
     (`FIT`): certain, and not too noisy."""
-    dim, drop_dim, middle = window.dim, window.drop_dim, np.uint64(k // 2) * FIELDS
+    dim, drop_dim = window.dim, window.drop_dim
     for x in range(W):
         reach, amplitude = REACH * room[middle + SWAY + x], room[middle + AMPLITUDE + x]
         lit = amplitude - reach > dim
@@ -209,10 +185,7 @@ def _look_around(window, k, room, sums):  # type: ignore[no-untyped-def]
         sums[NOISE + x] = room[middle + TURN + x]
         sums[FIT + x] = ONE if known else ZERO
         room[middle + WEIGHT + x] = room[middle + SIZE + x]
-    for q in range(k):
-        place = np.uint64(q) * FIELDS
-        if place == middle:
-            continue
+    for place in others:
         for x in range(W):
             reach, size = REACH * room[place + SWAY + x], room[place + SIZE + x]
             if drop_dim:
@@ -239,15 +212,12 @@ def _exp(x):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(**FAST)
-def _edge_of(at, window, k, room, sums, out):  # type: ignore[no-untyped-def]
+def _edge_of(at, window, middle, others, room, sums, out):  # type: ignore[no-untyped-def]
     """Write the edge sum's mean, deviation and bounds."""
-    dim, dim_edges, middle = window.dim, window.dim_edges, np.uint64(k // 2) * FIELDS
+    dim, dim_edges = window.dim, window.dim_edges
     mean, variance, sines, cosines, loose, counted, doubtful, longest = ROWS[:8]
     sums[mean : longest + W + W] = ZERO
-    for q in range(k):
-        place = np.uint64(q) * FIELDS
-        if place == middle:
-            continue
+    for place in others:
         for x in range(W):
             turn, own = room[place + TURN + x], room[middle + TURN + x]
             re, im, reach = room[place + BETWEEN + x], room[place + BETWEEN + W + x], REACH * room[place + SWAY + x]
@@ -290,203 +260,177 @@ def _edge_of(at, window, k, room, sums, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(**FAST)
-def _amplitude_of(at, phasor, by_amplitude, k, room, sums, out):  # type: ignore[no-untyped-def]
+def _amplitude_of(at, phasor, by_amplitude, middle, others, room, sums, out):  # type: ignore[no-untyped-def]
     """Write the filtered amplitude and its deviation, and the filtered phasor if noise leaves the phases unchanged."""
-    middle = np.uint64(k // 2) * FIELDS
     weights, amplitudes, spread, common, size, total = ROWS[:6]
-    sums[weights : total + W + W] = ZERO
-    for q in range(k):
-        place = np.uint64(q) * FIELDS
-        other = ZERO if place == middle else ONE
+    for x in range(W):
+        weight = room[middle + WEIGHT + x]
+        sums[weights + x], sums[amplitudes + x] = weight, weight * room[middle + BRIGHT + x]
+        sums[spread + x], sums[common + x] = (weight * room[middle + SWAY + x]) ** 2, ZERO
+        _put(sums, total + x, complex(weight * room[middle + AMPLITUDE + x], ZERO))
+    for place in others:
         for x in range(W):
             c, turn, own = sums[C + x], room[place + TURN + x], room[middle + TURN + x]
             re, im = room[place + BETWEEN + x], room[place + BETWEEN + W + x]
-            variance = other * min(turn * turn + own * own, QUARTER)
+            variance = min(turn * turn + own * own, QUARTER)
             mean = room[place + WEIGHT + x] * (ONE + HALF * variance * (c * im * c * im - c * re))
             sums[weights + x] += mean
             sums[amplitudes + x] += mean * room[place + BRIGHT + x]
             # noise across lengthens a phasor by what it takes from its mean
             sums[total + x] += mean * room[place + AMPLITUDE + x] * re
             sums[total + W + x] += mean * room[place + AMPLITUDE + x] * im
-            swayed = mean * room[place + SWAY + x]
-            sums[spread + x] += swayed * swayed
+            sums[spread + x] += (mean * room[place + SWAY + x]) ** 2
     for x in range(W):
-        re, im, whole = sums[total + x], sums[total + W + x], max(sums[weights + x], LEAST)
-        length = np.sqrt(re * re + im * im)
-        sums[size + x] = max(length, LEAST)
-        sums[weights + x] = whole
+        length, whole = np.sqrt(_power(_at(sums, total + x))), max(sums[weights + x], LEAST)
+        sums[size + x], sums[weights + x] = max(length, LEAST), whole
         sums[amplitudes + x] = (length if by_amplitude else sums[amplitudes + x]) / whole
     # noise of phases changes weights and how phasors add up: its variance, times the squared sum of weights
-    for q in range(k):
-        place = np.uint64(q) * FIELDS
-        if place == middle:
-            continue
+    for place in others:
         for x in range(W):
             re, im, weight = room[place + BETWEEN + x], room[place + BETWEEN + W + x], room[place + WEIGHT + x]
-            slope = sums[C + x] * im
+            slope, amplitude = sums[C + x] * im, sums[amplitudes + x]
             if by_amplitude:
-                value_re, value_im = -slope * re - im, re - slope * im
-                along = sums[total + x] * value_re + sums[total + W + x] * value_im
-                change = weight * (room[place + AMPLITUDE + x] * along / sums[size + x] + slope * sums[amplitudes + x])
+                along = sums[total + W + x] * (re - slope * im) - sums[total + x] * (slope * re + im)
+                change = weight * (room[place + AMPLITUDE + x] * along / sums[size + x] + slope * amplitude)
             else:
-                change = -slope * weight * (room[place + BRIGHT + x] - sums[amplitudes + x])
-            moved = change * min(room[place + TURN + x], HALF)
-            sums[spread + x] += moved * moved
+                change = slope * weight * (amplitude - room[place + BRIGHT + x])
+            sums[spread + x] += (change * min(room[place + TURN + x], HALF)) ** 2
             sums[common + x] += change
     for x in range(at.size):
         i, own = at[x], sums[common + x] * min(room[middle + TURN + x], HALF)
         out.amplitude[i] = sums[amplitudes + x]
-        out.phasor[i] = complex(sums[total + x], sums[total + W + x]) * phasor[i] / sums[size + x]
+        out.phasor[i] = _at(sums, total + x) * phasor[i] / sums[size + x]
         out.spread[i] = np.sqrt(sums[spread + x] + own * own) / sums[weights + x]
 
 
 @numba.njit(inline="always", **FAST)
-def _turned(c, re, im, v):  # type: ignore[no-untyped-def]
-    """Return F, F' and F'', real and imaginary parts, at the angle t whose exp(i t) is (re, im)."""
-    cosine, s = c * re, c * im
+def _at(values, place):  # type: ignore[no-untyped-def]
+    return complex(values[place], values[place + W])
+
+
+@numba.njit(inline="always", **FAST)
+def _put(values, place, z):  # type: ignore[no-untyped-def]
+    values[place], values[place + W] = z.real, z.imag
+
+
+@numba.njit(inline="always", **FAST)
+def _power(z):  # type: ignore[no-untyped-def]
+    return z.real * z.real + z.imag * z.imag
+
+
+@numba.njit(inline="always", **FAST)
+def _inverse(z):  # type: ignore[no-untyped-def]
+    """Return 1 / z, 0 where z is 0."""
+    size = ONE / max(_power(z), LEAST * LEAST)
+    return complex(z.real * size, -z.imag * size)
+
+
+@numba.njit(inline="always", **FAST)
+def _turned(c, between, v):  # type: ignore[no-untyped-def]
+    """Return F, F' and F'' at the angle t whose exp(i t) is ``between``."""
+    cosine, sine = c * between.real, c * between.imag
+    # derivatives of ln F: g, then -cosine, sine, cosine, -sine
+    g = complex(-sine, ONE)
+    g2, half = complex(sine * sine - ONE, -TWO * sine), HALF * v
+    second = g2 - cosine
+    third = g * (g2 - THREE * cosine) + sine
+    fourth = g2 * (g2 - SIX * cosine) + complex(cosine * (THREE * cosine + ONE) - FOUR * sine * sine, FOUR * sine)
+    fifth = g * (g2 * (g2 - TEN * cosine) + FIVE * cosine * (THREE * cosine + ONE))
+    fifth += complex(TEN * sine * (g2.real - cosine) - sine, -TEN * TWO * sine * sine)
     e = _exp(cosine - c)
-    # the derivatives of ln F are g = i - s, then -cosine, s, cosine, -s; p + q i is g^2
-    p, q = s * s - ONE, -TWO * s
-    a, b = p - cosine, q
-    third_re, third_im = s * (FOUR + THREE * cosine - s * s), p - THREE * cosine + TWO * s * s
-    fourth_re = p * (p - SIX * cosine) - q * q - FOUR * s * s + THREE * cosine * cosine + cosine
-    fourth_im = q * (TWO * p - SIX * cosine) + FOUR * s
-    inner_re = p * (p - TEN * cosine) - q * q + FIVE * cosine * (THREE * cosine + ONE)
-    inner_im = q * (TWO * p - TEN * cosine)
-    fifth_re = TEN * s * (p - cosine) - s - s * inner_re - inner_im
-    fifth_im = inner_re - s * inner_im - TEN * TWO * s * s
-    half = HALF * v
-    quarter = HALF * half
-    mean_re, mean_im = ONE + half * (a + quarter * fourth_re), half * (b + quarter * fourth_im)
-    first_re = half * (third_re + quarter * fifth_re) - s
-    first_im = ONE + half * (third_im + quarter * fifth_im)
-    second_re, second_im = a + half * fourth_re, b + half * fourth_im
-    re, im = e * re, e * im
-    return (
-        re * mean_re - im * mean_im, re * mean_im + im * mean_re,
-        re * first_re - im * first_im, re * first_im + im * first_re,
-        re * second_re - im * second_im, re * second_im + im * second_re,
-    )  # fmt: skip
+    value = complex(e * between.real, e * between.imag)
+    mean = ONE + half * (second + HALF * half * fourth)
+    return value * mean, value * (g + half * (third + HALF * half * fifth)), value * (second + half * fourth)
 
 
 @numba.njit(**FAST)
-def _moves_of(at, phasor, by_amplitude, k, room, sums, out):  # type: ignore[no-untyped-def]
+def _moves_of(at, phasor, by_amplitude, middle, others, room, sums, out):  # type: ignore[no-untyped-def]
     """Write the mean phasor, and into the room the change of its phase by each neighbour's phase."""
-    middle = np.uint64(k // 2) * FIELDS
     node, inverse, squares, total, mean = ROWS[:10:2]
+    if by_amplitude:
+        # a phasor with noise across is longer: only with that does a cos t keep its mean
+        for q in range(others.size + 1):
+            place = np.uint64(q) * FIELDS
+            for x in range(W):
+                room[place + SIZE + x] *= room[place + AMPLITUDE + x] * (ONE + HALF * room[place + TURN + x] ** 2)
     sums[mean : mean + W + W] = ZERO
     for number in range(3):
         # without the centre's noise, then sqrt(3) deviations of it either way
         share = f4(1 / 6) if number else f4(2 / 3)
         for x in range(W):
             away = SQRT_3 * room[middle + TURN + x]
-            cosine, sine = (sums[node + x], -sums[node + W + x]) if number == 2 else (np.cos(away), np.sin(away))
-            sums[node + x], sums[node + W + x] = (cosine, sine) if number else (ONE, ZERO)
+            turn = _at(sums, node + x).conjugate() if number == 2 else complex(np.cos(away), np.sin(away))
+            _put(sums, node + x, turn if number else complex(ONE, ZERO))
+            _put(sums, total + x, complex(room[middle + SIZE + x], ZERO))
         sums[squares : squares + W + W] = ZERO
-        sums[total : total + W + W] = ZERO
-        for q in range(k):
-            place = np.uint64(q) * FIELDS
+        for place in others:
             for x in range(W):
-                # a phasor with noise across is longer: only with that does a cos t keep its mean
-                turn2 = room[place + TURN + x] * room[place + TURN + x]
-                longer = room[place + AMPLITUDE + x] * (ONE + HALF * turn2) if by_amplitude else ONE
-                size = room[place + SIZE + x] * longer
-                if place == middle:
-                    sums[total + x] += size
-                else:
-                    re, im = room[place + BETWEEN + x], room[place + BETWEEN + W + x]
-                    cosine, sine = sums[node + x], sums[node + W + x]
-                    here_re, here_im = re * cosine + im * sine, im * cosine - re * sine
-                    v_re, v_im, s_re, s_im, b_re, b_im = _turned(sums[C + x], here_re, here_im, turn2)
-                    sums[total + x] += size * v_re
-                    sums[total + W + x] += size * v_im
-                    room[place + SLOPE + x], room[place + SLOPE + W + x] = size * s_re, size * s_im
-                    room[place + BEND + x], room[place + BEND + W + x] = size * b_re, size * b_im
+                turn, size = room[place + TURN + x], room[place + SIZE + x]
+                between = _at(room, place + BETWEEN + x) * complex(sums[node + x], -sums[node + W + x])
+                value, slope, bend = _turned(sums[C + x], between, turn * turn)
+                sums[total + x] += size * value.real
+                sums[total + W + x] += size * value.imag
+                room[place + SLOPE + x], room[place + SLOPE + W + x] = size * slope.real, size * slope.imag
+                room[place + BEND + x], room[place + BEND + W + x] = size * bend.real, size * bend.imag
         for x in range(W):
-            re, im = sums[total + x], sums[total + W + x]
-            size = max(re * re + im * im, LEAST * LEAST)
-            sums[inverse + x], sums[inverse + W + x] = re / size, -im / size
-        for q in range(k):
-            place = np.uint64(q) * FIELDS
-            if place == middle:
-                continue
+            _put(sums, inverse + x, _inverse(_at(sums, total + x)))
+        for place in others:
             for x in range(W):
-                turn, re, im = room[place + TURN + x], sums[inverse + x], sums[inverse + W + x]
-                a, b = room[place + SLOPE + x], room[place + SLOPE + W + x]
-                slope_re, slope_im = a * re - b * im, a * im + b * re
-                room[place + SLOPE + x], room[place + SLOPE + W + x] = slope_re, slope_im
-                sums[squares + x] += turn * turn * (slope_re * slope_re - slope_im * slope_im)
-                sums[squares + W + x] += turn * turn * TWO * slope_re * slope_im
-        for q in range(k):
-            place = np.uint64(q) * FIELDS
-            if place == middle:
-                continue
+                slope, turn2 = _at(room, place + SLOPE + x) * _at(sums, inverse + x), room[place + TURN + x] ** 2
+                _put(room, place + SLOPE + x, slope)
+                sums[squares + x] += turn2 * (slope.real * slope.real - slope.imag * slope.imag)
+                sums[squares + W + x] += turn2 * TWO * slope.real * slope.imag
+        for place in others:
             for x in range(W):
                 # E[d arg S], with S and its derivative moving together: d^3 ln S has 2 S'^3 / S^3 and -3 S' S'' / S^2
-                turn2, re, im = (
-                    room[place + TURN + x] * room[place + TURN + x],
-                    sums[inverse + x],
-                    sums[inverse + W + x],
-                )
-                a, b = room[place + BEND + x], room[place + BEND + W + x]
-                more_re = ONE + sums[squares + x] - turn2 * (a * re - b * im)
-                more_im = sums[squares + W + x] - turn2 * (a * im + b * re)
-                slope = room[place + SLOPE + x] * more_im + room[place + SLOPE + W + x] * more_re
-                room[place + MOVED + x] += share * slope
+                bend, turn2 = _at(room, place + BEND + x) * _at(sums, inverse + x), room[place + TURN + x] ** 2
+                more = complex(ONE + sums[squares + x] - turn2 * bend.real, sums[squares + W + x] - turn2 * bend.imag)
+                room[place + MOVED + x] += share * (_at(room, place + SLOPE + x) * more).imag
         for x in range(W):
             # E[arg S] = arg E[S] - Im(E[dS^2] / S^2) / 2
-            re, im, cosine, sine = sums[total + x], sums[total + W + x], sums[node + x], sums[node + W + x]
-            size = share / max(np.sqrt(re * re + im * im), LEAST)
-            less = HALF * sums[squares + W + x]
-            re, im = size * (re + im * less), size * (im - re * less)
-            sums[mean + x] += re * cosine - im * sine
-            sums[mean + W + x] += re * sine + im * cosine
+            whole, less = _at(sums, total + x), complex(ONE, -HALF * sums[squares + W + x])
+            size, turned = share / max(np.sqrt(_power(whole)), LEAST), whole * less * _at(sums, node + x)
+            sums[mean + x] += size * turned.real
+            sums[mean + W + x] += size * turned.imag
     for x in range(at.size):
         if sums[FIT + x] > ZERO:
-            re, im = sums[mean + x], sums[mean + W + x]
-            out.phasor[at[x]] = complex(re, im) * phasor[at[x]] / max(np.sqrt(re * re + im * im), LEAST)
+            whole = _at(sums, mean + x)
+            out.phasor[at[x]] = whole * phasor[at[x]] / max(np.sqrt(_power(whole)), LEAST)
 
 
 @numba.njit(**FAST)
-def _rest_of(at, by_amplitude, k, room, sums, out, moved):  # type: ignore[no-untyped-def]
+def _rest_of(at, by_amplitude, middle, others, room, sums, out, moved):  # type: ignore[no-untyped-def]
     """Write the phase's deviation, the share of its variance that is not of first order in phases, and its changes."""
-    middle = np.uint64(k // 2) * FIELDS
     inverse, _, total, _, common, bends, rest, variance = ROWS[:8]
-    sums[total : variance + W] = ZERO
-    for q in range(k):
-        place = np.uint64(q) * FIELDS
+    for x in range(W):
+        longer = room[middle + AMPLITUDE + x] if by_amplitude else ONE
+        _put(sums, total + x, complex(room[middle + WEIGHT + x] * longer, ZERO))
+    for place in others:
         for x in range(W):
             size = room[place + WEIGHT + x] * (room[place + AMPLITUDE + x] if by_amplitude else ONE)
             sums[total + x] += size * room[place + BETWEEN + x]
             sums[total + W + x] += size * room[place + BETWEEN + W + x]
     for x in range(W):
-        re, im = sums[total + x], sums[total + W + x]
-        size = max(re * re + im * im, LEAST * LEAST)
-        sums[inverse + x], sums[inverse + W + x] = re / size, -im / size
-    for q in range(k):
-        place = np.uint64(q) * FIELDS
-        if place == middle:
-            continue
+        _put(sums, inverse + x, _inverse(_at(sums, total + x)))
+    sums[common : variance + W] = ZERO
+    for place in others:
         for x in range(W):
-            c, turn, own = sums[C + x], room[place + TURN + x], room[middle + TURN + x]
-            re, im, weight = room[place + BETWEEN + x], room[place + BETWEEN + W + x], room[place + WEIGHT + x]
-            cosine, s, turn2, own2 = c * re, c * im, turn * turn, own * own
-            here_re = weight * (re * sums[inverse + x] - im * sums[inverse + W + x])
-            here_im = weight * (re * sums[inverse + W + x] + im * sums[inverse + x])
-            longer = room[place + AMPLITUDE + x] if by_amplitude else ONE
-            bend = longer * (here_im * (s * s - ONE - cosine) - here_re * TWO * s)
-            third_re, third_im = s * (FOUR + THREE * cosine - s * s), THREE * (s * s - cosine) - ONE
-            third = longer * (here_re * third_im + here_im * third_re)
+            c, turn2, own2 = sums[C + x], room[place + TURN + x] ** 2, room[middle + TURN + x] ** 2
+            cosine, s = c * room[place + BETWEEN + x], c * room[place + BETWEEN + W + x]
+            here = _at(room, place + BETWEEN + x) * _at(sums, inverse + x)
+            longer, weight = room[place + AMPLITUDE + x] if by_amplitude else ONE, room[place + WEIGHT + x]
+            size, ss = weight * longer, s * s
+            bend = size * (here.imag * (ss - ONE - cosine) - here.real * TWO * s)
+            third = here.real * (THREE * (ss - cosine) - ONE) + here.imag * s * (FOUR + THREE * cosine - ss)
             sums[bends + x] += bend
-            higher = bend * bend * turn2 * (HALF * turn2 + own2)
-            sums[rest + x] += higher + third * third * turn2 * turn2 * (turn2 + THREE * own2) * f4(1 / 6)
+            higher = (size * third) ** 2 * f4(1 / 6) * turn2 * (turn2 + THREE * own2)
+            sums[rest + x] += turn2 * (bend * bend * (HALF * turn2 + own2) + higher)
             change = room[place + MOVED + x]
             sums[common + x] += change
-            change = change * turn
-            swollen = here_im * room[place + SWAY + x] if by_amplitude else ZERO
-            change = np.copysign(np.sqrt(change * change + swollen * swollen), change)
-            room[place + MOVED + x] = change
-            sums[variance + x] += change * change
+            swollen = weight * here.imag * room[place + SWAY + x] if by_amplitude else ZERO
+            squared = change * change * turn2 + swollen * swollen
+            room[place + MOVED + x] = np.copysign(np.sqrt(squared), change)
+            sums[variance + x] += squared
     for x in range(at.size):
         if sums[FIT + x] == ZERO:
             continue
@@ -495,7 +439,7 @@ def _rest_of(at, by_amplitude, k, room, sums, out, moved):  # type: ignore[no-un
         higher = sums[rest + x] + 0.5 * (sums[bends + x] * own2) ** 2
         centre2 = (1.0 - sums[common + x]) ** 2 * own2 + higher
         room[middle + MOVED + x] = np.sqrt(centre2)
-        for q in range(k):
+        for q in range(others.size + 1):
             moved[x, q] = room[np.uint64(q) * FIELDS + MOVED + np.uint64(x)]
         both = sums[variance + x] + centre2
         out.turned[i], out.left_out[i] = np.sqrt(both), higher / max(both, SMALLEST)
