@@ -174,24 +174,36 @@ def smooth(  # type: ignore[no-untyped-def]
     path. Writes the mean half path, the weight and the strength of those that agree, (h, w) each."""
     h, w = gate_m.shape
     p, q, r = (half_m.shape[0] - h) // 2, (half_m.shape[1] - w) // 2, taps.size // 2
-    zero = np.float32(0)
-    moved, total, heights = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
+    sums = np.empty((3, CHUNK), np.float32)
     for v in range(h):
-        moved[:], total[:], heights[:] = zero, zero, zero
-        for k in range(-r, r + 1):
-            row = v + p + (0 if along_rows else k)
-            column = q + (k if along_rows else 0)
-            for u in range(w):
-                off = half_m[row, u + column] - half_m[v + p, u + q]
-                tap = taps[k + r] if abs(off) <= gate_m[v, u] else zero
-                weight = tap * share[row, u + column]
-                moved[u] += weight * off
-                total[u] += weight
-                heights[u] += tap * height[row, u + column]
-        for u in range(w):
-            out_m[v, u] = half_m[v + p, u + q] + moved[u] / total[u]
-            out_share[v, u] = total[u]
-            out_height[v, u] = heights[u]
+        for start in range(0, w, CHUNK):
+            stop = min(start + CHUNK, w)
+            centre_m = half_m[v + p, q + start : q + stop]
+            sums[:] = np.float32(0)
+            for k in range(-r, r + 1):
+                row, first = (v + p, q + k) if along_rows else (v + p + k, q)
+                near = slice(first + start, first + stop)
+                _add_agreeing(
+                    half_m[row, near], share[row, near], height[row, near], centre_m, gate_m[v, start:stop],
+                    taps[k + r], sums.reshape(sums.size),
+                )  # fmt: skip
+            for u in range(start, stop):
+                out_m[v, u] = half_m[v + p, u + q] + sums[0, u - start] / sums[1, u - start]
+            out_share[v, start:stop], out_height[v, start:stop] = sums[1, : stop - start], sums[2, : stop - start]
+
+
+CHUNK = 1024  # columns whose sums stand side by side: a loop that writes to one array is vectorised
+
+
+@numba.njit(**FAST)
+def _add_agreeing(half_m, share, height, centre_m, gate_m, tap, sums):  # type: ignore[no-untyped-def]
+    for u in range(np.uint64(gate_m.size)):
+        off = half_m[u] - centre_m[u]
+        counted = tap if abs(off) <= gate_m[u] else np.float32(0)
+        weight = counted * share[u]
+        sums[u] += weight * off
+        sums[np.uint64(CHUNK) + u] += weight
+        sums[np.uint64(2 * CHUNK) + u] += counted * height[u]
 
 
 @numba.njit(**FAST)
