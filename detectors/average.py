@@ -20,7 +20,7 @@ SAMPLED_PIXELS = 4096
 """Pixels on which a frame is judged: they show a changed fraction of 5 % to 0.35 %, and a shift to 0.02 sigma."""
 CORRELATED_PIXELS = 25  # pixels that share one noise value in the worst case: a depth engine with a 5x5 filter
 
-MOST_INSERTED = 16  # most samples of a pixel that insertion sorts as fast as other ways
+FEW = 6  # so few samples are sorted faster by exchanging neighbours
 NOT_FINITE = int(Reason.NOT_FINITE)
 
 
@@ -310,26 +310,15 @@ def _median_finite(values: np.ndarray) -> float:
 
 def pixel_medians(stack: np.ndarray) -> np.ndarray:
     """Return the median (..) of each pixel's finite samples in (r, ..); NaN where there is none."""
-    return np.asarray(_medians(stack.reshape(len(stack), -1)).reshape(stack.shape[1:]))
-
-
-@numba.njit(**PLAIN)
-def _medians(stack):  # type: ignore[no-untyped-def]
-    few, medians = np.empty(len(stack), stack.dtype), np.empty(stack.shape[1], stack.dtype)
-    for i in range(stack.shape[1]):
-        known = 0
-        for sample in stack[:, i]:
-            if np.isfinite(sample):
-                few[known] = sample
-                known += 1
-        if known > MOST_INSERTED:
-            few[:known].sort()
-        else:
-            for k in range(1, known):
-                sample, place = few[k], k
-                while place > 0 and few[place - 1] > sample:
-                    few[place] = few[place - 1]
-                    place -= 1
-                few[place] = sample
-        medians[i] = 0.5 * (few[(known - 1) // 2] + few[known // 2]) if known else np.nan
-    return medians
+    finite = np.isfinite(stack)
+    ordered, count = np.where(finite, stack, np.inf), finite.sum(axis=0)
+    if len(stack) > FEW:
+        ordered.sort(axis=0)
+    for last in range(len(stack) - 1, 0, -1) if len(stack) <= FEW else ():
+        for row in range(last):
+            low = np.minimum(ordered[row], ordered[row + 1])
+            np.maximum(ordered[row], ordered[row + 1], out=ordered[row + 1])
+            ordered[row] = low
+    places = (np.maximum(count - 1, 0) // 2, count // 2)
+    low, high = (np.take_along_axis(ordered, place[None], axis=0)[0] for place in places)
+    return np.where(count > 0, 0.5 * (low + high), np.nan)
