@@ -174,36 +174,35 @@ def smooth(  # type: ignore[no-untyped-def]
     path. Writes the mean half path, the weight and the strength of those that agree, (h, w) each."""
     h, w = gate_m.shape
     p, q, r = (half_m.shape[0] - h) // 2, (half_m.shape[1] - w) // 2, taps.size // 2
-    sums = np.empty((3, CHUNK), np.float32)
+    image, sums = (half_m, share, height), np.empty(3 * CHUNK, np.float32)
     for v in range(h):
         for start in range(0, w, CHUNK):
-            stop = min(start + CHUNK, w)
-            centre_m = half_m[v + p, q + start : q + stop]
-            sums[:] = np.float32(0)
+            n, sums[:] = min(CHUNK, w - start), np.float32(0)
             for k in range(-r, r + 1):
-                row, first = (v + p, q + k) if along_rows else (v + p + k, q)
-                near = slice(first + start, first + stop)
-                _add_agreeing(
-                    half_m[row, near], share[row, near], height[row, near], centre_m, gate_m[v, start:stop],
-                    taps[k + r], sums.reshape(sums.size),
-                )  # fmt: skip
-            for u in range(start, stop):
-                out_m[v, u] = half_m[v + p, u + q] + sums[0, u - start] / sums[1, u - start]
-            out_share[v, start:stop], out_height[v, start:stop] = sums[1, : stop - start], sums[2, : stop - start]
+                near = (v + p, q + start + k) if along_rows else (v + p + k, q + start)
+                _add_agreeing(image, gate_m, near, (v + p, q + start), (v, start), n, taps[k + r], sums)
+            for u in range(n):
+                out_m[v, start + u] = half_m[v + p, q + start + u] + sums[u] / sums[CHUNK + u]
+                out_share[v, start + u] = sums[CHUNK + u]
+                out_height[v, start + u] = sums[2 * CHUNK + u]
 
 
-CHUNK = 1024  # columns whose sums stand side by side: a loop that writes to one array is vectorised
+CHUNK = 256  # columns whose sums stand side by side: a loop that writes to one array is vectorised
 
 
 @numba.njit(**FAST)
-def _add_agreeing(half_m, share, height, centre_m, gate_m, tap, sums):  # type: ignore[no-untyped-def]
-    for u in range(np.uint64(gate_m.size)):
-        off = half_m[u] - centre_m[u]
-        counted = tap if abs(off) <= gate_m[u] else np.float32(0)
-        weight = counted * share[u]
+def _add_agreeing(image, gate_m, near, own, at, n, tap, sums):  # type: ignore[no-untyped-def]
+    """Add n neighbours, from the place ``near`` on, of the pixels from ``own`` on, whose gates begin at ``at``. Images
+    are passed whole, as a slice costs as much as tens of sums."""
+    (half_m, share, height), row, column = image, np.uint64(near[0]), np.uint64(near[1])
+    own_row, own_column, v, start = np.uint64(own[0]), np.uint64(own[1]), np.uint64(at[0]), np.uint64(at[1])
+    for u in range(np.uint64(n)):
+        off = half_m[row, column + u] - half_m[own_row, own_column + u]
+        counted = tap if abs(off) <= gate_m[v, start + u] else np.float32(0)
+        weight = counted * share[row, column + u]
         sums[u] += weight * off
         sums[np.uint64(CHUNK) + u] += weight
-        sums[np.uint64(2 * CHUNK) + u] += counted * height[u]
+        sums[np.uint64(2 * CHUNK) + u] += counted * height[row, column + u]
 
 
 @numba.njit(**FAST)
