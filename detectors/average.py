@@ -20,7 +20,6 @@ SAMPLED_PIXELS = 4096
 """Pixels on which a frame is judged: they show a changed fraction of 5 % to 0.35 %, and a shift to 0.02 sigma."""
 CORRELATED_PIXELS = 25  # pixels that share one noise value in the worst case: a depth engine with a 5x5 filter
 
-FEW = 6  # so few samples are sorted faster by exchanging neighbours
 NOT_FINITE = int(Reason.NOT_FINITE)
 
 
@@ -318,13 +317,12 @@ def pixel_medians(stack: np.ndarray) -> np.ndarray:
     """Return the median (..) of each pixel's finite samples in (r, ..); NaN where there is none."""
     finite = np.isfinite(stack)
     ordered, count = np.where(finite, stack, np.inf), finite.sum(axis=0)
-    if len(stack) > FEW:
+    if len(stack) > 6:  # exchanges of neighbours sort fewer samples in less time
         ordered.sort(axis=0)
-    for last in range(len(stack) - 1, 0, -1) if len(stack) <= FEW else ():
-        for row in range(last):
-            low = np.minimum(ordered[row], ordered[row + 1])
-            np.maximum(ordered[row], ordered[row + 1], out=ordered[row + 1])
-            ordered[row] = low
+    for place in range(len(stack) - 1 if len(stack) <= 6 else 0):
+        for row in range(len(stack) - 1 - place):
+            pair = ordered[row], ordered[row + 1]
+            ordered[row], ordered[row + 1] = np.minimum(*pair), np.maximum(*pair)
     places = (np.maximum(count - 1, 0) // 2, count // 2)
     low, high = (np.take_along_axis(ordered, place[None], axis=0)[0] for place in places)
     return np.where(count > 0, 0.5 * (low + high), np.nan)
