@@ -20,7 +20,6 @@ SAMPLED_PIXELS = 4096
 """Pixels on which a frame is judged: they show a changed fraction of 5 % to 0.35 %, and a shift to 0.02 sigma."""
 CORRELATED_PIXELS = 25  # pixels that share one noise value in the worst case: a depth engine with a 5x5 filter
 
-MOST_INSERTED = 16  # most samples of a pixel that insertion sorts as fast as other ways
 NOT_FINITE = int(Reason.NOT_FINITE)
 
 
@@ -167,12 +166,12 @@ class FrameSums:
     def _change(self, z_m: np.ndarray) -> tuple[float, float]:
         """Return a frame's shift against the reference in metres (NaN for none) and its changed fraction."""
         differences = z_m[self.sample] - self.sampled_z_m
-        differences = differences[np.isfinite(differences)].astype(np.float32)
-        if not len(differences):
+        differences = differences.astype(np.float32, copy=False)
+        if not np.isfinite(shift := _median_finite(differences)):
             return np.nan, 1.0
-        shift = np.median(differences)
+        # NaN is not within the limit
         changed = len(self.sample) - np.count_nonzero(np.abs(differences - shift) <= self.change_m)
-        return float(shift), changed / len(self.sample)
+        return shift, changed / len(self.sample)
 
     def _fault(self, frame: Frame) -> str | None:
         """Return why this frame does not belong; None if it does."""
@@ -217,7 +216,8 @@ class FrameSums:
                     self.channels[name] = np.zeros(z.size * width), np.zeros(z.size * width, dtype=np.int32)
                 _add_where(values.ravel(), used if width == 1 else np.repeat(used, width), *self.channels[name])
         if frame.rgb is not None:
-            self.rgb_total = frame.rgb.astype(np.uint32) if self.rgb_total is None else self.rgb_total + frame.rgb
+            self.rgb_total = np.zeros(frame.rgb.shape, np.uint32) if self.rgb_total is None else self.rgb_total
+            self.rgb_total += frame.rgb
             self.rgb_frames += 1
 
     def cloud(self) -> Cloud:
@@ -304,32 +304,25 @@ def _add_where(values: np.ndarray, used: np.ndarray, total: np.ndarray, count: n
 
 
 def _median_finite(values: np.ndarray) -> float:
+    """Return the median of the finite values, NaN if there are none, in two thirds of NumPy's time."""
     finite = values[np.isfinite(values)]
-    return float(np.median(finite)) if len(finite) else np.nan
+    if not len(finite):
+        return np.nan
+    low, high = (len(finite) - 1) // 2, len(finite) // 2
+    ordered = np.partition(finite, (low, high))
+    return float(0.5 * (ordered[low] + ordered[high]))
 
 
 def pixel_medians(stack: np.ndarray) -> np.ndarray:
     """Return the median (..) of each pixel's finite samples in (r, ..); NaN where there is none."""
-    return np.asarray(_medians(stack.reshape(len(stack), -1)).reshape(stack.shape[1:]))
-
-
-@numba.njit(**PLAIN)
-def _medians(stack):  # type: ignore[no-untyped-def]
-    few, medians = np.empty(len(stack), stack.dtype), np.empty(stack.shape[1], stack.dtype)
-    for i in range(stack.shape[1]):
-        known = 0
-        for sample in stack[:, i]:
-            if np.isfinite(sample):
-                few[known] = sample
-                known += 1
-        if known > MOST_INSERTED:
-            few[:known].sort()
-        else:
-            for k in range(1, known):
-                sample, place = few[k], k
-                while place > 0 and few[place - 1] > sample:
-                    few[place] = few[place - 1]
-                    place -= 1
-                few[place] = sample
-        medians[i] = 0.5 * (few[(known - 1) // 2] + few[known // 2]) if known else np.nan
-    return medians
+    finite = np.isfinite(stack)
+    ordered, count = np.where(finite, stack, np.inf), finite.sum(axis=0)
+    if len(stack) > 6:  # exchanges of neighbours sort fewer samples in less time
+        ordered.sort(axis=0)
+    for place in range(len(stack) - 1 if len(stack) <= 6 else 0):
+        for row in range(len(stack) - 1 - place):
+            pair = ordered[row], ordered[row + 1]
+            ordered[row], ordered[row + 1] = np.minimum(*pair), np.maximum(*pair)
+    places = (np.maximum(count - 1, 0) // 2, count // 2)
+    low, high = (np.take_along_axis(ordered, place[None], axis=0)[0] for place in places)
+    return np.where(count > 0, 0.5 * (low + high), np.nan)

@@ -24,10 +24,13 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 def draw_frames() -> None:
     """Draw a frame with every camera, and average frames with every method."""
+    import numpy as np
+
     from detectors.average import AverageConfig, prefix_averages
     from harness.vocabulary.geometry import Region
     from scenes.closed_form import plane_view
     from scenes.sensor.camera import CameraConfig, camera_names, load_camera
+    from scenes.sensor.empirical.imager import decode
     from scenes.sensor.source import SimulatedUnit
 
     for name in camera_names():
@@ -36,6 +39,9 @@ def draw_frames() -> None:
         view = plane_view(camera, Region(row - 20, row + 20, column - 30, column + 30), 0.7, 0.6, 0.05, 0.02)
         capture = SimulatedUnit(camera, CameraConfig(name=name), view).capture(6, 1)
         next(iter(capture.frames()))
+    # no camera's file is empirical
+    image, number = np.ones((2, 2), np.float32), np.float32(1)
+    decode(*6 * (image,), *4 * (number,), image.copy(), image.astype(np.uint8))
     for method in ("mean", "median", "clipped"):
         prefix_averages(capture, [1, 6], AverageConfig.from_data({"method": method}))
 

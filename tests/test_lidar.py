@@ -13,7 +13,7 @@ from scenes.closed_form import plane_view
 from scenes.sensor.calibration import ONLY_NOISE, calibrated_numbers, temporal_sigma_m, unit_before_plane
 from scenes.sensor.camera import NO_EFFECTS, CameraConfig
 from scenes.sensor.lidar.facts import ScannedLidar
-from scenes.sensor.lidar.kernels import strongest_peaks
+from scenes.sensor.lidar.kernels import CHUNK, NOWHERE_M, smooth, strongest_peaks
 from scenes.sensor.source import SimulatedUnit
 
 # ---------------------------------------------------------------- range without noise
@@ -161,6 +161,29 @@ def test_smoothing_correlates_as_its_weights_say():
     along_column = np.convolve(column, [share, 1, share])[len(column) // 2 + 1 :][:7]
     expected = np.outer(along_column / along_column[0], row[len(row) // 2 :][:7] / row.max())
     assert correlations(changed({**UNIFORM, **FINE})) == pytest.approx(expected, abs=0.04)
+
+
+@pytest.mark.parametrize("along_rows", [False, True])
+def test_smoothing_of_more_columns_than_a_chunk_meets_brute_force(along_rows: bool):
+    """Of steps and noise that the gates let through in part, for both axes, and beyond the picture's border."""
+    random = np.random.default_rng(1)
+    taps, (h, w), r = np.float32([0.05, 0.2, 0.5, 0.2, 0.05]), (6, CHUNK + 37), 2
+    half_m, share, height = (np.full((h + 2 * r, w + 2 * r), beyond, np.float32) for beyond in (NOWHERE_M, 0, 0))
+    inner = slice(r, -r), slice(r, -r)
+    half_m[inner] = 1 + 0.02 * random.integers(0, 2, (h, w)) + 0.005 * random.standard_normal((h, w))
+    share[inner], height[inner] = random.uniform(0.2, 1, (2, h, w))
+    gate_m = random.uniform(0.005, 0.03, (h, w)).astype(np.float32)
+    found = np.empty((3, h, w), np.float32)
+    smooth(half_m, share, height, gate_m, taps, along_rows, *found)
+    moved, total, heights = np.zeros((3, h, w))
+    for tap, k in zip(taps, range(-r, r + 1), strict=True):
+        down, right = (0, k) if along_rows else (k, 0)
+        near = slice(r + down, r + down + h), slice(r + right, r + right + w)
+        off = half_m[near] - half_m[inner]
+        weight = tap * (np.abs(off) <= gate_m)
+        moved, total = moved + weight * share[near] * off, total + weight * share[near]
+        heights = heights + weight * height[near]
+    np.testing.assert_allclose(found, [half_m[inner] + moved / total, total, heights], rtol=0, atol=1e-6)
 
 
 def test_noise_of_range_and_of_strength_are_independent():

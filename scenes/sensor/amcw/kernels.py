@@ -184,25 +184,23 @@ def filter_image(unit, amplitude, settings, filtered, edge):  # type: ignore[no-
     # the last row stays outside, and so do the neighbours that fill up the list
     rows, space = np.zeros(3 * (side + 1) * STRIDE, np.float32), _padded(settings.space)
     starts = np.full(space.size, np.uint64(3 * side * STRIDE))
-    for dy in range(side + 1):
-        rows[(3 * dy + 2) * STRIDE : (3 * dy + 3) * STRIDE] = OUTSIDE
-        for dx in range(side if dy < side else 0):
-            starts[dy * side + dx] = 3 * dy * STRIDE + dx
+    for row in range(side + 1):
+        rows[(3 * row + 2) * STRIDE : (3 * row + 3) * STRIDE] = OUTSIDE
     total = np.empty(5 * STRIDE, np.float32)
-    for y in range(h):
-        for dy in range(-half, half + 1):
-            re = 3 * (dy + half) * STRIDE + half
-            im = re + STRIDE
-            amp = im + STRIDE
-            if 0 <= y + dy < h:
-                # beside the picture, the initial zeros and ``OUTSIDE`` remain
-                rows[re : re + w] = unit[0, y + dy]
-                rows[im : im + w] = unit[1, y + dy]
-                rows[amp : amp + w] = amplitude[y + dy]
-            else:
-                rows[amp : amp + w] = OUTSIDE
-        centre = 3 * half * STRIDE + half
-        _filter_window(rows, centre, starts, space, w, settings, total, filtered[:, y], edge[y])
+    for y in range(-half, h):
+        # picture row y is row y modulo ``side``; beside the picture, the initial zeros and ``OUTSIDE`` remain
+        re = 3 * ((y + half) % side) * STRIDE + half
+        if y + half < h:
+            rows[re : re + w] = unit[0, y + half]
+            rows[re + STRIDE : re + STRIDE + w] = unit[1, y + half]
+            rows[re + 2 * STRIDE : re + 2 * STRIDE + w] = amplitude[y + half]
+        else:
+            rows[re + 2 * STRIDE : re + 2 * STRIDE + w] = OUTSIDE
+        for q in range(side * side if y >= 0 else 0):
+            starts[q] = 3 * ((y + half + 1 + q // side) % side) * STRIDE + q % side
+        if y >= 0:
+            centre = 3 * (y % side) * STRIDE + half
+            _filter_window(rows, centre, starts, space, w, settings, total, filtered[:, y], edge[y])
 
 
 @numba.njit(**FAST)

@@ -151,12 +151,17 @@ class GateInputs(NamedTuple):
 
 
 @numba.njit(inline="always", **FAST)
-def first_failed(gates, at):  # type: ignore[no-untyped-def]
-    """Return the code of the first gate that a pixel fails, or VALID: the engine's table of gates."""
-    limit = gates.residual
-    if gates.residual_slope != f4(0):
-        by_amplitude = gates.residual_scale * np.exp(gates.residual_slope * np.log(at.brightest))
-        limit = min(gates.residual_most, max(limit, np.float32(by_amplitude)))
+def residual_limit(gates, brightest):  # type: ignore[no-untyped-def]
+    """Return the largest lattice residual in turns of a pixel with a greatest amplitude ``brightest``."""
+    if gates.residual_slope == f4(0):
+        return gates.residual
+    by_amplitude = gates.residual_scale * np.exp(gates.residual_slope * np.log(brightest))
+    return min(gates.residual_most, max(gates.residual, np.float32(by_amplitude)))
+
+
+@numba.njit(inline="always", **FAST)
+def first_failed(gates, limit, at):  # type: ignore[no-untyped-def]
+    """Return the code of the first gate that a pixel with a `residual_limit` fails, or VALID: the table of gates."""
     # the first gate that fails gives the reason, so gates are tried from the last to the first
     code = LOW_REFLECTIVITY if at.total * at.range_m * at.range_m < gates.reflectivity else VALID
     code = code if (at.low_m >= gates.nearest_m) & (at.high_m <= gates.farthest_m) else OUT_OF_RANGE
@@ -176,7 +181,7 @@ def first_failed_each(gates, at):  # type: ignore[no-untyped-def]
             at.edge[i], at.least[i], at.greatest[i], at.total[i], at.residual2[i], at.brightest[i], at.range_m[i],
             at.low_m[i], at.high_m[i],
         )  # fmt: skip
-        codes[i] = first_failed(gates, here)
+        codes[i] = first_failed(gates, residual_limit(gates, here.brightest), here)
     return codes
 
 
@@ -198,37 +203,68 @@ def _range_and_gates(  # type: ignore[no-untyped-def]
     """Run `ranges_of`: r = (4 s^2 - e.e) / (4 s - 2 u.e) of half the path s by the emitter at e, along u."""
     n_frequencies, _, n = filtered.shape
     turn = np.empty((n_frequencies, BLOCK), np.float32)
-    half = np.empty(BLOCK, np.float32)
-    residual2 = np.empty(BLOCK, np.float32)
+    # loops over one array are vectorised, as no other can overlap it
+    block = np.zeros((CODE + 1, BLOCK), np.float32)
     for start in range(0, n, BLOCK):
         length = min(BLOCK, n - start)
+        these = slice(start, start + length)
         for f in range(n_frequencies):
-            _phases(filtered[f, 0, start : start + length], filtered[f, 1, start : start + length], turn[f])
-        half_path(turn, length, lattice, half[:length], residual2[:length])
-        for i in range(start, start + length):
-            least = filtered[0, 2, i]
-            greatest, sum_of_all, steepest, steps = least, least, edge[0, i], edge[0, i]
-            for f in range(1, n_frequencies):
-                a = filtered[f, 2, i]
-                least = min(least, a)
-                greatest = max(greatest, a)
-                sum_of_all += a
-                steepest = max(steepest, edge[f, i])
-                steps += edge[f, i]
-            if gates.edge_mean > f4(0):
-                steepest = steps / f4(n_frequencies)
-            path = half[i - start] + errors_m[i]
-            range_m = (FOUR * path * path - geometry[1, i]) / (FOUR * path - TWO * geometry[0, i])
-            z = range_m * geometry[2, i]
-            limited = z if gates.axial > f4(0) else range_m
-            r2 = residual2[i - start]
-            at = GateInputs(steepest, least, greatest, sum_of_all, r2, greatest, range_m, limited, limited)
-            code = first_failed(gates, at)
-            code = SATURATED if saturated[i] != np.uint8(0) else code
-            code = OUTSIDE_MASK if outside_mask[i] else code
-            total[i] = sum_of_all
-            reason[i] = np.uint8(code)
-            z_m[i] = z
+            _phases(filtered[f, 0, these], filtered[f, 1, these], turn[f])
+            block[AMPLITUDE, :length], block[GAP, :length] = filtered[f, 2, these], edge[f, these]
+            _fold(block.reshape(block.size), f == 0)
+        half_path(turn, length, lattice, block[HALF_PATH, :length], block[RESIDUAL, :length])
+        block[ERROR, :length] = errors_m[these]
+        block[ALONG : ALONG + 3, :length] = geometry[:, these]
+        block[LIMIT] = gates.residual
+        if gates.residual_slope != f4(0):
+            for i in range(length):
+                block[LIMIT, i] = residual_limit(gates, block[GREATEST, i])
+        _judge(block.reshape(block.size), gates, f4(n_frequencies))
+        total[these], z_m[these] = block[TOTAL, :length], block[RANGE, :length]
+        _reasons(block[CODE, :length], saturated[these], outside_mask[these], reason[these])
+
+
+AMPLITUDE, GAP, LEAST, GREATEST, TOTAL, STEEPEST, STEPS, HALF_PATH, RESIDUAL, ERROR, ALONG, EMITTER, COSINE = range(13)
+LIMIT, RANGE, CODE = 13, 14, 15
+"""Rows of a block: the first two of a frequency, five of all frequencies; the two before the last of `DepthEngine`."""
+
+
+@numba.njit(**FAST)
+def _fold(block, first):  # type: ignore[no-untyped-def]
+    """Take another frequency's amplitude and edge sum into the extremes and sums over the frequencies."""
+    for i in range(np.uint64(BLOCK)):
+        a, e = block[AMPLITUDE * BLOCK + i], block[GAP * BLOCK + i]
+        least, greatest, steepest = block[LEAST * BLOCK + i], block[GREATEST * BLOCK + i], block[STEEPEST * BLOCK + i]
+        block[LEAST * BLOCK + i] = a if first or a < least else least
+        block[GREATEST * BLOCK + i] = a if first or a > greatest else greatest
+        block[STEEPEST * BLOCK + i] = e if first or e > steepest else steepest
+        block[TOTAL * BLOCK + i] = a if first else block[TOTAL * BLOCK + i] + a
+        block[STEPS * BLOCK + i] = e if first else block[STEPS * BLOCK + i] + e
+
+
+@numba.njit(**FAST)
+def _judge(block, gates, n_frequencies):  # type: ignore[no-untyped-def]
+    """Fill the rows of z and of the code of the first gate that fails."""
+    for i in range(np.uint64(BLOCK)):
+        mean = block[STEPS * BLOCK + i] / n_frequencies
+        edge = mean if gates.edge_mean > f4(0) else block[STEEPEST * BLOCK + i]
+        path = block[HALF_PATH * BLOCK + i] + block[ERROR * BLOCK + i]
+        ratio = FOUR * path - TWO * block[ALONG * BLOCK + i]
+        range_m = (FOUR * path * path - block[EMITTER * BLOCK + i]) / ratio
+        z = range_m * block[COSINE * BLOCK + i]
+        limited = z if gates.axial > f4(0) else range_m
+        least, greatest, total = block[LEAST * BLOCK + i], block[GREATEST * BLOCK + i], block[TOTAL * BLOCK + i]
+        r2 = block[RESIDUAL * BLOCK + i]
+        at = GateInputs(edge, least, greatest, total, r2, greatest, range_m, limited, limited)
+        block[CODE * BLOCK + i] = f4(first_failed(gates, block[LIMIT * BLOCK + i], at))
+        block[RANGE * BLOCK + i] = z
+
+
+@numba.njit(**FAST)
+def _reasons(code, saturated, outside_mask, reason):  # type: ignore[no-untyped-def]
+    for i in range(np.uint64(reason.size)):
+        why = SATURATED if saturated[i] != np.uint8(0) else np.int32(code[i])
+        reason[i] = np.uint8(OUTSIDE_MASK if outside_mask[i] else why)
 
 
 @numba.njit(**FAST)

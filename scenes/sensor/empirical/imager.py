@@ -8,6 +8,7 @@ effects multipath, wiggling, ambient and saturation change nothing."""
 
 from typing import NamedTuple
 
+import numba
 import numpy as np
 from scipy import ndimage
 
@@ -15,7 +16,7 @@ from harness.vocabulary.geometry import MM, Reason, Region
 from scenes.optics import NoiseFreeView, wave_numbers
 from scenes.sensor.camera import CameraConfig
 from scenes.sensor.empirical.facts import EmpiricalCamera
-from scenes.sensor.normals import standard_normals
+from scenes.sensor.normals import FAST, standard_normals
 from scenes.sensor.tabled import filtered
 from scenes.sensor.unit import DecodedFrame, UnitModel
 
@@ -97,13 +98,29 @@ class EmpiricalImager(UnitModel[EmpiricalCamera]):
     def frame(self, exposure: IdealRange, rng: np.random.Generator, error_m: float = 0.0) -> DecodedFrame:
         """Draw a frame with noise from ``rng``; ``error_m`` displaces it as a whole."""
         engine, shape = self.camera.engine, exposure.range_m.shape
+        limits = map(f4, (engine.min_range_mm.value * MM, engine.max_range_mm.value * MM, self.camera.z_step_m))
         noise = filtered(standard_normals(rng, shape), *self._filters)
-        range_m = exposure.range_m + exposure.sigma_m * noise + f4(error_m)
-        step_m = self.camera.z_step_m
-        z_m = np.round(range_m / self._stretch / step_m) * step_m
-        with np.errstate(invalid="ignore"):
-            beyond = (range_m < engine.min_range_mm.value * MM) | (range_m > engine.max_range_mm.value * MM)
-        lost = np.isnan(exposure.range_m) | (rng.random(shape, dtype=f4) < exposure.chance)
-        reason = np.where(lost, Reason.NO_RETURN, np.where(beyond, Reason.OUT_OF_RANGE, Reason.VALID)).astype(np.uint8)
-        z_m = np.where(reason == Reason.VALID, z_m, np.nan).astype(f4)
+        images = exposure.range_m, exposure.sigma_m, exposure.chance, self._stretch, noise, rng.random(shape, dtype=f4)
+        z_m, reason = np.empty(shape, f4), np.empty(shape, np.uint8)
+        decode(*images, f4(error_m), *limits, z_m, reason)
         return DecodedFrame(z_m, reason, exposure.amplitude)
+
+
+NO_RETURN, OUT_OF_RANGE, VALID = map(np.uint8, (Reason.NO_RETURN, Reason.OUT_OF_RANGE, Reason.VALID))
+
+
+@numba.njit(**FAST)
+def decode(  # type: ignore[no-untyped-def]
+    range_m, sigma_m, chance, stretch, noise, uniforms, error_m, nearest_m, farthest_m, step_m, z_m, reason
+):
+    """Add ``noise`` of deviation 1 to an `IdealRange`, with random ``uniforms``; write z and the reason, (h, w) each.
+    ``stretch``: range over z. ``error_m`` displaces the frame."""
+    for y in range(range_m.shape[0]):
+        for x in range(range_m.shape[1]):
+            found_m = range_m[y, x] + sigma_m[y, x] * noise[y, x] + error_m
+            beyond = (found_m < nearest_m) | (found_m > farthest_m)
+            code = OUT_OF_RANGE if beyond else VALID
+            code = NO_RETURN if np.isnan(range_m[y, x]) | (uniforms[y, x] < chance[y, x]) else code
+            rounded = np.rint(found_m / stretch[y, x] / step_m) * step_m
+            z_m[y, x] = rounded if code == VALID else np.float32(np.nan)
+            reason[y, x] = code

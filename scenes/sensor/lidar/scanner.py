@@ -115,6 +115,14 @@ class LidarScanner(UnitModel[ScannedLidar]):
             total = total + weight * light[..., np.clip(every[rows] + ahead, 0, every[-1]), :]
         return total
 
+    @cached_property
+    def _everyone(self) -> np.ndarray:
+        """Return (h, w) float32: the weight of all neighbours within the picture."""
+        everyone = np.ones(self.region.shape, f4)
+        for axis, taps in enumerate(self.camera.smoothing_taps):
+            ndimage.convolve1d(everyone, taps, axis, everyone, mode="constant")
+        return everyone
+
     def frame(self, exposure: LidarReturns, rng: np.random.Generator, error_m: float = 0.0) -> DecodedFrame:
         """Draw a frame: noise from ``rng`` on the peaks, then the processing; ``error_m`` displaces the frame."""
         camera, (h, w) = self.camera, exposure.noise.shape
@@ -139,16 +147,15 @@ class LidarScanner(UnitModel[ScannedLidar]):
         gate_m = won[2] * f4(camera.engine.agree_deviations.value)
 
         # smoothing along columns, then along rows; range, gates and rounding
-        everyone, image = np.ones((h, w), f4), (half_m, share, height)
+        image = half_m, share, height
         for axis, taps in enumerate(camera.smoothing_taps):
-            ndimage.convolve1d(everyone, taps, axis, everyone, mode="constant")
             smoothed = tuple(np.empty((h, w), f4) for _ in image)
             kernels.smooth(*image, gate_m, taps, axis == 1, *smoothed)
-            for bordered_image, result in zip(image, smoothed, strict=True):
+            for bordered_image, result in zip(image, smoothed if axis == 0 else (), strict=axis == 0):
                 bordered_image[inner] = result
         z_m, strength, reason = np.empty((h, w), f4), np.empty((h, w), f4), np.empty((h, w), np.uint8)
         scene = *self._geometry, exposure.saturated, self._limits, f4(error_m)
-        kernels.gated(*smoothed, everyone, *scene, z_m, reason, strength)
+        kernels.gated(*smoothed, self._everyone, *scene, z_m, reason, strength)
         return DecodedFrame(z_m, reason, strength)
 
 
