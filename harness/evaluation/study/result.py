@@ -24,8 +24,7 @@ from harness.vocabulary.seeds import canonical_json
 if TYPE_CHECKING:
     import pandas as pd
 
-FRAMES = "capture.frames"
-"""The dotted path of the axis that every experiment has."""
+FRAMES = "capture.frames"  # the dotted path of the axis that every experiment has
 
 
 @dataclass(frozen=True, eq=False)
