@@ -29,10 +29,8 @@ MOST_CELLS, CELL_POINTS, EVEN_CELL_POINTS, ENOUGH_CELLS, FEW_CELLS = 3600, 16, 6
 TILE_CELLS, FOLDS = 3, 5
 """Side, in cells, of a tile that is predicted as a whole, and the number of folds into which the tiles are dealt."""
 LEAST_SCALE_M = 0.04  # largest width of damage, unless the settings differ: no free form that could follow it is chosen
-WORTH = 0.1
-"""A shape is as good as the best if its error of prediction is larger by at most this share of a pixel's noise."""
-NOISIER = 1.25
-"""Five standard errors of the median of 49 deviations of 16 pixels each; a smaller ratio counts as even noise."""
+WORTH = 0.1  # a shape is as good as the best if its error of prediction is larger by at most this share of the noise
+NOISIER = 1.25  # five standard errors of the median of 49 deviations of 16 pixels each; below it, noise counts as even
 STEEPEST_DEG = 75.0
 """Incidence beyond which a surface is not judged: a pixel covers 4 times its width there, and its noise grows."""
 FREE_FORM_FROM, MISFIT_FROM = 0.02, 0.1

@@ -28,8 +28,7 @@ from detectors.surface import SurfaceConfig, fit_surface
 from harness.vocabulary.geometry import Cloud, MapViews, Reason, Region, invert, transform_points
 
 CELLS = 2000
-CLASSES, PER_CLASS = 12, 100
-"""Number of distance classes on the sensor, with equal numbers of pairs; fewest pairs for a median."""
+CLASSES, PER_CLASS = 12, 100  # distance classes on the sensor, with equal numbers of pairs; fewest pairs for a median
 LENGTHS = 24  # number of trial lengths, geometric from a pixel to the largest distance between views
 EXPONENTS = (1.0, 1.5, 2.0)
 """A pattern that a filter smooths over a few pixels has a covariance that is flat at first (2), not pointed (1)."""

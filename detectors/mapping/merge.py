@@ -31,8 +31,7 @@ OVERSAMPLING = 2  # pixels of the undistorted image along a side of an original 
 WALL_DEG = 60.0
 """A crossing whose normal is farther from that of the smooth face lies on a wall. A dent as deep as its radius has
 flanks of 45 degrees; a drilled wall has 90, less the effect of the camera's blur."""
-LOOKED_UP_AT = 0.5
-"""Added to the principal point, because Open3D truncates pixel positions: the first pixel's centre is 0.5."""
+LOOKED_UP_AT = 0.5  # added to the principal point, as Open3D truncates pixel positions: the first pixel's centre is 0.5
 BLOCK, BLOCKS_AT_FIRST = 8, 4096
 """Voxels along a side of a block (larger ones lie mostly outside the truncated field), and blocks reserved at first."""
 

@@ -19,8 +19,7 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud, invert, transform_points
 
 LONGEST_EDGE = 4.0  # longest edge, in spacings, of a triangle between samples without a grid: longer edges cross a gap
-SLACK = 1e-9
-"""Tolerance for a cell on the edge between two triangles: it belongs to the first, and rounding must not lose it."""
+SLACK = 1e-9  # a cell on the edge between two triangles belongs to the first, and rounding must not lose it
 
 
 @dataclass(frozen=True)

@@ -18,15 +18,13 @@ from harness.vocabulary.geometry import Cloud
 FALSE_RATE = 1e-5
 """Share of the target's own pixels beyond the threshold by the extrapolated tail. Real tails have ten (Gauss) to a
 hundred (Laplace) times as many, which form no mark, because a mark has nine pixels that touch."""
-DEGREE = 2
-"""Degree of the polynomial: the light of one lamp, or of two lamps of different colour, bends once over a board."""
+DEGREE = 2  # degree of the polynomial: the light of one lamp, or of two of different colour, bends once over a board
 SAMPLE, STEPS, CORE = 4096, 6, 0.6
 """Number of pixels in the fit, number of steps of the scatter, and share of the pixels on which the scatter rests."""
 CORE_SHRINKS = {1: 0.2146, 2: 0.3891}  # variance of the innermost part (`CORE`) of a Gaussian in one and two dimensions
 GAUSSIAN_LIMITS = {1: 4.4172, 2: 4.7985}
 """Distances that a share `FALSE_RATE` of a Gaussian exceeds, in one and two dimensions."""
-NEARBY_PX = 16
-"""Distance over which a camera smears colour: JPEG stores one value for two by two pixels, in blocks of eight."""
+NEARBY_PX = 16  # reach of a camera's smearing of colour: JPEG stores one value for 2 x 2 pixels, in blocks of eight
 TAIL = (0.4, 0.7)  # quantiles from which the tail is extrapolated; pixels above them may belong to marks
 
 
@@ -82,8 +80,7 @@ def above_half(chosen: np.ndarray, contrast: np.ndarray) -> np.ndarray:
 
 LEAST_PIXELS, MOST_BLOBS = 9, 200
 """Fewest pixels of a mark, three by three (fewer have no inside), and the most groups that are examined."""
-RIM_PX, RING_PX = 2, 8
-"""Width of the band around a group that is searched for a mixed rim, and of the band for its surroundings."""
+RIM_PX, RING_PX = 2, 8  # widths of the band around a group that is searched for a mixed rim, and of its surroundings
 MIXED_SHARE = 0.15
 """Share of the rim, two pixels wide, with colours between 0.2 and 0.8 of the way from one colour to the other: 0.6 / 2
 if a colour is the mean over the pixel's area, and 0 if it is the colour at the pixel's centre."""

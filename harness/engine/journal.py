@@ -19,8 +19,7 @@ from harness.vocabulary.files import RECORD_BYTES, explained, open_plain, strict
 from harness.vocabulary.provenance import check_version, stamp_of, stamped
 from harness.vocabulary.seeds import canonical_json
 
-JOURNAL_VERSION = 6
-"""Increased with every change to records or to what a trial computes: trials of older versions then run again."""
+JOURNAL_VERSION = 6  # raised with every change to records or to what a trial computes: older trials then run again
 SEGMENT_NAME = re.compile(r"[0-9]{6}-[0-9a-f]{8}\.jsonl")
 THRESHOLDS = "thresholds-"  # prefix of the keys of entries that hold thresholds
 NOTHING = "null"  # replaces the record of a trial that is not done

@@ -31,8 +31,7 @@ from scenes.render.cache import read_view
 
 NOTHING = 0.1  # a camera that allows no threshold sees nothing if at most this share of a board's face is judged
 Quiet = dict[str, dict[str, tuple[float, float]]]  # (quiet threshold, judged area in m2) by point, then by trial
-AGREES = 1e-3
-"""Relative difference of equal thresholds: less than a tenth of the standard error of one from twenty boards."""
+AGREES = 1e-3  # relative difference of equal thresholds: below a tenth of the standard error of one from twenty boards
 
 
 class Calibration:

@@ -23,8 +23,7 @@ AXES = {
     "albedo": "source.target.material.albedo_850",
 }
 """The axes of a surface, and the columns of the table of limits that hold their values."""
-UNKNOWN_VARIANCE = 0.25
-"""Variance of ln a90 if an interval has no positive lower end: a factor of 1.65 in either direction."""
+UNKNOWN_VARIANCE = 0.25  # variance of ln a90 if an interval has no positive lower end: a factor of 1.65 either way
 TOLERANCE = 1e-9
 
 

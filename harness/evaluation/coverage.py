@@ -17,8 +17,7 @@ from harness.evaluation.pod.statement import POD
 from harness.vocabulary.errors import UserError
 
 BEYOND_DEG = 3.0  # largest angle by which a patch may be steeper than all inspected damage
-FAR = 1.5
-"""Ratio of score to threshold above which the score's value is ignored, so that the law holds near the threshold."""
+FAR = 1.5  # ratio of score to threshold above which the score is ignored, so that the law holds near the threshold
 GROWTHS = np.linspace(0.0, 4.0, 17)  # powers of 1 / cosine with which the scatter may grow
 LOOSE = 2.0  # limits count as rough above this ratio of the sizes found with probabilities of 90 % and 50 %
 FEWEST = 20  # fewest damages from which the law is fitted

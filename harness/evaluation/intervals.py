@@ -14,8 +14,7 @@ from harness.vocabulary.errors import UserError
 
 CONFIDENCE = 0.95  # two-sided confidence of every interval in tables and reports
 UPPER = 0.5 + CONFIDENCE / 2
-RESAMPLES = 2000
-"""Bootstrap resamples: the 2.5 % quantile is then the 50th smallest, stable to about 3 % of the interval's width."""
+RESAMPLES = 2000  # the 2.5 % quantile is then the 50th smallest, stable to about 3 % of the interval's width
 
 
 @dataclass(frozen=True)

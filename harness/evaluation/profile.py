@@ -5,8 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-FEWEST_PIXELS = 12
-"""Fewest valid pixels inside the outline to distinguish two shapes; with fewer, one ring is the whole hole."""
+FEWEST_PIXELS = 12  # valid pixels inside the outline to distinguish two shapes; with fewer, one ring is the whole hole
 FEWEST_VALID = 0.5  # least share of valid pixels inside the outline: fewer may show only one side of the hole
 CLEARLY = 0.8  # a shape fits clearly better if its rms misfit is at most this share of the other's (fixed beforehand)
 

@@ -18,8 +18,7 @@ from harness.tables.trials import EFFECTS, ResultTables
 
 MEASURES = ("extent", "model")
 KEYS = ["variant", "frames"]
-RESAMPLES = 1000
-"""Draws of the bootstrap: its 2.5 % quantile is the 25th smallest, stable to about 5 % of the interval's width."""
+RESAMPLES = 1000  # the 2.5 % quantile is then the 25th smallest, stable to about 5 % of the interval's width
 HALF = 0.5
 LIMIT_RULE = (
     "The detection limit is the smallest true diameter for which every hole as large or larger counts as found. "

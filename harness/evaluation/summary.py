@@ -16,14 +16,12 @@ from harness.tables.trials import TRIALS, TRUTH
 HoleState = Literal["found", "missed", "undecided"]
 Measure = Literal["extent", "model"]
 
-MAIN = "main"
-"""The variant that the experiment declares; all others change a fact that the thesis leaves open."""
+MAIN = "main"  # the variant that the experiment declares; all others change a fact that the thesis leaves open
 FOUND_RULE = (
     "A hole counts as found when the 95 % Wilson interval of its detection rate over the repeats lies above 0.5, "
     "as missed when it lies below, and as undecided otherwise."
 )
-FEWEST_TRIALS = 4
-"""4 of 4 have a Wilson interval from 0.51; with 3 nothing is certain."""
+FEWEST_TRIALS = 4  # 4 of 4 have a Wilson interval from 0.51; with 3 nothing is certain
 GROUP = ["variant", "frames", "hole"]
 TRUTH_COLUMNS = [column.name for column in TRUTH]
 

@@ -46,8 +46,7 @@ UNIT = CameraConfig(effects=EffectsConfig().model_copy(update={"unit_offset": Fa
 """Effects of a simulated unit that captures of a real unit also show."""
 STEPS, CLOSE, FARTHEST, FEW_FRAMES = 5, 0.01, 100.0, 12
 """Most steps of the fit of the gain, the relative error at which it ends, its largest change, and frames per step."""
-EDGE_SHARE = 2.56
-"""Width of a blurred edge from 10 % to 90 % of its step, in standard deviations of the Gaussian."""
+EDGE_SHARE = 2.56  # width of a blurred edge from 10 % to 90 % of its step, in standard deviations of the Gaussian
 UNKNOWN = "not determined by the captures"
 
 

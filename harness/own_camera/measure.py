@@ -28,22 +28,18 @@ TOLERANCE_M, LEAST_PLANE_PX = 8 * MM, 2000
 EDGE_PX, WIDEST_PX, LEAST_STEP_M = 3, 24, 20 * MM
 """Width of a plane's rim in pixels, which is left out because the camera's filter mixes other surfaces into it; largest
 distance in pixels between the two surfaces at an edge; and the least step of depth there."""
-LEAST_BIN_PX = 300
-"""About 12 windows of 5 x 5 pixels, so that the standard deviation of 20 frames is known to 5 %."""
-MOST_FRAMES = 300
-"""Most frames of a capture that are held in memory: 440 MB for 640 x 576 pixels."""
+LEAST_BIN_PX = 300  # about 12 windows of 5 x 5 pixels, so that the standard deviation of 20 frames is known to 5 %
+MOST_FRAMES = 300  # most frames of a capture that are held in memory: 440 MB for 640 x 576 pixels
 RANGE_CELLS, LIGHT_CELLS, ANGLE_CELL_DEG = 1.08, 1.25, 10.0
 """Ratios of the upper to the lower end of cells of range and of brightness, and the width of cells of angle."""
-TELLING_RATIO = 1.25
-"""Least ratio of the largest to the smallest range (or brightness) that determines an exponent."""
+TELLING_RATIO = 1.25  # least ratio of the largest to the smallest range (or brightness) that determines an exponent
 LAGS, PATTERN_LAGS, CORRELATED_FRAMES = 12, 40, 16
 """Largest lags in pixels of the correlations of noise and of pattern, and frames for the correlation of noise."""
 JUMP_M, JUMP_SIGMAS = 3 * MM, 6.0
 """A frame jumps if its displacement exceeds both values, which are ten times the wander of a static Azure Kinect."""
 ASSUMED = np.array([0.0, 2.0, -0.5])
 """Exponents of range (read noise, disparity) and brightness (shot noise) if the captures do not determine them."""
-UNSURE = 0.5
-"""Largest standard error of an exponent that is reported."""
+UNSURE = 0.5  # largest standard error of an exponent that is reported
 SLOW, WIDE_PX, COARSE = 0.15, 6.5, 0.35
 """Limits for the correlation of successive frames, the reach of neighbours' correlation, and the ratio of noise to
 rounding step, which show that a recording was averaged, smoothed or rounded before it was stored."""

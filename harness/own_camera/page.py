@@ -35,8 +35,7 @@ CAPTION = (
     "similar values of all three); correlation of noise and of fixed pattern along x and y, and their spectra (1 for "
     "white noise); displacement of whole frames; dropouts. Orange is the simulation from the camera file."
 )
-FigureRow = tuple[str, str, str, float, str]
-"""Name, place, unit, value and meaning of a figure."""
+FigureRow = tuple[str, str, str, float, str]  # name, place, unit, value and meaning of a figure
 
 
 def own_figures(found: Characteristics) -> Iterator[FigureRow]:

@@ -27,8 +27,7 @@ if TYPE_CHECKING:
 HERE = Path(__file__).parent
 SHOWN_FIRST = (*("commit", "dirty", "seed", "started", "machine", "mitsuba_variant"), *("renders", "versions"))
 """Keys of the provenance that every page shows, as "not recorded" if they are missing."""
-MOST_VALUES = 81
-"""Most points of a line whose values are shown under the pointer."""
+MOST_VALUES = 81  # most points of a line whose values are shown under the pointer
 SHOWN_APART = ("command", "seconds", "failures")
 NAMED = 3  # Most trials that are named for the same failure
 
@@ -150,8 +149,7 @@ def plain(value: Any) -> str:
 # Okabe and Ito's palette (Color Universal Design, 2008), which remains distinguishable with common colour blindness
 BLUE, ORANGE, GREEN, RED, SKY, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7"
 INK, GREY, PALE = "#1d2530", "#6b7480", "#e9ecef"
-DAMAGE = "#ff00ff"
-"""Magenta, the colour of damage in the clouds of the thesis."""
+DAMAGE = "#ff00ff"  # magenta, the colour of damage in the clouds of the thesis
 
 STYLE: dict[str, Any] = {
     "font.family": "sans-serif",

@@ -62,8 +62,7 @@ class MappedExample:
     is_variation: bool = False
 
 
-NOTHING = "#b9bec4"
-"""Grey, for pixels without a valid point."""
+NOTHING = "#b9bec4"  # grey, for pixels without a valid point
 LEAST_MM = 10.0
 MOST_DOWN = 3
 SMALLEST_RING_PX = 2.5

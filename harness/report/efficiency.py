@@ -20,10 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 STYLES = ("-", "--", "-.", ":")
-CLASSES = 8
-"""Number of classes of d', with equal numbers of damages, whose shares of hits are drawn."""
-LEFT = 0.5
-"""Left end of the axis of d'; damage with a lower d' is found only by chance."""
+CLASSES = 8  # number of classes of d', with equal numbers of damages, whose shares of hits are drawn
+LEFT = 0.5  # left end of the axis of d'; damage with a lower d' is found only by chance
 READ = (
     "Efficiency: the squared ratio of two d', that at which the ideal observer finds the share and that at which the "
     "detector finds it by depth alone. d' is the ideal observer's signal at a damage divided by the standard deviation "

@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DAMAGE_RGB = (255, 0, 255)
-ELONGATED = 2.0
-"""Least ratio of length to width of a long finding; a width below 1 mm, which is noise, counts as 1 mm."""
+ELONGATED = 2.0  # least ratio of length to width of a long finding; a width below 1 mm, which is noise, counts as 1 mm
 
 
 @dataclass(frozen=True)

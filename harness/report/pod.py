@@ -22,10 +22,8 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
-MOST_MARKS = 2000
-"""Most inspections that a figure draws as vector marks; if there are more, they are rasterised."""
-STRIPE = 0.10
-"""Height of the stripes above 1 and below 0 in which hits and misses are spread, in units of POD."""
+MOST_MARKS = 2000  # most inspections that a figure draws as vector marks; if there are more, they are rasterised
+STRIPE = 0.10  # height of the stripes above 1 and below 0 in which hits and misses are spread, in units of POD
 VALIDITY = (
     "The limit holds for inspections like these: the same kind of flaws and parts, the same procedure, and the sizes "
     "inspected. Targets are assumed to be independent. Sizes beyond the largest target are extrapolated."

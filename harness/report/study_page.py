@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 MOST_CURVES = 6
 STYLES = ("-", "--", ":", "-.")
 LONGEST_NAME = 60
-ROW = 0.035
-"""Height of a set-up's rows of hits above 1 and of misses below 0, in units of POD."""
+ROW = 0.035  # height of a set-up's rows of hits above 1 and of misses below 0, in units of POD
 
 
 def with_room(set_ups: Sequence[SetUpResult]) -> list[SetUpResult]:

@@ -16,8 +16,7 @@ from harness.thesis.views import score_views
 from harness.vocabulary.provenance import RESULTS_VERSION
 
 Summaries = Mapping[Table, pd.DataFrame]
-LISTS = ("found", "undecided", "reasons")
-"""Columns whose values are lists in memory and text in files."""
+LISTS = ("found", "undecided", "reasons")  # columns whose values are lists in memory and text in files
 
 
 def is_thesis(facts: Mapping[str, Any]) -> bool:

@@ -125,8 +125,7 @@ def share_of(hits: np.ndarray, pixels_each: float) -> Reading:
     return Reading(float(hits.mean()), Interval(float(low), float(high)))
 
 
-BISQUARE = 4.685
-"""Tukey's constant, which gives an efficiency of 95 % for normal errors."""
+BISQUARE = 4.685  # Tukey's constant, which gives an efficiency of 95 % for normal errors
 CANDIDATES, TRIPLE_PX, SCREENED = 400, 40, 4000
 """Number of planes tried in each round, distance between the three points of each, and pixels that judge it."""
 GROWN = 2.0
@@ -294,12 +293,10 @@ def fixed_pattern(z_m: np.ndarray, where: np.ndarray, slopes: np.ndarray, lags: 
 
 
 TOLERANCE_SIGMAS = 4.0
-TOLERANCE_STEP = 0.1
-"""A pixel is on a surface if it lies within four standard deviations of noise plus a tenth of the step."""
+TOLERANCE_STEP = 0.1  # a point of a surface lies within four standard deviations of noise plus a tenth of the step
 LEAST_TOLERANCE_M = 0.5 * MM
 MOST_OF_STEP = 0.45
-FLAT_PX = 8.0
-"""Distance from an edge beyond which the camera's filter sees a single surface."""
+FLAT_PX = 8.0  # distance from an edge beyond which the camera's filter sees a single surface
 
 
 def on_surface_tolerance_m(sigma_m: float, step_m: float) -> float:

@@ -49,8 +49,7 @@ PEAK_MM, RING_MM = 6.0, (6.5, 13.5)
 OFF_RING = 4.0
 """Robust standard deviations beyond which a ring's pixel is excluded, since it belongs to an object such as a tag."""
 PATTERN_PX, ANGLES_DEG = (3, 6, 12), (0, 20, 35, 60)
-CLOSE = 0.3
-"""Largest difference of a ratio from 1 that counts as agreement."""
+CLOSE = 0.3  # largest difference of a ratio from 1 that counts as agreement
 HOW = (
     "The board is declared, its view is rendered with light between its surfaces, the camera is simulated from its "
     "unchanged file, and the frames are resampled to the capture's pixels. The same analysis is applied to both: a "

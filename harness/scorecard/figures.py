@@ -31,11 +31,9 @@ from harness.vocabulary.seeds import canonical_json
 from scenes.sensor.camera import camera_names
 
 FIGURES_FILE = Path(__file__).with_name("figures.yaml")
-NEAR = 0.25
-"""A figure of a real camera passes within this share of a published value; a published bound must hold."""
+NEAR = 0.25  # a figure of a real camera passes within this share of a published value; a published bound must hold
 PROGRESS_EVERY_S = 10.0
-Request = tuple[str, str, Config]
-"""The camera, the quantity and its conditions."""
+Request = tuple[str, str, Config]  # the camera, the quantity and its conditions
 
 
 class Published(Config):

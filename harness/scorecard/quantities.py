@@ -46,8 +46,7 @@ LEAST_TILT = (0.05, 0.02)
 EDGE_PATCH = (40, 96)
 REACH_PX = 44.0
 """Distance from the edge within which pixels are counted: more than the widest shadow at 0.75 m, under 44 pixels."""
-SLANT = 0.1
-"""Slant of the edge, in pixels across per pixel along: all positions of an edge in a pixel occur, as in ISO 12233."""
+SLANT = 0.1  # pixels across per pixel along the edge: all positions of an edge in a pixel occur, as in ISO 12233
 ROOM_LIGHT = CameraConfig().ambient_uw_cm2_nm
 
 Distance = Annotated[float, Field(ge=0.1, le=20.0, description="along the optical axis, in metres")]

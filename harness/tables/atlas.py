@@ -11,8 +11,7 @@ from harness.tables.schema import Column, Estimate, Table
 
 DAMAGE = {"through": "through-hole", "blind": "blind hole", "dent": "dent"}
 """Names of kinds of damage in words; other kinds keep their name."""
-DISTANCES = 25
-"""Number of distances on a curve; their logarithms are evenly spaced."""
+DISTANCES = 25  # number of distances on a curve; their logarithms are evenly spaced
 
 
 @dataclass(frozen=True)

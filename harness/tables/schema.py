@@ -33,8 +33,7 @@ from harness.vocabulary.seeds import canonical_json
 if TYPE_CHECKING:
     import pandas as pd
 
-LISTS_AT_ONCE = 1_000
-"""Number of rows whose lists are expanded to rows of a file at a time; they take about 5 MB."""
+LISTS_AT_ONCE = 1_000  # number of rows whose lists are expanded to rows of a file at a time; they take about 5 MB
 UNITS = {"_per_m2": "1/m²", "_m2": "m²", "_mm3": "mm³", "_mm": "mm", "_m": "m", "_s": "s", "_mb": "MB", "_px": "pixels"}
 
 

@@ -27,8 +27,7 @@ from harness.tables.schema import Column, Estimate, Table
 from harness.tables.text import Grid
 from harness.vocabulary.path_names import camera_title, differing, names_of, on_one_line, unit_of, value_text
 
-BLOB_PX = 5.0
-"""Distance on the sensor within which two highest scores belong to the same blob: the width of a camera's filter."""
+BLOB_PX = 5.0  # distance on the sensor within which two highest scores are one blob: the width of a camera's filter
 HIGH_THRESHOLD = 10.0
 """Standard deviations. A hole-free board's highest score is 4 with Gaussian noise, 5 to 6 with a fixed pattern."""
 OFF_BOARD = "off the board"

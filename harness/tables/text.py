@@ -102,8 +102,7 @@ def _number(value: float, digits: int, most: float) -> str:
 Tone = Literal["", "good", "key", "bad", "open", "changed"]
 COLOURS = {"good": "green", "key": "bold green", "bad": "bold red", "open": "yellow"}
 """Colours at a terminal; the text alone conveys the same."""
-ROUGH = 0.1
-"""Ratio of an interval's width to the value beyond which a third digit is meaningless."""
+ROUGH = 0.1  # ratio of an interval's width to the value beyond which a third digit is meaningless
 CLASSES = {"good": "good", "key": "key", "bad": "none", "open": "open", "changed": "changed"}
 
 

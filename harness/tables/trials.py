@@ -269,8 +269,7 @@ def _found(row: Mapping[str, Any]) -> Cell:
     return Cell(f"{len(row['found'])} of {row['holes']}\n{words}".strip(), share=len(row["found"]) / row["holes"])
 
 
-MOST_NAMES = 15
-"""Most holes that a cell lists by name; for more holes it gives only the number."""
+MOST_NAMES = 15  # most holes that a cell lists by name; for more holes it gives only the number
 CALLS_OF = Column(
     "", "false calls", lambda row: f"{row['false_calls']:.0f} in {row['runs']:.0f}" if row["runs"] > 0 else "–"
 )

@@ -13,10 +13,8 @@ from harness.evaluation.maps import MANY
 from harness.thesis.claims import CAMERA, FEW, FOUND_WITH_FEW, FOUND_WITH_MANY, THESIS_HOLES
 from harness.vocabulary.path_names import in_words, names_of, value_text
 
-FEWEST_SET_UPS = 20
-"""Fewest set-ups for which a posterior is computed."""
-DOUBTED = 0.5
-"""A value is doubted if its posterior probability is less than this share of its prior probability."""
+FEWEST_SET_UPS = 20  # fewest set-ups for which a posterior is computed
+DOUBTED = 0.5  # a value is doubted if its posterior probability is less than this share of its prior probability
 SET_UP = "set-up"
 KIND = "source.target.hole_kind"
 SPEAKS_OF = {"source.target.blind_depth_mm": "blind", "source.target.backing_distance_mm": "through"}

@@ -24,8 +24,7 @@ _F_AND_INVERSE: dict[str, tuple[Callable[[np.ndarray], np.ndarray], Callable[[np
     "loglog": (lambda t: np.exp(-np.exp(-t)), lambda p: -np.log(-np.log(p))),
 }
 LINKS = tuple(_F_AND_INVERSE)
-CELLS = 2**17
-"""Number of curves times targets, or of resampled boards times their targets, in one block: 1 MB per array."""
+CELLS = 2**17  # curves times targets, or resampled boards times their targets, in one block: 1 MB per array
 
 
 def link_cdf(link: str, t: np.ndarray) -> np.ndarray:

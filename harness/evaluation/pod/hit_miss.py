@@ -42,8 +42,7 @@ from harness.vocabulary.errors import UserError
 Beyond = Literal["floor", "ceiling", "both"]
 METHOD = "likelihood ratio"
 EXACT = 1e-9  # tolerance of the coefficients of a single study
-STEEPEST = 1e3
-"""Largest slope in standardised sizes: a curve that rises within a thousandth of the sizes' spread is a step."""
+STEEPEST = 1e3  # largest slope in standardised sizes: a curve that rises within a thousandth of their spread is a step
 NEAR_DEVIANCE = 2.0
 """Largest excess over the least deviance, with one inspection per target, of a model that is hardly worse than the
 best. With equally many parameters, it is a difference of 2 in AIC (Burnham and Anderson 2002, 2.6)."""

@@ -17,8 +17,7 @@ import numpy as np
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import TABLE_BYTES, bounded_bytes, limited_memory
 
-FEWEST_ROWS = 10
-"""Fewest rows for two parameters and a bound; MIL-HDBK-1823A asks for 60 targets (hit/miss) or 40 (signal)."""
+FEWEST_ROWS = 10  # rows for two parameters and a bound; MIL-HDBK-1823A asks for 60 targets (hit/miss) or 40 (signal)
 SEPARATORS = (",", ";", "\t")
 HITS = dict.fromkeys(("1", "yes", "y", "true", "t", "hit", "h", "found", "detected"), 1.0)
 HITS |= dict.fromkeys(("0", "no", "n", "false", "f", "miss", "m", "missed", "not found", "not detected"), 0.0)

@@ -35,8 +35,7 @@ PRIOR_SIZE, PRIOR_WIDTH = 1.5, 2.0
 """Scales of the prior: factors by which a simulation may well be wrong in size and in the width of the rise."""
 REACH, NODES = 8.0, (241, 61)  # half the grid's side in scales, and its nodes along ln k and ln w
 DRAWS = 999  # simulated campaigns for the p-values of the tests of agreement: 5 % is then known to 0.7 %
-ENOUGH = 1.2
-"""Stop rule: the ratio of a90/95 to a90 at which no further board can lower a90/95 by more than this factor."""
+ENOUGH = 1.2  # stop rule: ratio of a90/95 to a90 at which no further board can lower a90/95 by more than this factor
 LIMIT_AT = float(stats.norm.cdf(np.sqrt(criterion(CONFIDENCE))))
 """0.975: the quantile at which the handbook's likelihood ratio, which gives all other a90/95, has its bound."""
 

@@ -18,13 +18,10 @@ from harness.evaluation.study.limit import DRAWS, SetUpLimit, Targets, crossings
 from harness.vocabulary.errors import UserError
 
 LINK = "probit"
-LEAST_INDEX = 0.05
-"""Least value of d': smaller ones are raised to it: such damage is never found and must not decide the curve."""
+LEAST_INDEX = 0.05  # least d'; smaller ones are raised to it: such damage is never found and must not decide the curve
 HARDLY = 0.5  # fewest expected hits, and misses, for a curve
-HEAVY = 1.0
-"""Excess kurtosis from which the noise no longer counts as Gaussian."""
-MOST_LOST = 0.01
-"""Largest share of a board's pixels within damage that may return nothing without a warning."""
+HEAVY = 1.0  # excess kurtosis from which the noise no longer counts as Gaussian
+MOST_LOST = 0.01  # largest share of a board's pixels within damage that may return nothing without a warning
 
 
 @dataclass(frozen=True)

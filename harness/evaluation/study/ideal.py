@@ -28,8 +28,7 @@ from harness.vocabulary.seeds import random_stream
 LONGEST_LAG_PX = 72
 """Lag at which the autocovariance is 0: ten times the length of known cameras' patterns. The window smooths the
 spectrum a little: d' of 50 frames is 1 to 2 % below that with 110 pixels."""
-LEAST_POWER = 1e-3
-"""Least power of the noise at any frequency, as a share of the mean; smaller estimates are only error."""
+LEAST_POWER = 1e-3  # least power of the noise at any frequency, as a share of the mean; smaller estimates are error
 CONVERGED, MOST_ITERATIONS = 1e-4, 200
 """Relative residual of C^-1 s, which is the relative error of d'^2, and the most steps to reach it."""
 NORMALS = 4096  # draws of a neighbourhood of the statistic: rates of maxima are then known to 3 %, thresholds to 0.01

@@ -139,8 +139,7 @@ def design_effect(targets: Targets, curve: PodCurve, pod: float) -> float:
 
 
 LINKS = ("logit", "probit")
-LEAST_RATIO = 1.2
-"""Least ratio of the deepest to the shallowest damage for which a coefficient of depth can be estimated."""
+LEAST_RATIO = 1.2  # ratio of the deepest to the shallowest damage from which a coefficient of depth is estimated
 STEPS = 25  # number of diameters at which the depth found is drawn, in equal ratios over those inspected
 
 

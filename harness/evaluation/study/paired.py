@@ -80,8 +80,7 @@ class LimitChange:
     paired: bool
 
 
-KNOWN = 0.9
-"""Least share of draws with an a90 whose deviation counts as that of the change."""
+KNOWN = 0.9  # least share of draws with an a90 whose deviation counts as that of the change
 
 
 def limit_change(first: SetUpLimit, second: SetUpLimit, same_boards: bool) -> LimitChange:
@@ -104,8 +103,7 @@ def limit_change(first: SetUpLimit, second: SetUpLimit, same_boards: bool) -> Li
     return LimitChange(now / before, now - before, percentiles(differences), grown, shrunk, paired)
 
 
-SAME = 1e-6
-"""Relative difference of equal thresholds between machines."""
+SAME = 1e-6  # relative difference of equal thresholds between machines
 
 
 @dataclass(frozen=True)

@@ -29,10 +29,8 @@ from harness.vocabulary.files import RECORD_BYTES, bounded_bytes, strict_json
 from harness.vocabulary.path_names import in_words
 from harness.vocabulary.provenance import check_version
 
-RECORD_VERSION = 2
-"""1: hits by depth alone. Increased when the meaning of a field, or of a hit, changes."""
-OLDEST_VERSION = 1
-"""Still read: if no damage is found only by missing returns, its hits are those of today."""
+RECORD_VERSION = 2  # 1: hits by depth alone. Increased when the meaning of a field, or of a hit, changes
+OLDEST_VERSION = 1  # still read: if no damage is found only by missing returns, its hits are those of today
 LEGAL = "a study.json, or a baseline that python -m harness.check --update wrote"
 AGAIN = "run the study again, which rewrites the file; do not edit it by hand"
 

@@ -21,8 +21,7 @@ from harness.tables.trials import ResultTables
 from harness.vocabulary.path_names import camera_title, in_words
 from harness.vocabulary.seeds import canonical_json
 
-FRAMES = "capture.frames"
-"""The dotted path of the axis that every experiment has."""
+FRAMES = "capture.frames"  # the dotted path of the axis that every experiment has
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,13 +17,11 @@ from harness.evaluation.study.paired import Tails
 from harness.evaluation.study.record import SetUpRecord, StudyRecord
 from harness.vocabulary.seeds import canonical_json
 
-MARGIN = 1.10
-"""Largest growth of a90, the rate of false calls, or threshold over signals that is neither worse nor better."""
+MARGIN = 1.10  # largest growth of a90, rate of false calls, or threshold over signals that is neither worse nor better
 ALPHA = 0.001
 """Level of a gate's tests, for a whole comparison. It is low because no test over boards includes the scatter of each
 set-up's calibration of the threshold; `harness.check` says how often the rule fails because of it."""
-QUESTIONS = 3
-"""The questions about a set-up: its limit, false calls and signals."""
+QUESTIONS = 3  # the questions about a set-up: its limit, false calls and signals
 
 Mark = Literal[
     "worse", "better", "as good", "not significant", "newly failing", "newly working", "no limit",
