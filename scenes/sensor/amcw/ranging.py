@@ -215,9 +215,10 @@ def _range_and_gates(  # type: ignore[no-untyped-def]
         half_path(turn, length, lattice, block[HALF_PATH, :length], block[RESIDUAL, :length])
         block[ERROR, :length] = errors_m[these]
         block[ALONG : ALONG + 3, :length] = geometry[:, these]
-        block[LIMIT] = gates.residual
-        if gates.residual_slope != f4(0):
-            for i in range(length):
+        block[LIMIT] = least = min(gates.residual, gates.residual_most)
+        for i in range(length if gates.residual_slope != f4(0) else 0):
+            # no limit is lower than the least
+            if block[RESIDUAL, i] > least * least:
                 block[LIMIT, i] = residual_limit(gates, block[GREATEST, i])
         _judge(block.reshape(block.size), gates, f4(n_frequencies))
         total[these], z_m[these] = block[TOTAL, :length], block[RANGE, :length]
