@@ -143,8 +143,8 @@ def _shares_of(window: FilterSettings) -> tuple[np.ndarray, np.ndarray]:
     # windows with one noise each, below one another
     side, k, count = window.space.shape[0], window.space.size, len(NOISES)
     weights = window.space.ravel() / window.space.sum()
-    each, bright = np.repeat(NOISES, k)[None], np.full((1, count * k), 1e3 * max(window.dim, 1.0))
-    light = Light(np.ones_like(each, complex), bright, bright, each, each / 1e3)
+    each, bright = np.repeat(NOISES, k)[None].astype(f4), np.full((1, count * k), 1e3 * max(window.dim, 1.0), f4)
+    light = Light(np.ones_like(each, np.complex64), bright, bright, each, each / f4(1e3))
     middles, out = np.arange(count) * k + k // 2, unknown_filtered(1, count * k)
     lost = np.zeros(count * k, bool)
     moved = linearised(middles[1:], light, window, (count * side, side), lost, out)[0]
