@@ -6,6 +6,7 @@ import argparse
 import json
 import sys
 from collections import Counter
+from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -109,9 +110,10 @@ def _about(experiment: Experiment, licence: str, samples: list[Sample], command:
 
 def _written(out: Path, samples: list[Sample], engine: JobEngine) -> list[str]:
     """Render missing views and write missing boards; return why jobs failed. Progress is printed to stderr."""
-    from harness.engine.boards import TRUTH, joined, seen_region, write_board
+    from harness.engine.boards import TRUTH, seen_region, write_board
     from harness.engine.estimate import progress_display
     from harness.engine.run import carried_out
+    from harness.vocabulary.geometry import Region
 
     outcome, failures = Outcome(), list[str]()
     renders = {sample.render.path: sample.render for sample in samples}
@@ -136,7 +138,7 @@ def _written(out: Path, samples: list[Sample], engine: JobEngine) -> list[str]:
         by_category: dict[str, list[Any]] = {}
         for sample in samples:
             by_category.setdefault(sample.category, []).append(regions[sample.render.path.stem])
-        windows = {category: joined(seen) for category, seen in by_category.items()}
+        windows = {category: reduce(Region.joined, seen) for category, seen in by_category.items()}
         boards = [Job(board.name, "trials", write_board, (out, board, windows[board.category])) for board in missing]
         carry_out(boards, outcome.trials)
     return failures

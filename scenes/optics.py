@@ -81,8 +81,7 @@ class Quadrilaterals:
 
     def __init__(self, lens: Lens, region: Region) -> None:
         # slopes (h + 1, w + 1, 2) of the corners of the region's pixels
-        v, u = np.mgrid[region.row0 : region.row1 + 1, region.col0 : region.col1 + 1] - 0.5
-        self.corner = lens.slopes(u, v)
+        self.corner = lens.region_slopes(Region(region.row0, region.row1 + 1, region.col0, region.col1 + 1), -0.5)
 
     def axes(self, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
         """Return (n, 3, k): a pixel's sub-rays are these vectors, weighted by `grid` or `lattice`; z is 1."""

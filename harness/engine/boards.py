@@ -113,13 +113,6 @@ def seen_region(render: RenderJob) -> Region:
     return SimulatedUnit(camera, render.camera, view).region
 
 
-def joined(regions: list[Region]) -> Region:
-    """Return the smallest region that contains all regions."""
-    sides = np.array([(each.row0, each.row1, each.col0, each.col1) for each in regions])
-    (row0, _, col0, _), (_, row1, _, col1) = sides.min(axis=0).tolist(), sides.max(axis=0).tolist()
-    return Region(row0, row1, col0, col1)
-
-
 def write_board(out: Path, sample: Sample, window: Region) -> None:
     """Write all files of a board on the ``window`` that its category shares; the truth last, to allow resuming."""
     set_up, (point,) = load_set_up(sample.task.set_ups[0]), sample.task.points

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -69,6 +69,16 @@ class Region:
         rows = max(self.row0 - margin, 0), min(self.row1 + margin, height)
         return Region(*rows, max(self.col0 - margin, 0), min(self.col1 + margin, width))
 
+    @property
+    def area(self) -> int:
+        """Number of pixels."""
+        return (self.row1 - self.row0) * (self.col1 - self.col0)
+
+    def joined(self, other: Region) -> Region:
+        """Return the smallest region that holds both."""
+        rows = min(self.row0, other.row0), max(self.row1, other.row1)
+        return Region(*rows, min(self.col0, other.col0), max(self.col1, other.col1))
+
     def within(self, outer: Region) -> tuple[slice, slice]:
         """Return the slices that cut this region out of an array that covers ``outer``."""
         rows = slice(self.row0 - outer.row0, self.row1 - outer.row0)
@@ -113,9 +123,20 @@ class Lens:
         stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, UNDISTORT_STEPS, 1e-10)
         return cv2.undistortPoints(pixels, self.matrix, np.array(self.distortion), criteria=stop).reshape(*u.shape, 2)
 
-    def region_slopes(self, region: Region) -> np.ndarray:
-        """Return (x/z, y/z) through the pixel centres of a region, shape (h, w, 2); cached, so do not write to it."""
-        return _region_slopes(self, region)
+    def region_slopes(self, region: Region, shift_px: float = 0.0) -> np.ndarray:
+        """Return (x/z, y/z) through the pixel centres of a region, shape (h, w, 2), or ``shift_px`` beside and below
+        them; do not write to it. Slopes are kept, as the boards of a study lie in nearly one place."""
+        known, slopes = _slopes.pop((self, shift_px), (region, None))
+        joint = known.joined(region)
+        if slopes is None or joint != known:
+            joint = joint.grown(SPARE_PX, self.height + 1, self.width + 1)
+            known = joint if slopes is not None and joint.area <= 2 * (known.area + region.area) else region
+            v, u = np.mgrid[known.row0 : known.row1, known.col0 : known.col1] + shift_px
+            slopes = self.slopes(u, v)
+        _slopes[self, shift_px] = known, slopes
+        if len(_slopes) > MOST_LENSES:
+            _slopes.pop(next(iter(_slopes)))
+        return np.ascontiguousarray(slopes[region.within(known)])
 
     def project(self, points_camera_m: np.ndarray) -> np.ndarray:
         """Return the pixel positions (u, v), shape (..., 2), of points (..., 3) in front of the camera (z > 0)."""
@@ -153,10 +174,8 @@ class OtherLens(Lens):
         return Lens(self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.distortion)
 
 
-@lru_cache(maxsize=6)  # a region of 640 x 576 pixels takes 6 MB and 0.3 s
-def _region_slopes(lens: Lens, region: Region) -> np.ndarray:
-    v, u = np.mgrid[region.row0 : region.row1, region.col0 : region.col1]
-    return lens.slopes(u, v)
+_slopes: dict[tuple[Lens, float], tuple[Region, np.ndarray]] = {}  # of regions, the last used at the end
+MOST_LENSES, SPARE_PX = 6, 16  # a region of 640 x 576 pixels takes 6 MB and 0.3 s; margin of a region for several views
 
 
 class Reason(IntEnum):
