@@ -137,8 +137,7 @@ class JointState:
 
     def split(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return the parts (v - 1, 6), (10,), (m, 2) and (v, 10) of a vector of all unknowns, or of their indices."""
-        sizes = np.cumsum([6 * (len(self.T) - 1), len(TERMS), self.marks_m.size])
-        poses, surface, marks, own = np.split(values, sizes)
+        poses, surface, marks, own = np.split(values, np.cumsum([6 * (len(self.T) - 1), len(TERMS), self.marks_m.size]))
         return poses.reshape(-1, 6), surface, marks.reshape(-1, 2), own.reshape(-1, len(TERMS))
 
     def moved(self, motion: np.ndarray, shared_m: float) -> JointState:
