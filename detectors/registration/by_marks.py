@@ -143,9 +143,8 @@ class JointState:
     def moved(self, motion: np.ndarray, shared_m: float) -> JointState:
         """Return the state after a motion of all unknowns; poses move about the frame's origin."""
         poses, surface, marks, own = self.split(motion)
-        T = np.stack(
-            [self.T[0], *(registered.moved_by(w, np.zeros(3)) @ T for w, T in zip(poses, self.T[1:], strict=True))]
-        )
+        turned = (registered.moved_by(w, np.zeros(3)) @ T for w, T in zip(poses, self.T[1:], strict=True))
+        T = np.stack([self.T[0], *turned])
         return JointState(T, self.surface + surface, self.own + own, self.marks_m + marks, shared_m, self.half_m)
 
     def basis(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:

@@ -120,11 +120,10 @@ def closing(provenance: Mapping[str, Any], experiment_yaml_text: str, left_out: 
     rows = [(stage, f"{float(value):.1f}") for stage, value in provenance.get("seconds", {}).items()]
     cost = Grid.of(("stage", "seconds"), rows).html() if rows else paragraph("Not recorded.")
     keys = [key for key in provenance if key not in (*SHOWN_FIRST, *SHOWN_APART)]
-    recorded = [
-        (key.replace("_mm", " (mm)").replace("_", " "), plain(provenance.get(key, "not recorded")))
-        for key in (*SHOWN_FIRST, *keys)
-    ]
-    lines = (tag("tr", tag("th", name, scope="row"), tag("td", value)) for name, value in recorded)
+    lines = []
+    for key in (*SHOWN_FIRST, *keys):
+        name, value = key.replace("_mm", " (mm)").replace("_", " "), plain(provenance.get(key, "not recorded"))
+        lines.append(tag("tr", tag("th", name, scope="row"), tag("td", value)))
     parts += [heading("Provenance")]
     table = tag("table", tag("tbody", joined(lines)), kind="prov")
     folds = fold("Cost, versions and command", cost, table, *command_of(provenance.get("command", "not recorded")))
