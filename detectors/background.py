@@ -110,8 +110,7 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
     points, central = np.ascontiguousarray(cloud.points_m[mask]), cloud.projection == "central"
     cells = _cells(points, cloud)
     if cells is None:
-        stated = config.shape in STATED
-        name, fit = _stated(points, config if stated else SurfaceConfig(degree=1), central)
+        name, fit = _stated(points, config if config.shape in STATED else SurfaceConfig(degree=1), central)
         fitted = fit(points)
         noise_m = sigma_of(points[:, 2] - fitted)
         warning = f"{len(points)} points are too few to tell whether the surface ({name}) fits"

@@ -102,8 +102,7 @@ class Separated:
 def flattened(cloud: Cloud, mask: np.ndarray, name: str, T_first_camera: np.ndarray | None = None) -> FlatCapture:
     """Return an averaged cloud of a flat surface, of the pixels in ``mask`` (h, w), minus its smooth fit. With a pose,
     the places are x and y in the first capture's camera frame, until `_on_one_plane` rotates them. Raises UserError
-    without a pixel grid, if the frames are too few to estimate their noise, or if the pixels are too few to fit a
-    surface."""
+    without a pixel grid, or if frames or pixels are too few for noise or surface."""
     noise_m2 = average_variance_m2(cloud, mask)
     if not cloud.organised or noise_m2 is None:
         what = f"{name}: {cloud.n_frames} frame{'s' * (cloud.n_frames != 1)}: too few to estimate the noise"

@@ -34,8 +34,7 @@ def free_form(points: np.ndarray, weights: np.ndarray, base: Fit, wavelength: fl
     penalty = _penalty(int(counts[0]), int(counts[1]))
     banded[width + penalty.row - penalty.col, penalty.col] += stiffness * penalty.data
     banded[-1] += RIDGE * float(banded[-1].max())
-    coefficients = solveh_banded(banded, right, check_finite=False)
-    table = coefficients.reshape(counts)
+    table = solveh_banded(banded, right, check_finite=False).reshape(counts)
 
     def z_at(q: np.ndarray) -> np.ndarray:
         return base(q) + _spline_sums(q, central, low, spacing, table)

@@ -26,8 +26,7 @@ SELDOM = 0.2
 """A pixel that returned in at most this share of the frames counts as missing: its depth comes from stray light."""
 SQUARES = (1, 2, 3, 4, 5)  # sides in pixels of the square that correlates dropouts
 RATE_WINDOW_PX, RATE_PRIOR_PX = 65, 200.0
-"""The local rate of dropouts is that in a window of this side, with the target's own rate weighted like this many
-pixels."""
+"""Side of the window for the local rate of dropouts; the target's own rate counts like this many pixels in it."""
 SIMULATED_PX, FEWEST_FIELDS, MOST_FIELDS = 1e6, 10, 100
 """Simulation continues until its fields hold this many pixels: enough to reach well under one cluster per target."""
 TAIL_CLUSTERS = 60  # largest simulated clusters, from which the fall of their number with size is estimated
@@ -123,8 +122,7 @@ def missing_returns(cloud: Cloud, evidence: Evidence) -> MissingReturns | None:
     outline, unseen, missing, labels, sizes, free = gaps
     blind = float((~cloud.valid)[outline].mean())
     if sizes[free].max(initial=0) < LEAST_POINTS:
-        small = float(missing.sum() / outline.sum())
-        return MissingReturns(outline, unseen, blind, small, LEAST_POINTS, 0.0, ())
+        return MissingReturns(outline, unseen, blind, float(missing.sum() / outline.sum()), LEAST_POINTS, 0.0, ())
     chance = _settled(labels, sizes, outline)
     found = []
     for number in np.flatnonzero(free & (sizes >= chance.least_points)):

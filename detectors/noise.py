@@ -81,8 +81,7 @@ def average_variance_m2(cloud: Cloud, where: np.ndarray) -> np.ndarray | None:
     known = cv2.blur(seen.astype(np.float64), side, borderType=cv2.BORDER_CONSTANT)
     scatter = cv2.blur(np.where(seen, cloud.variance_m2, 0.0), side, borderType=cv2.BORDER_CONSTANT)
     variance = np.where(where & (known > 0), scatter / np.maximum(known, 1e-9), np.nan) / cloud.n_frames
-    typical = median_of(variance[np.isfinite(variance)])
-    return np.where(where & np.isnan(variance), typical, variance)
+    return np.where(where & np.isnan(variance), median_of(variance[np.isfinite(variance)]), variance)
 
 
 def rounding_floor(cloud: Cloud, mask: np.ndarray) -> float:
@@ -128,8 +127,7 @@ def _levelled(values: np.ndarray, known: np.ndarray, side: int) -> np.ndarray:
         cv2.boxFilter(each, -1, (side, side), borderType=cv2.BORDER_CONSTANT)
         for each in (known.astype(np.float64), np.where(known, values, 0.0))
     )
-    level = total / np.maximum(weight, 1e-9)
-    return np.where(known, values - level, 0.0)
+    return np.where(known, values - total / np.maximum(weight, 1e-9), 0.0)
 
 
 def _first_unlike_lag(noise: np.ndarray, known: np.ndarray) -> int:

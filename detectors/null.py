@@ -147,8 +147,7 @@ def behind(evidence: Evidence) -> np.ndarray:
 
 def skew_of(evidence: Evidence) -> float:
     """Return Bowley's skewness of the residual, -1 to 1; damage on less than a quarter hardly changes it."""
-    known = evidence.residual_m[np.isfinite(evidence.residual_m)]
-    low, middle, high = np.quantile(known, (0.25, 0.5, 0.75))
+    low, middle, high = np.quantile(evidence.residual_m[np.isfinite(evidence.residual_m)], (0.25, 0.5, 0.75))
     return float((high + low - 2 * middle) / max(high - low, 1e-12))
 
 

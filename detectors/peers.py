@@ -177,8 +177,7 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
             normal_m, radius_m = self.settings.normal_radius_mm * MM, self.settings.cylinder_radius_mm * MM
             sizes = {"normal_radii": (normal_m,), "cyl_radius": radius_m, "max_distance": self.settings.reach_mm * MM}
             core = np.ascontiguousarray(feet)
-            measured = py4dgeo.M3C2(epochs=epochs, corepoints=core, registration_error=0.0, **sizes)
-            distance, uncertainty = measured.run()
+            distance, uncertainty = py4dgeo.M3C2(epochs=epochs, corepoints=core, registration_error=0.0, **sizes).run()
         few = np.minimum(uncertainty["num_samples1"], uncertainty["num_samples2"]) < LEAST_SAMPLES
         return np.where(few, np.nan, distance), uncertainty["lodetection"] / LOD_SIGMAS
 
@@ -233,8 +232,7 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
             raise UserError(f"the detector {self.name!r} learns from at least two hole-free clouds")
         of_clouds = []
         for cloud in hole_free:
-            mask = crop(cloud, self.settings.crop)
-            features, rows, columns = self._features(cloud, mask)
+            features, rows, columns = self._features(cloud, crop(cloud, self.settings.crop))
             # only windows that hardly overlap
             of_clouds.append(features[(rows % self.settings.pool_px == 0) & (columns % self.settings.pool_px == 0)])
         memory = coreset(np.concatenate(of_clouds[:-1]), self.settings.memory)
@@ -279,8 +277,7 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
         # the last channel counts points
         image = np.zeros((int(rows.max()) + 1, int(columns.max()) + 1, features.shape[1] + 1))
         np.add.at(image, (rows, columns), np.column_stack([features, np.ones(len(features))]))
-        side = (settings.pool_px, settings.pool_px)
-        pooled = cv2.blur(image, side, borderType=cv2.BORDER_CONSTANT)[rows, columns]
+        pooled = cv2.blur(image, (settings.pool_px, settings.pool_px), borderType=cv2.BORDER_CONSTANT)[rows, columns]
         return pooled[:, :-1] / pooled[:, -1:], rows, columns
 
 

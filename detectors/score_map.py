@@ -114,9 +114,8 @@ class Findings:
     def detections(self) -> tuple[Detection, ...]:
         """The arrays as single detections, strongest first."""
         by_label = np.argsort(self.labels, kind="stable")
-        _, *groups = np.split(
-            self.pixels[by_label], np.cumsum(np.bincount(self.labels + 1, minlength=len(self.scores) + 1))[:-1]
-        )
+        counts = np.bincount(self.labels + 1, minlength=len(self.scores) + 1)
+        _, *groups = np.split(self.pixels[by_label], np.cumsum(counts)[:-1])
         of_each = zip(self.scores.tolist(), groups, self.centres_m, strict=True)
         found = (Detection(score, pixels, centre) for score, pixels, centre in of_each)
         return tuple(sorted(found, key=lambda detection: (-detection.score, int(detection.pixels[0]))))

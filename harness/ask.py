@@ -161,8 +161,7 @@ def _chosen(options: argparse.Namespace, surfaces: Sequence[LimitSurface], kind:
 
     detectors = list(dict.fromkeys(surface.detector for surface in surfaces))
     detector = options.detector or (BEST if BEST in detectors else detectors[0])
-    given = (("camera", options.camera or ()), ("kind", [kind]), ("detector", [detector]))
-    for name, wanted in given:
+    for name, wanted in (("camera", options.camera or ()), ("kind", [kind]), ("detector", [detector])):
         in_atlas = dict.fromkeys(getattr(surface, name) for surface in surfaces)
         if unknown := [value for value in wanted if value not in in_atlas]:
             option = "--damage" if name == "kind" else f"--{name}"

@@ -63,8 +63,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     study = read_record(options.study) if options.study else None
     poses = read_poses(options.poses, len(options.paths)) if options.poses else None
     refuse_repeats(options.paths)
-    reading = reading_of(options)
-    recordings = [opened_as(options.like, [path], options.intrinsics, **reading) for path in options.paths]
+    recordings = [opened_as(options.like, [path], options.intrinsics, **reading_of(options)) for path in options.paths]
     captures = list(map(read_still, recordings))
     if options.like:
         with_lens(options.like, captures[0].lens)  # a camera with another image size cannot be refitted

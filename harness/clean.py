@@ -57,9 +57,8 @@ def main(options: argparse.Namespace, command: str) -> int:
         with _held(folders, of_results):  # report a running sweep before asking
             pass
     wanted = [file for path in folders for file in (removable(path) if of_results else cache_removal(path, limit))]
-    what = (
-        f"{len(wanted)} files in {many(len(folders), 'folder')}" if of_results else many(len(wanted), "stored render")
-    )
+    in_folders = f"{len(wanted)} files in {many(len(folders), 'folder')}"
+    what = in_folders if of_results else many(len(wanted), "stored render")
     if not _agreed(options, f"{what}, {size_text(sum(file.size_bytes for file in wanted))}", len(wanted)):
         return 0 if options.dry_run or not wanted else 1
     with _held(folders, of_results):  # not held during the question, which would block every sweep

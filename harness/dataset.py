@@ -159,8 +159,7 @@ def _finish(out: Path, samples: list[Sample], about: dict[str, Any]) -> None:
             pictures = [truths[each.name] for each in samples if (each.category, each.split) == (category, split)]
             text = json.dumps(coco_data(pictures, kinds, info), separators=(",", ":"))
             write_text(out / "coco" / f"{category}_{split}.json", text + "\n")
-    card = template("dataset_card.md").render(about=about, inset=INSET_PX, title=camera_title)
-    write_text(out / "README.md", card)
+    write_text(out / "README.md", template("dataset_card.md").render(about=about, inset=INSET_PX, title=camera_title))
     write_text(out / INDEX, json.dumps({**about, "samples": [*truths]}, indent=1) + "\n")
 
 

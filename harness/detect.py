@@ -45,12 +45,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         " instead of the points of the marks).",
     ).add_argument
     add("--register", choices=cli.METHODS, metavar="METHOD", help=f"register the views by {', '.join(cli.METHODS)}")
-    add(
-        "--merge",
-        choices=cli.MERGES,
-        metavar="KIND",
-        help=f"merge them by {', '.join(cli.MERGES)} (default: fusion)",
-    )
+    add("--merge", choices=cli.MERGES, metavar="KIND", help=f"merge them by {', '.join(cli.MERGES)} (default: fusion)")
     marks = "marks: colour (separate coloured strips; default), red (the thesis' rule), coded (ArUco, AprilTag)"
     add("--marks", choices=cli.MARKS, metavar="KIND", help=marks)
     poses = "poses from which registration starts: JSON with 4x4 matrices in metres, or TUM's groundtruth.txt"

@@ -57,8 +57,7 @@ def main(arguments: argparse.Namespace, command: str) -> int:
     batch = batch_of(source.target.declare(), role, source, cache)
     count = len(batch.renders) if arguments.views is None else arguments.views
     if count > len(batch.renders):
-        legal = f"1 to {len(batch.renders)}"
-        raise UserError(f"--views {count}: the experiment has {len(batch.renders)}", legal=legal)
+        raise UserError(f"--views {count}: the experiment has {len(batch.renders)}", legal=f"1 to {len(batch.renders)}")
     frames, captures = arguments.frames or experiment.config.capture.frames, []
     with atomic_folder(arguments.out) as folder:
         for number, job in enumerate(batch.renders[:count]):
@@ -83,13 +82,9 @@ def main(arguments: argparse.Namespace, command: str) -> int:
 
 
 def _write_beside(
-    folder: Path,
-    arguments: argparse.Namespace,
-    experiment: Experiment,
-    targets: list[TargetConfig],
-    views: tuple[ExportedView, ...],
-    command: str,
-) -> None:
+    folder: Path, arguments: argparse.Namespace, experiment: Experiment, targets: list[TargetConfig],
+    views: tuple[ExportedView, ...], command: str,
+) -> None:  # fmt: skip
     """Write the truth, the nominal poses for a registration, the declaration, and the provenance."""
     import numpy as np
 

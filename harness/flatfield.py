@@ -104,8 +104,7 @@ def _captures(options: argparse.Namespace) -> tuple[Lens, list[FlatCapture], lis
         if recording.lens is None:
             raise UserError(f"{path}: its lens is unknown", fix="name a file or a camera with --intrinsics")
         if recording.lens != first.lens:
-            what = f"{path}: has another lens than {options.paths[0]}"
-            raise UserError(what, legal="captures of one unit and mode")
+            raise UserError(f"{path}: has another lens than {options.paths[0]}", legal="captures of one unit and mode")
     found = []
     for recording, pose in zip(recordings, poses, strict=True):
         for part in _halves(recording) if len(recordings) == 1 else (recording,):

@@ -122,9 +122,7 @@ def _laid_out(options: argparse.Namespace, sizes: np.ndarray) -> Gauge:
     room = [size - 2 * rim for size in (width, height)]
     xs, ys = (np.linspace(-size / 2, size / 2, max(int(size // apart) + 1, 2)).round(2).tolist() for size in room)
     clear = side / 2 + options.diameters[1] / 2 + CLEAR_MM
-    places = [
-        (x, y) for y in ys for x in xs if all(max(abs(x - cx), abs(y - cy)) >= clear for cx, cy in corners.tolist())
-    ]
+    places = [(x, y) for y in ys for x in xs if (np.abs(corners - (x, y)).max(axis=1) >= clear).all()]
     count = -(-len(sizes) // max(len(places), 1))
     if not places or min(*inset, *room) <= side or 4 * count > CODES:
         fix = "a larger --board, a smaller --apart, or fewer --targets"

@@ -84,20 +84,14 @@ def _list_results(options: argparse.Namespace) -> int:
         raise UserError(f"{options.out}: has no results of {options.name!r}", fix=fix)
     if options.json:
         return _print_json(folders)
-    latest = ", latest"
     print(f"results in {options.out}" + ("" if folders else ": none"))
     for name in sorted({run["experiment"] for run in folders}):
         print(f"  {name}")
         shown = [run for run in folders if run["experiment"] == name]
-        rows = [
-            (
-                run["digest"],
-                (run["date"] or "")[:10],
-                size_text(run["size_bytes"]),
-                run["note"] + latest * run["is_latest"],
-            )
-            for run in shown
-        ]
+        rows = []
+        for run in shown:
+            note = run["note"] + (", latest" if run["is_latest"] else "")
+            rows.append((run["digest"], (run["date"] or "")[:10], size_text(run["size_bytes"]), note))
         for run, line in zip(shown, Grid.of(("run", "date", "size", "state"), rows, left=4).lines()[1:], strict=True):
             cells = (limit_text(run["limits"]), differs_text(run["differs"]))
             print("\n".join([f"    {line}", *(f"      {text}" for text in cells if text)]))

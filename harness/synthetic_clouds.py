@@ -29,9 +29,9 @@ def cylinder(seed: int, radius_m: float = 0.5) -> Cloud:
     return _seen(seed, lambda x, y: DISTANCE_M + radius_m - np.sqrt(radius_m**2 - x**2))
 
 
-def with_gaps(cloud: Cloud, seed: int, share: float = 0.05) -> Cloud:
-    """Return the cloud without a share of its pixels, a block of them, and its last column."""
-    gone = np.random.default_rng(seed).random(cloud.valid.shape) < share
+def with_gaps(cloud: Cloud, seed: int) -> Cloud:
+    """Return the cloud without 5 % of its pixels, a block of them, and its last column."""
+    gone = np.random.default_rng(seed).random(cloud.valid.shape) < 0.05
     gone[10:14, 20:26] = True
     gone[:, -1] = True
     return without(cloud, gone)

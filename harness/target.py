@@ -65,8 +65,7 @@ def declared(what: str | Path | Mapping[str, Any], board: int) -> TargetConfig:
             raise UserError(f"there is no target {what.get('name')!r}", legal=f"name: {', '.join(TARGETS)}")
         config = settings_of(TARGETS[what["name"]], what, "target")
     elif not Path(what).exists():
-        legal = f"{', '.join(NAMED_TARGETS)} or a file"
-        raise UserError(f"{what}: there is no such file or named target", legal=legal)
+        raise UserError(f"{what}: there is no such file or named target", legal=f"{', '.join(NAMED_TARGETS)} or a file")
     else:
         config = read_as(TARGETS, "name", read_yaml(Path(what)))
     if isinstance(config, DrawnTargetConfig):

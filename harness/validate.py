@@ -14,8 +14,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, default=Path("results/validate"), metavar="DIR", help="default: results/validate")
     add("--jobs", type=whole_number(4096), default=2, metavar="N", help="worker processes (default: 2)")
     add("--figures", type=Path, metavar="FILE", help="a file with other published figures")
-    capture = parser.add_argument_group("a real capture")
-    put = capture.add_argument
+    put = parser.add_argument_group("a real capture").add_argument
     put("--capture", type=Path, nargs="+", metavar="PATH", help="frames of a static scene, as read by harness.detect")
     add_reading(put)
     put("--frames", type=whole_number(4096), metavar="N", help="use only the first N frames")

@@ -118,8 +118,7 @@ def implant_of(
     ends = lens.project(transform_points(board.pose.T_camera_board, corners))
     (left, top), (right, bottom) = np.floor(ends.min(axis=0)).astype(int), np.ceil(ends.max(axis=0)).astype(int)
     onto = Region(top, bottom + 1, left, right + 1).grown(0, lens.height, lens.width)
-    slopes = lens.region_slopes(onto)
-    at = camera.nominal_lens.project(np.concatenate([slopes, np.ones((*onto.shape, 1))], axis=-1))
+    at = camera.nominal_lens.project(np.concatenate([lens.region_slopes(onto), np.ones((*onto.shape, 1))], axis=-1))
     rows_columns = [at[..., 1] - region.row0, at[..., 0] - region.col0]
 
     def moved(image: np.ndarray) -> np.ndarray:

@@ -146,8 +146,7 @@ def _outliers(heights: np.ndarray, variances: np.ndarray) -> np.ndarray:
     """Return (k, h, w) bool: observations more than `GATE_SIGMAS` deviations (their own, or the robust spread of the
     views if larger) from the median of at least three views that cannot be damage: in front of the fitted surface,
     where damage would have hidden it from the others; or behind it, but alone among their neighbours."""
-    middle = pixel_medians(heights)
-    deviation = heights - middle
+    deviation = heights - pixel_medians(heights)
     limit = GATE_SIGMAS * np.maximum(1.4826 * pixel_medians(np.abs(deviation)), np.sqrt(variances))
     several = np.isfinite(heights).sum(axis=0) >= 3
     rejected: np.ndarray = several & (deviation < -limit) & (heights < -limit)

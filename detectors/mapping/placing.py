@@ -54,8 +54,7 @@ class Raster:
 
     @property
     def concentration(self) -> np.ndarray:
-        """Return the sum of squares (h, w) of the samples' weights: the factor of the variance of independent
-        errors."""
+        """Return the sum of squares (h, w) of the samples' weights: the factor of independent errors' variance."""
         return np.asarray(self.weights.multiply(self.weights).sum(axis=1), np.float64).reshape(self.shape)
 
 

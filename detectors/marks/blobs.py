@@ -254,8 +254,7 @@ def region_covariance_px2(pixels: np.ndarray) -> np.ndarray:
     sizes = 1.0 + np.stack([steps, 2 * steps % SIZES], axis=1) / SIZES / extent
     cosine, sine = np.cos(TURNS / extent.max()), np.sin(TURNS / extent.max())
     axes = np.moveaxis(np.array([[cosine, -sine], [sine, cosine]]), -1, 0)
-    outlines = ((outline - middle) * sizes[:, None, None, :]) @ axes
-    return centroid_covariance_px2(outlines)
+    return centroid_covariance_px2(((outline - middle) * sizes[:, None, None, :]) @ axes)
 
 
 def _area_and_centre(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

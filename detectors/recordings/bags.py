@@ -238,8 +238,7 @@ def _chosen_topic(bag: Bag, given: Given) -> tuple[str, str]:
             raise UserError(f"{path}: {name} holds {topics[name]}", legal=kinds)
         return name, ""
     usual = [topic for topic in clouds if topic.removeprefix("/") == USUAL_TOPIC] or clouds
-    has_lens = bool(given.intrinsics or given.lens)
-    if len(images) == 1 and (not clouds or has_lens or _infos_of(bag, images[0])):
+    if len(images) == 1 and (not clouds or given.intrinsics or given.lens or _infos_of(bag, images[0])):
         also = f", with their lens, not the clouds on {', '.join(clouds)}; --topic chooses"
         return images[0], f"the depth images on {images[0]} are read{also}" if clouds else ""
     if len(usual) == 1:

@@ -59,8 +59,7 @@ def refuse_broken_png(name: str, content: bytes) -> None:
 def _header(name: str, content: bytes) -> ImageFile.ImageFile:
     """Read only the header of a picture, as the kind that its first bytes show."""
     kind = PngImagePlugin.PngImageFile if content.startswith(PNG_SIGNATURE) else JpegImagePlugin.JpegImageFile
-    what = f"{name}: cannot be decoded: it is neither PNG nor JPEG, or it is truncated"
-    with read_errors(what, LEGAL_PICTURE):
+    with read_errors(f"{name}: cannot be decoded: it is neither PNG nor JPEG, or it is truncated", LEGAL_PICTURE):
         return kind(io.BytesIO(content))
 
 
@@ -70,9 +69,7 @@ TUM_MATCH_S = 0.02
 """Largest difference of time stamps of depth and colour that belong together (the benchmark's own default)."""
 LEGAL_PNG = "16-bit single-channel PNG (uint16, 0 = no depth)"
 NUMBER = re.compile(r"\d+(?:\.\d+)?")
-NOT_DEPTH = re.compile(
-    r"(^|[/_.-])(ir|infra\w*|conf\w*|amplitude|intensity|reflectivity|mask)([/_.-]|\d|$)", re.IGNORECASE
-)
+NOT_DEPTH = re.compile(r"(?i)(^|[/_.-])(ir|infra\w*|conf\w*|amplitude|intensity|reflectivity|mask)([/_.-]|\d|$)")
 """Words in the names of files and topics of other pictures that a depth camera writes in 16 bits or floating point."""
 
 
@@ -102,14 +99,9 @@ def open_depth_folder(folder: Path, given: Given) -> Recording:
 
 
 def open_depth_list(
-    depths: Sequence[Path],
-    given: Given,
-    name: str,
-    root: Path | None = None,
-    colours: Sequence[Path | None] = (),
-    is_tum: bool = False,
-    note: str = "",
-) -> Recording:
+    depths: Sequence[Path], given: Given, name: str, root: Path | None = None, colours: Sequence[Path | None] = (),
+    is_tum: bool = False, note: str = "",
+) -> Recording:  # fmt: skip
     """Open depth PNGs in the order given. ``root``: folder of the capture, in or beside which their lens is sought.
     ``colours``: the colour picture of each, if any. Raises UserError if their lens is not known."""
     root = root or depths[0].parent

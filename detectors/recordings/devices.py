@@ -167,16 +167,10 @@ BLUR_PX = 0.5  # motion by this much of a pixel blurs an edge more than the sens
 
 
 def _recording(
-    path: Path,
-    given: Given,
-    read: Callable[[], Iterator[Frame]],
-    size: tuple[int, int],
-    scaled_lens: Callable[[], Lens],
-    files: tuple[Path, ...],
-    poses: tuple[np.ndarray, np.ndarray, str],
-    scale_m: float,
+    path: Path, given: Given, read: Callable[[], Iterator[Frame]], size: tuple[int, int],
+    scaled_lens: Callable[[], Lens], files: tuple[Path, ...], poses: tuple[np.ndarray, np.ndarray, str], scale_m: float,
     writer: str,
-) -> Recording:
+) -> Recording:  # fmt: skip
     """Return the recording of either program. ``size``: width, height. ``poses``: places, quaternions, their source."""
     lens, lens_files = lens_for(str(path), given, *size, scaled_lens)
     notes = () if lens_files or given.lens else (f"lens scaled from the colour pixels to {size[0]} x {size[1]}",)
@@ -297,8 +291,7 @@ def open_r3d(path: Path, given: Given) -> Recording:
             for name in _depth_names(archive):
                 beside = f"{name.removesuffix('.depth')}.conf"
                 sure = _plane(path, archive, beside, "u1", (width, height)) if beside in archive.namelist() else None
-                stored = _plane(path, archive, name, "<f4", (width, height))
-                yield _frame(f"{path.name} {name}", stored, sure, scale_m)
+                yield _frame(f"{path.name} {name}", _plane(path, archive, name, "<f4", (width, height)), sure, scale_m)
 
     motion, writer = (poses[:, 4:], poses[:, :4], "its metadata"), "Record3D, which writes metres"
     return _recording(path, given, read, (width, height), scaled_lens, (path,), motion, scale_m, writer)

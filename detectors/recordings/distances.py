@@ -222,8 +222,7 @@ def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int,
         usual = f"the data: with {usual}, {1e3 * usual_m:g} mm, the median distance would be {median * usual_m:.4g} m"
     also = f"; others are possible: {', '.join(shown[1:])}" if len(shown) > 1 else ""
     taken = f"{1e3 * scale_m:.4g} mm is taken, which puts the median at {median * scale_m:.3g} m{also}"
-    warning = f"nothing states the depth unit; {taken}; state it with --unit {best}"
-    return Unit(scale_m, usual, warning)
+    return Unit(scale_m, usual, f"nothing states the depth unit; {taken}; state it with --unit {best}")
 
 
 def rounding_step_m(z_m: np.ndarray) -> float:

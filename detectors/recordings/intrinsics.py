@@ -134,22 +134,16 @@ KNOWN_MODELS = ("", "none", "pinhole", "plumb_bob", "brown_conrady", "rational_p
 
 
 def lens_for(
-    name: str,
-    given: Given,
-    width: int,
-    height: int,
-    own: Callable[[], Lens | None] = lambda: None,
-    beside: Sequence[Path] = (),
-    hint: str = "",
-) -> tuple[Lens, tuple[Path, ...]]:
+    name: str, given: Given, width: int, height: int, own: Callable[[], Lens | None] = lambda: None,
+    beside: Sequence[Path] = (), hint: str = "",
+) -> tuple[Lens, tuple[Path, ...]]:  # fmt: skip
     """Return the lens of depth images and the files that state it: --intrinsics, the named camera's, the capture's
     ``own``, or the first file named like a lens in the folders ``beside``. Raises UserError if no lens is stated
     (``hint`` ends its advice), or only that of other images."""
     lens, file = given.lens, given.intrinsics
     if lens is None and file is None:
         lens = own()
-        suffixes = (".json", ".yaml", ".yml")
-        names = [*(f"{stem}{suffix}" for stem in FOUND_BESIDE for suffix in suffixes), *BARE_MATRICES]
+        names = [*(f"{stem}{suffix}" for stem in FOUND_BESIDE for suffix in (".json", ".yaml", ".yml")), *BARE_MATRICES]
         file = next(filter(Path.is_file, (folder / name for folder in beside for name in names)), None)
     if file is not None:
         lens = read_lens(file, width, height)
@@ -200,11 +194,9 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
         return OtherLens(*numbers, warning=warning)
     if max(abs((cx + 0.5) / width - 0.5), abs((cy + 0.5) / height - 0.5)) <= FAR_OFF:
         return Lens(*numbers)
-    warning = (
-        f"{path.name} has its principal point at {cx:.5g}, {cy:.5g}, far from the middle of {width} x {height} pixels:"
-    )
-    warning += " unless the images are crops of larger images, the lens is for another size, and all sizes are wrong"
-    return OtherLens(*numbers, warning=warning)
+    off = f"{path.name} has its principal point at {cx:.5g}, {cy:.5g}, far from the middle of {width} x {height} pixels"
+    doubt = "unless the images are crops of larger images, the lens is for another size, and all sizes are wrong"
+    return OtherLens(*numbers, warning=f"{off}: {doubt}")
 
 
 def parsed_lens(path: Path) -> dict[str, Any]:

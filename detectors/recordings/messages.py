@@ -40,8 +40,7 @@ def stored_depth(name: str, message: Any) -> np.ndarray:
     if hasattr(message, "format"):
         return _unpacked(name, encoding, bytes(message.data))
     kind = np.dtype((">" if message.is_bigendian else "<") + DEPTH_NUMBERS[encoding])
-    stored = _rows(name, message, kind, int(message.step))
-    return stored.astype(kind.newbyteorder("="))
+    return _rows(name, message, kind, int(message.step)).astype(kind.newbyteorder("="))
 
 
 def _rows(name: str, message: Any, kind: np.dtype, row_bytes: int) -> np.ndarray:

@@ -92,8 +92,7 @@ def _unit_not_stated(recording: Recording) -> Unit:
 
 def _statements_beside(files: Sequence[Path]) -> Iterator[tuple[Path, dict[str, Any]]]:
     """Yield the names and values in the JSON and YAML files in and above the folder of a capture's first file."""
-    folders = dict.fromkeys((files[0].parent, files[0].parent.parent) if files else ())
-    for folder in folders:
+    for folder in dict.fromkeys((files[0].parent, files[0].parent.parent) if files else ()):
         beside = (path for end in ("json", "yaml", "yml") for path in sorted(folder.glob(f"*.{end}")))
         for path in islice(beside, 20):
             try:

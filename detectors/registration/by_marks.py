@@ -137,16 +137,14 @@ class JointState:
 
     def split(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return the parts (v - 1, 6), (10,), (m, 2) and (v, 10) of a vector of all unknowns, or of their indices."""
-        sizes = np.cumsum([6 * (len(self.T) - 1), len(TERMS), self.marks_m.size])
-        poses, surface, marks, own = np.split(values, sizes)
+        poses, surface, marks, own = np.split(values, np.cumsum([6 * (len(self.T) - 1), len(TERMS), self.marks_m.size]))
         return poses.reshape(-1, 6), surface, marks.reshape(-1, 2), own.reshape(-1, len(TERMS))
 
     def moved(self, motion: np.ndarray, shared_m: float) -> JointState:
         """Return the state after a motion of all unknowns; poses move about the frame's origin."""
         poses, surface, marks, own = self.split(motion)
-        T = np.stack(
-            [self.T[0], *(registered.moved_by(w, np.zeros(3)) @ T for w, T in zip(poses, self.T[1:], strict=True))]
-        )
+        turned = (registered.moved_by(w, np.zeros(3)) @ T for w, T in zip(poses, self.T[1:], strict=True))
+        T = np.stack([self.T[0], *turned])
         return JointState(T, self.surface + surface, self.own + own, self.marks_m + marks, shared_m, self.half_m)
 
     def basis(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:

@@ -108,10 +108,8 @@ def judge(
     undetermined, apart = "", _apart(agreement)
     if error_m > limit_m:
         undetermined = "not determined: the points let the target slide or rotate (they lie on a line, or the surface"
-        undetermined += (
-            f" slides in itself); the predicted error over it is {error_m / MM:.1f} mm, which would blur the map"
-        )
-        undetermined += f" (up to {limit_m / MM:.1f} mm are merged)"
+        undetermined += f" slides in itself); the predicted error over it is {error_m / MM:.1f} mm, which would blur"
+        undetermined += f" the map (up to {limit_m / MM:.1f} mm are merged)"
     if judged.method in UNJUDGED_AGREEMENT:
         return replace(judged, failure=undetermined, notes=(*judged.notes, *([apart] if apart else [])))
     failure = "; ".join(reason for reason in (undetermined, apart) if reason)
@@ -159,8 +157,7 @@ def _widened(
     across the surface and within it. An offset of a whole view does not show."""
 
     def beyond_m(measured_m: float, explained_m: float, scatter: float) -> float:
-        beyond = measured_m > explained_m * (1 + scatter)
-        return float(np.sqrt(measured_m**2 - explained_m**2)) if beyond else 0.0
+        return float(np.sqrt(measured_m**2 - explained_m**2)) if measured_m > explained_m * (1 + scatter) else 0.0
 
     more_across = beyond_m(agreement.apart_m, float(np.hypot(agreement.noise_m, across)), agreement.scatter)
     explained = float(np.linalg.norm([agreement.noise_m, across, within, agreement.grids_m, more_across]))

@@ -164,9 +164,8 @@ def clouds_of(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, tuple[str, ...], str]:
     """Return the points to register, of the fiducials or of the whole target: the reference's and the view's, each (n,
     3) with at most `MAX_POINTS`; the guess (4, 4); a note without one; and why they cannot be registered, else ""."""
-    fixed, moving = (
-        thinned(each.mark_points_m if points == "marks" else each.points_m, MAX_POINTS) for each in (reference, view)
-    )
+    both = [each.mark_points_m if points == "marks" else each.points_m for each in (reference, view)]
+    fixed, moving = (thinned(each, MAX_POINTS) for each in both)
     guess = guess_of(reference, view)
     notes = () if guess is not None else ("no guess: registration started from the reference's pose",)
     few = ""

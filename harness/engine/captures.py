@@ -48,8 +48,7 @@ def judge_captures(experiment: Experiment, out: Path, command: str) -> int:
         print(f"{name} {point.label}: {len(found.findings)} findings beyond {rows[-1]['threshold_mm']:.2f} mm")
         for left in cloud.left_out:
             print(f"  left out: {left.name}: {left.why}")
-    origin = {"results_version": RESULTS_VERSION, **record(command)}
-    write_json(folder / PROVENANCE.name, origin)
+    write_json(folder / PROVENANCE.name, {"results_version": RESULTS_VERSION, **record(command)})
     write_table(folder, POINTS_OF_CAPTURES, POINTS_OF_CAPTURES.frame(rows))
     point_to(folder)
     print(f"findings: {folder}")

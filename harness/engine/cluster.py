@@ -193,13 +193,13 @@ class ClusterEngine:
 
         asyncio.run_coroutine_threadsafe(call(), self._client.loop.asyncio_loop)
 
-    def _step(self, waits_s: float = LOOKS_S) -> None:
-        """Process the events that have happened; wait for the first of them at most so long."""
+    def _step(self) -> None:
+        """Process the events that have happened; wait for the first of them at most `LOOKS_S`."""
         if time.monotonic() - self._looked >= LOOKS_S:
             self._look_for_nodes()
             self._looked = time.monotonic()
         with contextlib.suppress(queue.Empty):
-            self._heed(*self._events.get(timeout=waits_s))
+            self._heed(*self._events.get(timeout=LOOKS_S))
             while True:
                 self._heed(*self._events.get_nowait())
 

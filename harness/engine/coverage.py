@@ -34,9 +34,7 @@ STEEPEST_DEG = 60.0  # largest tilt of these boards about either axis
 DRAWS, AROUND_PX, NEAR_PX = 2, 31, 15  # averages for noise; sides of squares for the unit of score, for missing pixels
 MOST_PATCHES = 3000
 SAME_MM = 1e-6  # sizes that differ by less are equal; if all are, the size of damage is its depth
-ON_FACE_M = (
-    5 * MM
-)  # a patch is visible if its z and the view's differ by less than this, or than two pixels along the slope
+ON_FACE_M = 5 * MM  # a patch is visible if its z and the view's differ by less, or by less than two pixels on the slope
 
 Pose = tuple[float, float, float]  # Distance in metres, tilts of the part about its x and y in degrees
 

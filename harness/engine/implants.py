@@ -256,8 +256,7 @@ def judge_scans(
         for at, placement in enumerate(made):
             slices = [group for scan, group in judged if scan is placement.scan]
             slices = slices or [group for scan, group in groups if scan is placement.scan]
-            cloud = placement.cloud(slices[at % len(slices)])
-            known = placement.scan.known(cloud, placement.target)
+            known = placement.scan.known(placement.cloud(slices[at % len(slices)]), placement.target)
             _add(rows, judging, known, threshold, {"frames": count, "board": placement.number, "role": "damaged"})
             print(f"frames averaged {count}: placement {at + 1} of {len(made)}", file=sys.stderr)
     tables = ResultTables(

@@ -45,16 +45,9 @@ class JudgedCloud:
 
 
 def judge(
-    known: KnownCloud,
-    detector_name: str,
-    settings_json: str,
-    threshold: float | None,
-    radius_m: float,
-    *,
-    overlap: float | None = None,
-    hole_free: bool,
-    learned: str | None = None,
-) -> JudgedCloud:
+    known: KnownCloud, detector_name: str, settings_json: str, threshold: float | None, radius_m: float, *,
+    overlap: float | None = None, hole_free: bool, learned: str | None = None,
+) -> JudgedCloud:  # fmt: skip
     """Judge a detector on a cloud; without a threshold, only find the quiet threshold. ``learned``: path of a file."""
     cloud = known.cloud
     detector = detector_for(known, detector_name, settings_json, hole_free=hole_free, learned=learned)
@@ -124,13 +117,9 @@ def smeared(outlines: Sequence[np.ndarray], shape: tuple[int, ...], *, grid: boo
 
 
 def matched_places(
-    lines_m: Sequence[np.ndarray],
-    areas: Sequence[np.ndarray],
-    placed: Callable[[np.ndarray], np.ndarray],
-    levels: Sequence[Findings],
-    radius_m: float,
-    overlap: float | None,
-) -> list[tuple[dict[int, int], int]]:
+    lines_m: Sequence[np.ndarray], areas: Sequence[np.ndarray], placed: Callable[[np.ndarray], np.ndarray],
+    levels: Sequence[Findings], radius_m: float, overlap: float | None,
+) -> list[tuple[dict[int, int], int]]:  # fmt: skip
     """Match as `matched` does. ``lines_m``: centre lines of the damages. ``areas``: their masks (none without an
     ``overlap``). ``placed``: maps centres onto the face. ``levels``: the detections at each of several thresholds."""
     places_m = placed(np.concatenate([found.centres_m for found in levels]))
@@ -167,11 +156,9 @@ def detector_for(
     detector = detector_of(name, settings_json, learned)
     if not (isinstance(detector, NeedsTruth) and DETECTORS.offer(name).built_in):
         return detector
-    truth = (
-        TrueDamage(known.centre_in_cloud_m(damage), damage.diameter_m, known.outlines[damage.id])
-        for damage in known.truth
-    )
-    return detector.with_truth(() if hole_free else tuple(truth))
+    damages = () if hole_free else known.truth
+    truth = [TrueDamage(known.centre_in_cloud_m(each), each.diameter_m, known.outlines[each.id]) for each in damages]
+    return detector.with_truth(tuple(truth))
 
 
 def _place(damage: Damage) -> dict[str, Any]:
@@ -245,8 +232,7 @@ def study_rows(known: KnownCloud, judged: JudgedCloud, radius_m: float, *, hole_
         run |= {"loudest_u_px": float(u_px), "loudest_v_px": float(v_px)}
         return {"runs": [run], "holes": []}
     without_return, run["no_return_calls"] = _without_return(known, judged, radius_m, hole_free=hole_free)
-    lines = [damage.line_m for damage in known.truth]
-    signals = highest_within(known.places_m, score, lines, radius_m).tolist()
+    signals = highest_within(known.places_m, score, [damage.line_m for damage in known.truth], radius_m).tolist()
     counts_for = {} if hole_free else {finding: str(known.truth[i].id) for i, finding in judged.pairs.items()}
     operating = _operating(known, judged, threshold, radius_m, hole_free=hole_free)
     tables: Rows = {"runs": [run], "holes": [], "sites": [], "findings": [], "operating": [operating], "pixels": []}
@@ -291,8 +277,7 @@ def _without_return(
     pairs = {} if hole_free else matched(known, found, radius_m, judged.overlap)[0]
     hits = {id(found[number]) for number in pairs.values()}
     alone = one_damage_once(known.cloud.valid.shape, judged.detections, found)
-    calls = sum(each.kind == "no return" and id(each) not in hits for each in alone)
-    return frozenset(pairs), calls
+    return frozenset(pairs), sum(each.kind == "no return" and id(each) not in hits for each in alone)
 
 
 def _operating(

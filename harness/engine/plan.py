@@ -79,8 +79,7 @@ class Batch:
         """Return the set-ups of a repeat, with its unit of the camera."""
         if not self.units:
             return self.set_ups
-        camera = self.units[repeat % len(self.units)]
-        return tuple(replace(ref, camera=camera) for ref in self.set_ups)
+        return tuple(replace(ref, camera=self.units[repeat % len(self.units)]) for ref in self.set_ups)
 
 
 @dataclass(frozen=True)
@@ -279,13 +278,9 @@ def unit_of(camera: CameraConfig, seed: int, role: Role, number: int) -> CameraC
 
 
 def batch_of(
-    declared: TargetConfig,
-    role: Role,
-    source: SimulatedSource,
-    cache: Path,
-    board: int | None = None,
+    declared: TargetConfig, role: Role, source: SimulatedSource, cache: Path, board: int | None = None,
     units: tuple[CameraConfig, ...] = (),
-) -> Batch:
+) -> Batch:  # fmt: skip
     """Return the trials of a role with one declared target, which shows its damage only in the role "damaged"."""
     target = declared.at_wavelength(camera_of(source.camera).optics.wavelength_nm)
     poses = (target.pose,) if source.views is None else poses_of(source.views, target.pose)

@@ -289,8 +289,7 @@ def _starting() -> Iterator[None]:
     config: dict[str, Any] = multiprocessing.current_process()._config  # type: ignore[attr-defined]
     started_in = multiprocessing.process.ORIGINAL_DIR  # type: ignore[attr-defined]
     own = os.pathsep.join(path or started_in for path in sys.path)
-    paths = {"PYTHONPATH": own, "PYTHONSAFEPATH": "1"}
-    with _STARTING, _environment(ONE_THREAD | paths):
+    with _STARTING, _environment(ONE_THREAD | {"PYTHONPATH": own, "PYTHONSAFEPATH": "1"}):
         daemon, config["daemon"] = config.get("daemon"), False
         has_masks = hasattr(signal, "pthread_sigmask")
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if has_masks else set()

@@ -144,14 +144,9 @@ MOST_TRACEBACKS = 200  # failures whose traceback stays in memory; the journal h
 
 
 def run_plan(
-    plan: SweepPlan,
-    journal: Journal,
-    engine: JobEngine,
-    report: Report,
-    *,
-    shard: Shard = WHOLE,
+    plan: SweepPlan, journal: Journal, engine: JobEngine, report: Report, *, shard: Shard = WHOLE,
     retry_failed: bool = False,
-) -> Outcome:
+) -> Outcome:  # fmt: skip
     """Run the trials that the journal lacks (with ``retry_failed``, also those that failed), and draw a whole sweep's
     pictures. A job that fails becomes a `Failure`; trials that need it are skipped. Raises UserError if nothing can be
     written or the engine is gone. KeyboardInterrupt passes through; the journal has all finished trials."""
@@ -404,15 +399,13 @@ class _Run:
     def _trials(self, part: PlanPart) -> list[_Trial]:
         """Return a part's trials. Those that others judged at agreeing thresholds are filed under this run's keys."""
         group = self._groups[part.group]
-        unlearned = self._calibrations[part.group].unlearned
-        made = group.trials(part.batch, self.outcome.thresholds, part.repeats, unlearned)
+        made = group.trials(part.batch, self.outcome.thresholds, part.repeats, self._calibrations[part.group].unlearned)
         found = [_Trial(part, key, task) for key, task in made]
         self.outcome.trials.total += len(found) - len(part.repeats)
         if part.sets_threshold:
             return self._shard.rotated(found)
         for thresholds in self._others[part.group]:
-            elsewhere = group.trials(part.batch, thresholds, part.repeats)
-            for trial, (key, judged) in zip(found, elsewhere, strict=True):
+            for trial, (key, judged) in zip(found, group.trials(part.batch, thresholds, part.repeats), strict=True):
                 is_new = self._journal.state(trial.key) != "done" and self._journal.state(key) == "done"
                 if is_new and (entry := self._journal.read(key)) is not None:
                     self._journal.write(trial.key, refiled(entry, judged, trial.task))

@@ -171,10 +171,9 @@ def load_set_up(ref: SetUpRef) -> SetUp:
         seen = tuple(damage for damage, is_seen in zip(truth, in_view, strict=True) if is_seen)
         _kept[ref] = SetUp(unit, ref.damaged, seen, ref.target, T_camera_board)
     _kept.move_to_end(ref)
-    while len(_kept) > 1 and (
-        len(_kept) > KEPT or sum(kept.unit.view.phasor.nbytes for kept in _kept.values()) > KEPT_BYTES
-    ):
-        _kept.popitem(last=False)
+    held_bytes = sum(kept.unit.view.phasor.nbytes for kept in _kept.values())
+    while len(_kept) > 1 and (len(_kept) > KEPT or held_bytes > KEPT_BYTES):
+        held_bytes -= _kept.popitem(last=False)[1].unit.view.phasor.nbytes
     return _kept[ref]
 
 

@@ -62,8 +62,7 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
                 outcome = run_plan(plan, journal, engine, report, shard=options.shard, retry_failed=retry)
             if not options.shard.is_whole:
                 done = outcome.trials
-                counts = f"{done.done} trials done, {done.found} found, {done.failed} failed"
-                print(f"shard {options.shard}: {counts}")
+                print(f"shard {options.shard}: {done.done} trials done, {done.found} found, {done.failed} failed")
                 _print_failures(outcome)
                 print(f"journal: {folder / 'journal'}")
                 print("when all shards have run: python -m harness.merge, then the same command without --shard")
@@ -113,14 +112,9 @@ def _records(journal: Journal, outcome: Outcome) -> Iterator[dict[str, Any]]:
 
 
 def _write_study(
-    folder: Path,
-    experiment: Experiment,
-    plan: SweepPlan,
-    outcome: Outcome,
-    tables: ResultTables,
-    provenance: dict[str, Any],
-    engine: JobEngine,
-) -> list[str | Grid]:
+    folder: Path, experiment: Experiment, plan: SweepPlan, outcome: Outcome, tables: ResultTables,
+    provenance: dict[str, Any], engine: JobEngine,
+) -> list[str | Grid]:  # fmt: skip
     """Write a study's record, tables and report. Return what the terminal shows."""
     failed = failures_by_point(plan, outcome.failures, outcome.thresholds)
     study = record_of(experiment, plan, tables, failed, provenance)

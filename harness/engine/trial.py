@@ -176,8 +176,7 @@ class MapMaker:
     def merged(self, mapping: MappingConfig, frames: int) -> Merged:
         """Return the map."""
         if (key := f"merged {self.key(mapping, frames)}") not in self._made:
-            registrations = self.registrations(mapping, frames)
-            self._made[key] = merge(self.prepared(mapping, frames), registrations, mapping.merge)
+            self._made[key] = merge(self.prepared(mapping, frames), self.registrations(mapping, frames), mapping.merge)
         return cast("Merged", self._made[key])
 
     def prepared(self, mapping: MappingConfig, frames: int, count: int | None = None) -> tuple[PreparedView, ...]:
@@ -353,14 +352,9 @@ def capture_of(set_up: SetUp, number: int, task: TrialTask, frames: int) -> Simu
 
 
 def _point_rows(
-    task: TrialTask,
-    first: SetUp,
-    views: dict[int, Cloud],
-    maps: MapMaker | None,
-    point: PointTask,
-    done: dict[str, Rows],
-    seconds: dict[str, float],
-) -> Rows:
+    task: TrialTask, first: SetUp, views: dict[int, Cloud], maps: MapMaker | None, point: PointTask,
+    done: dict[str, Rows], seconds: dict[str, float],
+) -> Rows:  # fmt: skip
     """Return the rows of one point, by table. ``done``: rows of earlier points, reused if their inputs are the same."""
     common: dict[str, Any] = {"variant": point.variant, "frames": point.frames, "repeat": task.repeat}
     if task.board is not None:

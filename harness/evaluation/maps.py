@@ -14,7 +14,7 @@ import pandas as pd
 
 from harness.evaluation.intervals import UNKNOWN, Interval, bootstrap, mean_t
 from harness.evaluation.set_ups import compare_set_ups
-from harness.evaluation.summary import HoleState, Measure, found_holes, with_columns
+from harness.evaluation.summary import HoleState, found_holes, with_columns
 from harness.tables.trials import ResultTables
 from harness.vocabulary.path_names import value_text
 
@@ -73,8 +73,7 @@ def compare_maps(tables: ResultTables, summary: pd.DataFrame) -> pd.DataFrame:
         return compared
     columns = {"views_left_out": ("views_left_out", "mean"), "seconds_map": ("seconds_map", "median")}
     columns |= {"surface_std_mm": ("surface_noise_mm", "std")}
-    damaged = tables.runs[tables.runs["role"] == "damaged"]
-    means = damaged.groupby(["variant", "frames"], as_index=False).agg(**columns)
+    means = tables.runs[tables.runs["role"] == "damaged"].groupby(["variant", "frames"], as_index=False).agg(**columns)
     return compared.merge(maps, "left", "variant").merge(means, "left", ["variant", "frames"])
 
 
@@ -118,11 +117,11 @@ class SizeErrors:
             return change_of(np.where(valid, chosen, 0.0).sum(axis=1) / valid.sum(axis=1))
 
 
-def size_errors(first: pd.DataFrame, second: pd.DataFrame, measure: Measure = "extent") -> SizeErrors:
+def size_errors(first: pd.DataFrame, second: pd.DataFrame) -> SizeErrors:
     """Pair the rows of two maps in the table of holes, each of one set-up and number of frames; see `FEWEST_BOTH`."""
 
     def errors(rows: pd.DataFrame) -> pd.DataFrame:
-        error = (rows[f"{measure}_diameter_mm"] - rows["true_diameter_mm"]).abs()
+        error = (rows["extent_diameter_mm"] - rows["true_diameter_mm"]).abs()
         return rows.assign(error=error).pivot(index="repeat", columns="hole", values="error")
 
     change = (errors(second) - errors(first)).dropna(axis="columns", thresh=FEWEST_BOTH)
@@ -169,8 +168,7 @@ class MapCase:
     def variant(self, views: int, registration: str, merge: str) -> str | None:
         """Return the name of the set-up. All registrations of a single view are the same, so any of them will do."""
         alike = [each for each in self.set_ups if (each.views, each.merge) == (views, merge)]
-        named = [each for each in alike if each.registration == registration]
-        chosen = named or (alike if views == 1 else [])
+        chosen = [each for each in alike if each.registration == registration] or (alike if views == 1 else [])
         return chosen[0].variant if chosen else None
 
     def frames(self, variant: str) -> list[int]:
@@ -284,10 +282,10 @@ def span(interval: Interval, digits: int = 2) -> str:
     return f"{low:.{digits}f} to {high:.{digits}f}"
 
 
-def change_text(change: Change, unit: str = " mm") -> str:
+def change_text(change: Change) -> str:
     """Return ``+0.12 mm (0.05 to 0.19)``."""
     known = np.isfinite(change.mean)
-    return f"{round(change.mean, 2) + 0.0:+.2f}{unit} ({span(change.interval)})" if known else "not compared"
+    return f"{round(change.mean, 2) + 0.0:+.2f} mm ({span(change.interval)})" if known else "not compared"
 
 
 def ratio_text(change: Change) -> str:
@@ -320,8 +318,7 @@ def summarise_registrations(registrations: pd.DataFrame) -> pd.DataFrame:
     both `PARTS`: median, root mean square, the value that covariances predict, and the ``_ratio`` of actual to
     predicted (1: honest, above 1: too sure) with a bootstrap over repeats. ``guess_mm``: error of the initial guess."""
     groups = registrations.groupby(["method", "frames"], sort=False)
-    rows = [{"method": method, "frames": frames} | _summary(part) for (method, frames), part in groups]
-    return pd.DataFrame(rows)
+    return pd.DataFrame([{"method": method, "frames": frames} | _summary(part) for (method, frames), part in groups])
 
 
 def by_views(registrations: pd.DataFrame, counts: Sequence[int]) -> pd.DataFrame:

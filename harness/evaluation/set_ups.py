@@ -175,8 +175,7 @@ def effect_costs(tables: ResultTables) -> pd.DataFrame:
         wanted = [(effect, "nothing", nothing, alone) for effect, alone in effects]
         wanted += [(effect, "all others", everything - alone, everything) for effect, alone in effects]
         wanted.append(("all", "nothing", nothing, everything))
-        holes = tables.holes[tables.holes["variant"].isin(by_switches.values())]
-        for frames, rows in holes.groupby("frames"):
+        for frames, rows in tables.holes[tables.holes["variant"].isin(by_switches.values())].groupby("frames"):
             by_variant = {str(name): ladder_of(part) for name, part in rows.groupby("variant")}
             ladders = {on: by_variant[variant] for on, variant in by_switches.items() if variant in by_variant}
             for effect, against, off, on in wanted:

@@ -165,8 +165,7 @@ def noise_against_frames(probes: pd.DataFrame) -> pd.DataFrame:
         if len(moments):
             variance, offset, *_ = mean = moments.mean(axis=0)
             pattern2, repeats = float(_pattern_variance(mean, len(moments))), int(part["repeats"].median())
-            parts = [variance, offset**2 + pattern2, variance + offset**2 + pattern2]
-            temporal, systematic, total = np.sqrt(parts)
+            temporal, systematic, total = np.sqrt([variance, offset**2 + pattern2, variance + offset**2 + pattern2])
             displacement, start = float(part["displacement_std_mm"].median()), (variant, frames, len(moments), repeats)
             rows.append((*start, temporal, offset, np.sqrt(pattern2), systematic, displacement, total))
     table = pd.DataFrame(rows, columns=COLUMNS)

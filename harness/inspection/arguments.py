@@ -106,8 +106,7 @@ def detector_of(
         settings["surface"] = {"shape": "auto"}
     for assignment in assignments:
         assign(settings, assignment)
-    detector = load_detector(arguments.detector, settings)
-    return detector, known.from_data(settings).to_data()
+    return load_detector(arguments.detector, settings), known.from_data(settings).to_data()
 
 
 def mapping_of(arguments: argparse.Namespace) -> MappingConfig:

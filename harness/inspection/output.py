@@ -106,19 +106,12 @@ def choice_facts(choice: Choice | None) -> dict[str, Any] | None:
     """Return the choice's facts for the JSON; None if there was none."""
     if choice is None:
         return None
-    candidates = [
-        {
-            "number": n,
-            **{
-                f"{name}_mm": m / MM for name, m in zip(("nearest", "distance", "farthest"), area.depths_m, strict=True)
-            },
-            "extent_mm": [side / MM for side in area.extent_m],
-            "share_of_view": area.share,
-            "tilt_deg": area.tilt_deg,
-            "pixels": int(area.own.sum()),
-        }
-        for n, area in enumerate(choice.candidates, start=1)
-    ]
+    candidates = []
+    for n, area in enumerate(choice.candidates, start=1):
+        nearest, distance, farthest = (m / MM for m in area.depths_m)
+        facts: dict[str, Any] = {"number": n, "nearest_mm": nearest, "distance_mm": distance, "farthest_mm": farthest}
+        facts |= {"extent_mm": [side / MM for side in area.extent_m], "share_of_view": area.share}
+        candidates.append({**facts, "tilt_deg": area.tilt_deg, "pixels": int(area.own.sum())})
     return {"taken": choice.taken, "warnings": choice.warnings, "candidates": candidates}
 
 

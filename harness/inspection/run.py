@@ -44,9 +44,7 @@ if TYPE_CHECKING:
     from detectors.recordings import Recording
     from detectors.registration.registered import Registration
 
-DEFAULT_K = (
-    5.0  # robust standard deviations, if the capture sets no threshold; 0.6 of a million normal pixels lie beyond
-)
+DEFAULT_K = 5.0  # robust deviations, if the capture sets no threshold; 0.6 of a million normal pixels lie beyond
 FAINT_CALLS = 0.05  # noise explains a finding if at least this many false calls of its score are expected
 THRESHOLDS = ("threshold", "quiet_capture", "false_calls")  # arguments of which each sets the threshold
 
@@ -140,8 +138,7 @@ def with_faint_warning(judged: Judged, threshold: float) -> Judged:
     which = f"{len(faint)} of {len(judged.findings)} findings ({', '.join(faint)})"
     calls = f"{_calls(null['expected'])} false calls are expected, with scores up to about {sure:.2g}"
     warning = f"{which} are so faint that noise explains them: {calls}"
-    evidence = replace(judged.evidence, warnings=(*judged.evidence.warnings, warning))
-    return replace(judged, evidence=evidence)
+    return replace(judged, evidence=replace(judged.evidence, warnings=(*judged.evidence.warnings, warning)))
 
 
 def with_size_warnings(judged: Judged) -> Judged:
@@ -211,10 +208,9 @@ def inspect(arguments: argparse.Namespace) -> int:
     # a view's name is the last part of its path, or the whole path if these parts are not distinct
     names = [path.resolve().name for path in paths] if config else [recordings[0].name]
     names = names if len(set(names)) == len(names) else list(map(str, paths))
-    views: list[View] = []
+    clouds = (_averaged(arguments, recording, field) for recording in recordings)
+    views = [View(*each) for each in zip(names, clouds, guesses, strict=False)]
     choices: list[Choice | None] = []
-    for name, recording, guess in zip(names, recordings, guesses, strict=False):
-        views.append(View(name, _averaged(arguments, recording, field), guess))
     for view in views:
         with _mistakes_named(view if config else None):
             choices.append(output.choice_by(config or getattr(detector, "settings", None), view.cloud))
@@ -253,9 +249,8 @@ def _opened(arguments: argparse.Namespace, paths: Sequence[Path]) -> Recording:
 
 def _averaged(arguments: argparse.Namespace, recording: Recording, field: FlatField | None) -> Cloud:
     cloud = average(recording, RECORDED.model_copy(update={"method": arguments.average}))
-    reach_px = (
-        noise_reach_px(list(islice(recording.frames(), REACH_FRAMES)), recording.z_step_m) if cloud.organised else 0.0
-    )
+    first = list(islice(recording.frames(), REACH_FRAMES)) if cloud.organised else []
+    reach_px = noise_reach_px(first, recording.z_step_m) if first else 0.0
     cloud = replace(cloud, projection=recording.projection, noise_reach_px=reach_px)
     return cloud if field is None else corrected(cloud, field)
 
@@ -428,7 +423,6 @@ def _facts(run: Inspection, recordings: Sequence[Recording]) -> dict[str, Any]:
 
 
 def _write(run: Inspection, facts: dict[str, Any]) -> None:
-
     mapped, beside = run.mapped, dict[str, Callable[[Path], object]]()
     count, limit = len(run.result.detections), output.threshold_text(run.threshold, run.result.evidence)
     subject = f"{len(mapped.merged.views_used)} views" if mapped else run.recordings[0].name

@@ -266,8 +266,7 @@ def _again(camera: AnyCamera, capture: StillCapture, albedo: float, frames: int,
     light *= camera.optics.cone(capture.slopes)
     unit = SimulatedUnit(camera, config, image_view(camera, lens.whole, z_m, light))
     if capture.amplitude is not None:
-        plain = measure.mean_amplitude([next(iter(unit.capture(1, SEED).frames())).amplitude])
-        ratio = capture.amplitude / plain
+        ratio = capture.amplitude / measure.mean_amplitude([next(iter(unit.capture(1, SEED).frames())).amplitude])
         ratio = np.clip(np.nan_to_num(ratio / np.nanmedian(ratio[capture.steady]), nan=1.0), 0.02, 50.0)
         unit = SimulatedUnit(camera, config, image_view(camera, lens.whole, z_m, light * ratio))
     taken = list(unit.capture(frames, SEED, "own camera", number).frames())

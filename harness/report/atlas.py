@@ -54,10 +54,8 @@ def save_atlas_png(path: Path, rows: Sequence[Row]) -> None:
     least half of the places gets a panel. If there are several albedos, the brightest target is drawn."""
     albedos = sorted({row.place["albedo"] for row in rows if "albedo" in row.place})
     rows = [row for row in rows if row.place.get("albedo") in (None, *albedos[-1:])]
-    known = pd.Series([np.isfinite(row.answer.a90_mm) for row in rows]).groupby(
-        [row.damage for row in rows], sort=False
-    )
-    damages = [damage for damage, share in known.mean().items() if share >= 0.5]
+    known = pd.Series([np.isfinite(row.answer.a90_mm) for row in rows], index=[row.damage for row in rows])
+    damages = [damage for damage, share in known.groupby(level=0, sort=False).mean().items() if share >= 0.5]
     titles = list(dict.fromkeys(row.title for row in rows))
     counts = sorted({int(row.place["frames"]) for row in rows})
     shown = {counts[0]: "--", counts[-1]: "-"}
@@ -76,8 +74,7 @@ def save_atlas_png(path: Path, rows: Sequence[Row]) -> None:
                     x = [row.place["distance_m"] for row in line]
                     names = ("low_mm", "a90_mm", "high_mm")
                     low, middle, high = ([getattr(row.answer, name) for row in line] for name in names)
-                    label = title if frames == counts[-1] else None
-                    panel.plot(x, middle, style, color=colour, label=label)
+                    panel.plot(x, middle, style, color=colour, label=title if frames == counts[-1] else None)
                     if frames == counts[-1]:
                         panel.fill_between(x, low, high, color=colour, alpha=0.12, linewidth=0)
             panel.set(title=damage, yscale="log")

@@ -117,19 +117,16 @@ def closing(provenance: Mapping[str, Any], experiment_yaml_text: str, left_out: 
         more = f" and {len(parts_of) - NAMED} others" if len(parts_of) > NAMED else ""
         parts.append(tag("p", f"{', '.join(parts_of[:NAMED])}{more}: {why}", kind="fail"))
     parts += [paragraph(left_out)] if left_out else []
-    seconds = dict(provenance.get("seconds", {}))
-    rows = [(stage, f"{float(value):.1f}") for stage, value in seconds.items()]
+    rows = [(stage, f"{float(value):.1f}") for stage, value in provenance.get("seconds", {}).items()]
     cost = Grid.of(("stage", "seconds"), rows).html() if rows else paragraph("Not recorded.")
     keys = [key for key in provenance if key not in (*SHOWN_FIRST, *SHOWN_APART)]
-    recorded = [
-        (key.replace("_mm", " (mm)").replace("_", " "), plain(provenance.get(key, "not recorded")))
-        for key in (*SHOWN_FIRST, *keys)
-    ]
-    lines = (tag("tr", tag("th", name, scope="row"), tag("td", value)) for name, value in recorded)
+    lines = []
+    for key in (*SHOWN_FIRST, *keys):
+        name, value = key.replace("_mm", " (mm)").replace("_", " "), plain(provenance.get(key, "not recorded"))
+        lines.append(tag("tr", tag("th", name, scope="row"), tag("td", value)))
     parts += [heading("Provenance")]
     table = tag("table", tag("tbody", joined(lines)), kind="prov")
-    blocks = (cost, table, *command_of(provenance.get("command", "not recorded")))
-    folds = fold("Cost, versions and command", *blocks)
+    folds = fold("Cost, versions and command", cost, table, *command_of(provenance.get("command", "not recorded")))
     return [*parts, folds, fold("The resolved experiment", tag("pre", experiment_yaml_text))]
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -126,11 +127,9 @@ def examples_figure(name: str, examples: Sequence[StudyExample], title: str, *, 
     for where in get_args(Where):
         alike = [example for example in examples if example.where == where]
         columns.append(sorted(alike, key=lambda item: (item.diameter_mm, item.board))[:MOST_DOWN])
-    rows = [
-        [None if down >= len(line) else _example_cut(line[down], titles) for line in columns]
-        for down in range(max(map(len, columns)))
-    ]
     every = [example for line in columns for example in line]
+    cuts = ([_example_cut(example, titles) for example in line] for line in columns)
+    rows = list(zip_longest(*cuts))
     captions = "; ".join(f"{each.diameter_mm:.1f} mm, {titles[each.where].lower()}, {_outcome(each)}" for each in every)
     return _cuts(name, rows, f"{title}: {captions}.")
 

@@ -80,8 +80,7 @@ def efficiency_figure(rows: Sequence[Efficiency]) -> str:
 
 def efficiency_parts(rows: Sequence[Efficiency], first: str, warnings: Sequence[str]) -> list[str | Grid]:
     """Return the parts for a terminal: the conditions, warnings, the table and the answer."""
-    grid = EFFICIENCY.grid(rows, terminal=True)
-    return [first, *(f"warning: {text}" for text in warnings), grid, "", answer(rows)]
+    return [first, *(f"warning: {text}" for text in warnings), EFFICIENCY.grid(rows, terminal=True), "", answer(rows)]
 
 
 def efficiency_html(rows: Sequence[Efficiency], first: str, warnings: Sequence[str], name: str, command: str) -> str:

@@ -119,7 +119,7 @@ def _draw(figure: Figure, found: Mapod) -> None:
     curves.plot(found.sizes, found.simulated.curve.pod(found.sizes), color=PURPLE, ls="--", label="simulated")
     if found.measured is not None:
         curves.plot(found.sizes, found.measured.curve.pod(found.sizes), color=ORANGE, ls=":", lw=2, label="measured")
-    draw_hits(curves, found.read.size, found.read.response == 1, 0.6)
+    draw_hits(curves, found.read.size, found.read.response == 1)
     curves.axhline(POD, color=GREY, lw=0.8, ls=":")
     if found.sizes[0] < found.a90_95 < found.sizes[-1]:
         curves.plot([found.a90_95], [POD], "o", color=RED, label=f"a90/95: {sized(found.a90_95, 'mm')}")

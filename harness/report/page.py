@@ -102,10 +102,8 @@ def limits_figure(compared: pd.DataFrame, layout: Layout, frames: Sequence[int])
         columns = int(15 * width_in / (6 + max(map(len, layout.rows))))  # about 15 letters per inch
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=max(columns, 1))
 
-    width_in = 1 + 3.2 * len(frames)
-    return blocks.svg(
-        "limits", (width_in, 3.2 + 0.1 * len(layout.rows)), "Smallest diameter found by each set-up.", draw
-    )
+    width_in, height_in = 1 + 3.2 * len(frames), 3.2 + 0.1 * len(layout.rows)
+    return blocks.svg("limits", (width_in, height_in), "Smallest diameter found by each set-up.", draw)
 
 
 def noise_figure(noise: pd.DataFrame) -> str:
@@ -264,8 +262,7 @@ def set_ups_answer(compared: pd.DataFrame, layout: Layout, costs: pd.DataFrame, 
     if compared.empty:
         return "No trial of any set-up finished, so there is no answer."
     frames = sections.shown_frames(compared)
-    many_frames = compared[compared["frames"] == frames[-1]]
-    found = {row["variant"]: len(row["found"]) for row in sections.records(many_frames)}
+    found = {row["variant"]: len(row["found"]) for row in sections.records(compared[compared["frames"] == frames[-1]])}
     rows = [f"{row}: {', '.join(str(found.get(name, '–')) for name in names)}" for row, names in layout.rows.items()]
     where = f" at {', '.join(layout.columns)}" if layout.columns else ""
     if len(rows) > MOST_ROWS:
@@ -304,15 +301,9 @@ def _costs_grid(costs: pd.DataFrame) -> Grid:
 
 
 def write_report(
-    folder: Path,
-    tables: ResultTables,
-    examples: Sequence[ExampleCloud | MappedExample],
-    provenance: Mapping[str, Any],
-    experiment_yaml_text: str,
-    title: str,
-    facts: Mapping[str, Any] | None = None,
-    found: Summaries | None = None,
-) -> Path:
+    folder: Path, tables: ResultTables, examples: Sequence[ExampleCloud | MappedExample], provenance: Mapping[str, Any],
+    experiment_yaml_text: str, title: str, facts: Mapping[str, Any] | None = None, found: Summaries | None = None,
+) -> Path:  # fmt: skip
     """Write ``folder/report.html`` and return its path: the page of a set-up, of several set-ups, or of maps, with a
     page for each map of ``examples`` beside it. `harness.report.blocks.closing` describes ``provenance``; ``facts`` is
     the resolved experiment as plain data, ``found`` the result of `summaries`. Claims need the thesis' target.

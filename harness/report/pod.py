@@ -99,8 +99,7 @@ MODELS = Table(
 def models_grid(statement: PodStatement) -> Grid:
     """Return the table of models; it marks the model of the curve, and the models whose bounds are compared with it."""
     of_unit = f" ({statement.unit})" if statement.unit else ""
-    heads = {name: f"{name}{of_unit}" for name in ("a50", "a90", "a90/95")}
-    return MODELS.grid(statement.models, heads=heads)
+    return MODELS.grid(statement.models, heads={name: f"{name}{of_unit}" for name in ("a50", "a90", "a90/95")})
 
 
 def fit_grid(statement: PodStatement) -> Grid:
@@ -181,7 +180,7 @@ def draw_pod(axes: Axes, statement: PodStatement) -> None:
     axes.plot(sizes, curve.pod(sizes), color=BLUE, lw=2.0, label=f"POD, {statement.model}")
     axes.axhline(POD, color=GREY, lw=0.8, ls=":")
     if statement.signal is None:
-        draw_hits(axes, statement.read.size, statement.read.response == 1, 0.6)
+        draw_hits(axes, statement.read.size, statement.read.response == 1)
     for name, value, pod, colour in (
         ("a50", statement.a50, 0.5, GREEN),
         ("a90", statement.a90, POD, ORANGE),
@@ -197,11 +196,11 @@ def draw_pod(axes: Axes, statement: PodStatement) -> None:
     hits_in_view(axes, STRIPE + 0.06 if statement.signal is None else 0.03)
 
 
-def draw_hits(axes: Axes, size: np.ndarray, hit: np.ndarray, strength: float) -> None:
+def draw_hits(axes: Axes, size: np.ndarray, hit: np.ndarray) -> None:
     """Draw each inspection of ``size`` (n,), ``hit`` (n,) bool, as a stroke; equal sizes are spread in height."""
     # multiples of the golden ratio spread the strokes without random numbers
     spread = STRIPE * np.asarray((np.arange(len(size)) * 0.6180339887498949) % 1.0)
-    style: dict[str, Any] = {"marker": "|", "s": 26, "lw": 0.8, "color": INK, "alpha": strength, "clip_on": False}
+    style: dict[str, Any] = {"marker": "|", "s": 26, "lw": 0.8, "color": INK, "alpha": 0.6, "clip_on": False}
     style["rasterized"] = len(size) > MOST_MARKS
     axes.scatter(size[hit], 1.03 + spread[hit], **style)
     label = f"hits above ({int(hit.sum())}), misses below ({int((~hit).sum())})"

@@ -88,6 +88,7 @@ def _side(label: str, side: str) -> Column:
     return Column("", f"{label}{', without' if side == 'other' else ''}", cell)
 
 
+COMPARED = ("found", "threshold (mm)", "surface noise (mm)")
 VARIED = Table(
     "variations",
     "one row per variation and number of frames, beside the set-up that it changes",
@@ -97,11 +98,7 @@ VARIED = Table(
         Column("", "changes", lambda row: in_words(row.variant["reference"] or "–")),
         Column("", "frames", lambda row: "no trial of it finished" if row.row is None else row.row["frames"]),
         Column("", "≠", lambda row: Cell("≠" if row.differs else "", "changed" if row.differs else "")),
-        *(
-            _side(label, side)
-            for label in ("found", "threshold (mm)", "surface noise (mm)")
-            for side in ("row", "other")
-        ),
+        *(_side(label, side) for label in COMPARED for side in ("row", "other")),
     ),
     formats=(),
     left=4,
@@ -145,12 +142,10 @@ def claims_section(title: str, verdicts: Sequence[Verdict]) -> Markup:
 
 def counted_verdicts(verdicts: Sequence[Verdict]) -> str:
     """Return ``Of 7 claims, 5 are borne out (C1, ...), 2 are undecided (...).``; empty without verdicts."""
-    named = {answer: [verdict.claim for verdict in verdicts if verdict.verdict == answer] for answer in MARKS}
-    parts = [
-        f"{len(names)} {'is' if len(names) == 1 else 'are'} {answer} ({', '.join(names)})"
-        for answer, names in named.items()
-        if names
-    ]
+    parts = []
+    for answer in MARKS:
+        if names := [verdict.claim for verdict in verdicts if verdict.verdict == answer]:
+            parts.append(f"{len(names)} {'is' if len(names) == 1 else 'are'} {answer} ({', '.join(names)})")
     return f" Of {many(len(verdicts), 'claim')}, {', '.join(parts)}." if parts else ""
 
 
@@ -242,10 +237,9 @@ def ways_grid(compared: pd.DataFrame) -> Grid:
         undecided = f"+{len(row['undecided'])}" if row and row["undecided"] else ""
         return "–" if row is None else f"{len(row['found'])}{undecided}"
 
-    cells = [
-        [way, *(" / ".join(count(found.get((n, at))) for at in frames) for n in views)] for way, found in by_way.items()
-    ]
-    heads = ("registration, merge", *(many(n, "view") for n in views))
+    heads, cells = ("registration, merge", *(many(n, "view") for n in views)), []
+    for way, found in by_way.items():
+        cells.append([way, *(" / ".join(count(found.get((n, at))) for at in frames) for n in views)])
     of_holes = f" of {max(row['holes'] for row in rows)}" if rows else ""
     numbers = " / ".join(f"N={n}" for n in frames)
     return Grid.of(heads, cells, title=f"holes found{of_holes} with {numbers} frames per view (+: undecided)")

@@ -66,8 +66,7 @@ class Bench:
         self, view: NoiseFreeView, effects: EffectsConfig, frames: int, *labels: str | int, **settings: Any
     ) -> FrameStack:
         """Return frames of a unit with ``settings`` of `CameraConfig` and a view; ``labels`` select the noise."""
-        config = CameraConfig(name=self.camera_name, effects=effects, **settings)
-        unit = SimulatedUnit(self.camera, config, view)
+        unit = SimulatedUnit(self.camera, CameraConfig(name=self.camera_name, effects=effects, **settings), view)
         cut = unit.cut
         taken = unit.capture(frames, SEED, "scorecard", self.camera_name, *labels)
         true_z_m = view.range_m[cut] / np.sqrt(1 + (view.slopes[cut] ** 2).sum(axis=-1))
@@ -96,10 +95,10 @@ class Reading:
 NOTHING = Reading(float("nan"))
 
 
-def jackknifed(frames: np.ndarray, statistic: Callable[[np.ndarray], float], groups: int = GROUPS) -> Reading:
+def jackknifed(frames: np.ndarray, statistic: Callable[[np.ndarray], float]) -> Reading:
     """Return ``statistic`` of ``frames`` (n, ...), which must be independent, with Student's interval from the
     delete-a-group jackknife over frames; unknown below 4 frames. Source: Efron and Tibshirani 1993, chapter 11."""
-    value, g = float(statistic(frames)), min(groups, len(frames) // 2)
+    value, g = float(statistic(frames)), min(GROUPS, len(frames) // 2)
     if g < 2 or not np.isfinite(value):
         return Reading(value)
     number = np.arange(len(frames)) % g
@@ -308,14 +307,9 @@ def on_surface_tolerance_m(sigma_m: float, step_m: float) -> float:
 
 
 def edge_widths(
-    z_m: np.ndarray,
-    front_z_m: np.ndarray,
-    back_z_m: np.ndarray,
-    from_edge_px: np.ndarray,
-    tolerance_m: float,
-    reach_px: float,
-    across: int,
-) -> dict[str, np.ndarray]:
+    z_m: np.ndarray, front_z_m: np.ndarray, back_z_m: np.ndarray, from_edge_px: np.ndarray, tolerance_m: float,
+    reach_px: float, across: int,
+) -> dict[str, np.ndarray]:  # fmt: skip
     """Return widths (n,) in pixels within ``reach_px`` of an edge that lines of pixels along the axis ``across`` cross,
     for each of the frames (n, h, w): the ``gap`` without a range, the ``flying`` pixels with a range off both surfaces,
     and the share of lines ``with_flying`` pixels. All but the gap are NaN if noise hides the step. ``front_z_m`` and

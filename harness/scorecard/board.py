@@ -104,10 +104,9 @@ def image_of(target: TargetConfig, camera: AnyCamera, lens: Lens | None) -> Imag
         return Image(lens or own, T_depth_board, np.eye(4))
     colour = getattr(camera, "colour", None)
     if colour is None:
-        raise UserError(
-            f"the capture has {lens.width} x {lens.height} pixels, {camera.name} has {own.width} x {own.height}",
-            legal="the camera's own depth images, or images aligned to a colour camera that its file places",
-        )
+        what = f"the capture has {lens.width} x {lens.height} pixels, {camera.name} has {own.width} x {own.height}"
+        legal = "the camera's own depth images, or images aligned to a colour camera that its file places"
+        raise UserError(what, legal=legal)
     lens = lens if any(lens.distortion) else replace(lens, distortion=tuple(colour.distortion.value))
     return Image(lens, colour.T_colour_depth @ T_depth_board, colour.T_colour_depth)
 
@@ -166,8 +165,7 @@ def measured(
 
 def _angles_deg(target: TargetConfig) -> np.ndarray:
     """Return the angle (n,) of each hole from the depth camera's axis."""
-    centres = np.array([[*hole.centre_m, 0.0] for hole in target.holes])
-    places = transform_points(target.pose.T_camera_board, centres)
+    places = transform_points(target.pose.T_camera_board, np.array([[*hole.centre_m, 0.0] for hole in target.holes]))
     return np.degrees(np.arctan2(np.linalg.norm(places[:, :2], axis=-1), places[:, 2]))
 
 
@@ -190,10 +188,9 @@ def run_board(options: argparse.Namespace, recording: Recording | None, command:
     config, source = points[0].config, points[0].config.simulated
     target = source.target
     if not isinstance(target, TargetConfig) or not target.holes or config.threshold.k is None:
-        raise UserError(
-            f"{options.board}: declares no drilled board in front of a simulated camera, or no threshold k",
-            legal="source.kind: simulated, source.target.name: custom with holes, threshold: {k: ...}",
-        )
+        what = f"{options.board}: declares no drilled board in front of a simulated camera, or no threshold k"
+        legal = "source.kind: simulated, source.target.name: custom with holes, threshold: {k: ...}"
+        raise UserError(what, legal=legal)
     camera, frames, remarks, rows = camera_of(source.camera), config.capture.frames, [], []
     image, judged = image_of(target, camera, recording.lens if recording else None), {}
     if recording is not None:
@@ -244,8 +241,7 @@ def _answer(rows: list[Beside]) -> str:
     ratios: dict[str, dict[str, float]] = {}
     for row in rows:
         if row.measured.value > 0 and np.isfinite(row.simulated.value):
-            of_row = ratios.setdefault(row.where, {})
-            of_row[f"{row.quantity}, {row.at}"] = row.simulated.value / row.measured.value
+            ratios.setdefault(row.where, {})[f"{row.quantity}, {row.at}"] = row.simulated.value / row.measured.value
     off = {where: {k: r for k, r in found.items() if abs(r - 1) > CLOSE} for where, found in ratios.items()}
     best = min(off, key=lambda where: (len(off[where]), sum(abs(np.log(r)) for r in ratios[where].values())))
     share = f"{len(ratios[best]) - len(off[best])} of {len(ratios[best])} figures within {100 * CLOSE:.0f} %"

@@ -197,8 +197,7 @@ def measured(requests: Iterable[Request], effort: Effort, jobs: int) -> dict[Req
     # new processes are spawned, since a forked process would share the locks of this process's libraries
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
         mapped = map if jobs == 1 else pool.map
-        found = mapped(measure_group, groups, [effort] * len(groups))
-        for group, readings in zip(groups, found, strict=True):
+        for group, readings in zip(groups, mapped(measure_group, groups, [effort] * len(groups)), strict=True):
             results |= zip(group, readings, strict=True)
             if time.monotonic() - last_s > PROGRESS_EVERY_S:
                 last_s = time.monotonic()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -80,11 +80,7 @@ def run_scorecard(options: argparse.Namespace, command: str) -> int:
 
 
 def _page(
-    answer: str,
-    scores: Sequence[scoring.Score],
-    titles: Mapping[str, str],
-    provenance: Mapping[str, object],
-    command: str,
+    answer: str, scores: Sequence[scoring.Score], titles: dict[str, str], provenance: dict[str, object], command: str
 ) -> str:
     """Return the page: the figure of ratios, figures of cameras, checks of the code, and the quantities' meanings."""
     body = [heading("Simulated and published values")]
@@ -141,8 +137,7 @@ def _answer(scores: Sequence[scoring.Score]) -> str:
     blind = by_use["blind"]
     families: dict[str, list[scoring.Score]] = {}
     for score in blind:
-        first = score.figure.camera.partition("_")[0]
-        families.setdefault(FAMILIES.get(first, "other cameras"), []).append(score)
+        families.setdefault(FAMILIES.get(score.figure.camera.partition("_")[0], "other cameras"), []).append(score)
     by_family = ", ".join(f"{name} {share(own)}" for name, own in families.items())
     values = [score for score in blind if score.figure.published.value is not None]
     bounds = [score for score in blind if score.figure.published.value is None]

@@ -54,22 +54,13 @@ ATLAS = Table(
         Column("frames", "frames", lambda row: int(row.place["frames"]), "number of averaged frames"),
         Column("albedo", "albedo", lambda row: row.place.get("albedo"), "the target's albedo, if it varies"),
         Column("depth_mm", "", lambda row: row.place.get("depth_mm"), "depth of the damage, if it has one"),
-        Column(
-            "a90_mm",
-            "a90 (mm)",
-            _a90,
-            "size found 90 % of the time, with the 95 % interval of the surface; beyond the largest inspected size if "
-            "all neighbouring set-ups miss such damage; empty if one of them has no limit",
-            interval=True,
-        ),
+        Column("a90_mm", "a90 (mm)", _a90, "size found 90 % of the time, with the 95 % interval of the surface; beyond "
+               "the largest inspected size if all neighbouring set-ups miss such damage; empty if one of them has no "
+               "limit", interval=True),
         Column("largest_mm", "", "answer.largest_mm", "largest inspected size; empty if a90 is unknown"),
         Column("surface_error", "", "surface.error", "rms error of ln a90 when each set-up is left out in turn"),
-        Column(
-            "found",
-            "found?",
-            lambda row: "" if np.isnan(row.size_mm) else row.answer.verdict(row.size_mm),
-            "whether damage of the given size is found nine times out of ten: yes, no or undecided",
-        ),
+        Column("found", "found?", lambda row: "" if np.isnan(row.size_mm) else row.answer.verdict(row.size_mm),
+               "whether damage of the given size is found nine times out of ten: yes, no or undecided"),
     ),
     title="the atlas: size found 90 % of the time",
     left=3,

@@ -110,15 +110,11 @@ FLAT_CAPTURES = Table(
         Column("tilt_deg", "tilt (°)", "tilt_deg", "angle between the optical axis and the surface's normal"),
         Column("pixels", "pixels", "pixels", "number of pixels used"),
         Column("noise_mm", "noise (mm)", lambda row: row.noise_m / MM, "temporal noise of the averaged distance"),
-        Column(
-            "residual_mm",
-            "residual (mm)",
-            lambda row: float(np.sqrt(np.nanmean(row.residual_m**2))) / MM,
-            "rms difference between the range and a smooth fit: pattern, shape and noise",
-        ),
+        Column("residual_mm", "residual (mm)", lambda row: float(np.sqrt(np.nanmean(row.residual_m**2))) / MM,
+               "rms difference between the range and a smooth fit: pattern, shape and noise"),
     ),
     formats=("csv",),
-)
+)  # fmt: skip
 
 FLAT_FIGURES = Table(
     "flat_field",

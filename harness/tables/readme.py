@@ -45,8 +45,7 @@ def results_readme() -> Iterator[str]:
         yield from ("", f"## {title}", "", "| file | content |", "|---|---|")
         yield from (f"| `{output.name}` | {output.note} |" for output in FILES if output.of == group)
     yield TABLES
-    of_trials = [table for table in STORED if table not in STUDY_ONLY]
-    yield from _tables("Trials", of_trials)
+    yield from _tables("Trials", [table for table in STORED if table not in STUDY_ONLY])
     yield from _tables("Summaries of an experiment that is not a study", SUMMARISED)
     yield from _tables("Detection limits of a study", STUDY_TABLES)
     yield from _tables("Efficiency of a study's detectors", EFFICIENCY_TABLES)

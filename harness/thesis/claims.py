@@ -120,9 +120,8 @@ def _c3(case: Case) -> tuple[Answer, str]:
 
 def _between_units(case: Case, rows: pd.DataFrame) -> str:
     """Return the error of the mean size of the holes found (``rows``) in standard deviations between units."""
-    means = case.units[case.units["frames"] == MANY].pivot(
-        index="variant", columns="hole", values="extent_diameter_mean_mm"
-    )
+    many = case.units[case.units["frames"] == MANY]
+    means = many.pivot(index="variant", columns="hole", values="extent_diameter_mean_mm")
     if len(means) < FEWEST_UNITS:
         return "Between units: not judged, because all repeats have the same unit's fixed pattern."
     true = rows.set_index("hole")["true_diameter_mm"]

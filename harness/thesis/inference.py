@@ -26,8 +26,7 @@ def posterior_of(summary: pd.DataFrame, axes: Sequence[str]) -> pd.DataFrame | N
     Return None for another target, too few set-ups, several cameras, or without both numbers of frames. The probability
     of a fact that only one kind of hole has is conditional on this kind."""
     rows = summary[summary["frames"].isin([FEW, MANY]) & summary["hole"].isin(THESIS_HOLES)]
-    whole = rows.groupby("variant")["hole"].transform("size") == 2 * len(THESIS_HOLES)
-    rows = rows[whole]
+    rows = rows[rows.groupby("variant")["hole"].transform("size") == 2 * len(THESIS_HOLES)]
     if CAMERA in axes or rows["variant"].nunique() < FEWEST_SET_UPS:
         return None
     chance = (rows["detected"] + 0.5) / (rows["n"] + 1)

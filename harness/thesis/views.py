@@ -59,8 +59,7 @@ def _is_in_one_plane(rows: pd.DataFrame, noise_mm: float) -> bool | None:
     across = maps.per_pair(rows, "tre_across_mm").to_numpy(float)
     if len(across) < FEWEST_PAIRS:
         return None
-    interval = intervals.bootstrap(lambda chosen: np.median(across[chosen], axis=1), len(across))
-    over = interval.over(noise_mm)
+    over = intervals.bootstrap(lambda chosen: np.median(across[chosen], axis=1), len(across)).over(noise_mm)
     return None if over is None else not over
 
 

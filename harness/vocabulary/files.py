@@ -60,8 +60,7 @@ def bounded_bytes(path: Path, at_most: int) -> bytes:
 
 def shipped(kind: str) -> Path:
     """Return the folder ``experiments`` or ``baselines``: of tofpod's checkout, or else of the environment."""
-    checkout = Path(__file__).resolve().parents[2]
-    folder = checkout / ("results/baselines" if kind == "baselines" else kind)
+    folder = Path(__file__).resolve().parents[2] / ("results/baselines" if kind == "baselines" else kind)
     return folder if folder.is_dir() else Path(sysconfig.get_path("data")) / "share" / "tofpod" / kind
 
 

@@ -38,8 +38,7 @@ def read_mesh(file: str) -> Any:
     try:
         content = bounded_bytes(path, MOST_BYTES)
         with limited_memory():
-            kind = path.suffix.lower().removeprefix(".")
-            mesh: Any = trimesh.load(io.BytesIO(content), file_type=kind, force="mesh")
+            mesh: Any = trimesh.load(io.BytesIO(content), file_type=path.suffix.lower().removeprefix("."), force="mesh")
     except OSError as error:
         raise UserError(f"{file}: cannot be read ({error.strerror})") from error
     except (ValueError, KeyError, IndexError, TypeError, NotImplementedError) as error:

@@ -12,9 +12,9 @@ def canonical_json(value: Any) -> str:
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
 
 
-def digest(value: Any, length: int = 16) -> str:
-    """Return the hexadecimal BLAKE2b digest of plain data (``length`` hex digits)."""
-    return hashlib.blake2b(canonical_json(value).encode(), digest_size=32).hexdigest()[:length]
+def digest(value: Any) -> str:
+    """Return the first 16 hexadecimal digits of the BLAKE2b digest of plain data."""
+    return hashlib.blake2b(canonical_json(value).encode(), digest_size=32).hexdigest()[:16]
 
 
 def random_stream(seed: int, *labels: str | int) -> np.random.Generator:

@@ -69,8 +69,7 @@ def smooth_field(white: np.ndarray, length_px: float) -> np.ndarray:
         responses.append(scipy.fft.fft(response / np.linalg.norm(response)).astype(np.complex64))
     down, across = responses
     spectrum = scipy.fft.rfft2(white)
-    smooth = scipy.fft.irfft2(spectrum * down[:, None] * across[: spectrum.shape[1]], white.shape)
-    return np.asarray(smooth, float)
+    return np.asarray(scipy.fft.irfft2(spectrum * down[:, None] * across[: spectrum.shape[1]], white.shape), float)
 
 
 SPECTRUM, LEAST_POWER, FAINT = 256, 1e-3, 0.05

@@ -75,10 +75,9 @@ def _board_problems(board: custom.BoardConfig) -> list[str]:
         if board.thickness_mm * MM <= 2 * (depth_m := float(-face.height_m(x, y).min())):
             return [f"board: {board.thickness_mm:g} mm is too thin for a rough face of {depth_m / MM:.3g} mm depth"]
     elif board.thickness_mm * MM * tightest > THICKEST_BEND:
-        small = (
-            f"radius of curvature {1 / tightest / MM:.3g} mm is too small for a thickness of {board.thickness_mm:g} mm"
-        )
-        return [f"board: {small}; it must be {board.thickness_mm / THICKEST_BEND:g} mm or more"]
+        small = f"radius of curvature {1 / tightest / MM:.3g} mm is too small for a thickness of"
+        least = f"{board.thickness_mm:g} mm; it must be {board.thickness_mm / THICKEST_BEND:g} mm or more"
+        return [f"board: {small} {least}"]
     return []
 
 

@@ -272,8 +272,7 @@ class DrawnTargetConfig(Config):
         if isinstance(board.shape, custom.RoughConfig):
             own = {"seed": int(stream("roughness").integers(2**32))}
             board = board.model_copy(update={"shape": board.shape.model_copy(update=own)})
-        grain_seed = int(stream("grain").integers(2**32))
-        material = custom.MaterialConfig(**self.material.model_dump(), grain_seed=grain_seed)
+        material = custom.MaterialConfig(**self.material.model_dump(), grain_seed=int(stream("grain").integers(2**32)))
         placed = self._posed(*within("distance", self.distance_jitter_mm, 1), *pose)
         config = custom.TargetConfig(board=board, material=material, pose=placed, **common)
         if self.backing is None or self.backing.size_mm is not None:

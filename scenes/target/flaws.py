@@ -82,7 +82,7 @@ class _FlawConfig(PlacedConfig):
 
     @abstractmethod
     def relief(self) -> Relief:
-        """Return the depth over the damage's frame."""
+        """Return the depth over the damage's frame, negative where it stands out of the face."""
 
 
 class _LongConfig(_FlawConfig):
@@ -114,7 +114,6 @@ class SlotConfig(_LongConfig):
     depth_mm: Depth | None = Field(None, description="null: through the board")
 
     def relief(self) -> Relief:
-        """Return the depth over the slot's frame."""
         s, t, _ = self._grid()
         return Relief(s, t, np.full(s.shape, np.nan if self.depth_mm is None else self.depth_mm * MM))
 
@@ -131,7 +130,6 @@ class GougeConfig(_LongConfig):
     run_out_mm: Annotated[float, Field(ge=0.1, le=1e3)] = 5.0
 
     def relief(self) -> Relief:
-        """Return the depth over the gouge's frame."""
         s, t, across = self._grid()
         section = 1 - np.abs(across) if self.section == "v" else 1 - across**2
         run_out = min(self.run_out_mm, self.length_mm / 2) * MM
@@ -154,7 +152,6 @@ class RoundConfig(_FlawConfig):
         return self.kind != "protrusion"
 
     def relief(self) -> Relief:
-        """Return the depth over the frame, negative where it stands out."""
         s, t, ring = _disc(self.diameter_mm * MM / 2)
         height = (1 + np.cos(np.pi * ring)) / 2 if self.pressed else 1 - ring**2
         return Relief(s, t, (1.0 if self.kind == "pressed_dent" else -1.0) * self.depth_mm * MM * height)
@@ -174,7 +171,6 @@ class CorrosionConfig(_FlawConfig):
     seed: Seed = 1
 
     def relief(self) -> Relief:
-        """Return the depth over the patch's frame."""
         rng, radius_m = random_stream(self.seed, "corrosion"), self.diameter_mm * MM / 2
         s, t, ring = _disc(1.0)
         angle, turn = np.arctan2(t, s), np.linspace(0, 2 * np.pi, 721)
@@ -205,7 +201,6 @@ class ChipConfig(_FlawConfig):
     angle_deg: Literal[0, 90, 180, -90]
 
     def relief(self) -> Relief:
-        """Return the depth over the chip's frame."""
         u, v = np.meshgrid(CHIP_ARC * np.sin(np.linspace(-1, 1, ALONG + 1) * np.pi / 2), np.linspace(1, 0, ACROSS + 1))
         v = np.sin(v * np.pi / 2)
         s, t = u * self.length_mm * MM / 2, -v * np.sqrt(1 - u**2) * self.width_mm * MM

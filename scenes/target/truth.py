@@ -256,8 +256,7 @@ class Damage:
         return float(np.linalg.norm(self.outline_board_m - self.centre_board_m[:2], axis=1).max())
 
     def within(self, x_m: np.ndarray, y_m: np.ndarray, margin_m: float = 0.0) -> np.ndarray:
-        """Return which places in plan lie inside the outline, or within ``margin_m`` of it; the shape is that of
-        ``x_m``."""
+        """Return which places in plan lie inside the outline, or within ``margin_m`` of it; shaped like ``x_m``."""
         apart = np.sqrt((x_m - self.centre_board_m[0]) ** 2 + (y_m - self.centre_board_m[1]) ** 2)
         with np.errstate(invalid="ignore"):
             near = np.asarray(apart < self.reach_m + margin_m)

@@ -119,8 +119,7 @@ def fit_hit_miss(
             place[1] = 0.0
         notes = ("no miss is larger than any hit (separation), so Firth's penalised likelihood is used",)
     else:
-        start = np.array([float(link_ppf(link, np.array(rate))), 0.0])
-        place = maxima(several, start, EXACT)[0]
+        place = maxima(several, np.array([float(link_ppf(link, np.array(rate))), 0.0]), EXACT)[0]
     if place[1] <= 0:
         fix = "check that hits are 1 and misses 0, and that size is what detection depends on"
         raise UserError("the probability of detection does not grow with size: the slope is not positive", fix=fix)
@@ -143,14 +142,12 @@ def fit_hit_miss(
     return HitMissFit(curve, *numbers, method, notes, centre, spread, place, replace(single, penalty=penalty))
 
 
-def choose_model(
-    size: ArrayLike, hit: ArrayLike, *, links: Sequence[str] = LINKS, inspections: ArrayLike | None = None
-) -> tuple[HitMissFit, ...]:
+def choose_model(size: ArrayLike, hit: ArrayLike, *, inspections: ArrayLike | None = None) -> tuple[HitMissFit, ...]:
     """Fit every link with a and, if all sizes are positive, with ln a; least deviance first. The order does not depend
     on the limits: a model chosen because its limit is small has no coverage."""
     logs = (False, True) if np.all(np.asarray(size, float) > 0) else (False,)
     fit = partial(fit_hit_miss, size, hit, inspections=inspections)
-    fits = [fit(link=link, log_size=log_size) for log_size, link in product(logs, links)]
+    fits = [fit(link=link, log_size=log_size) for log_size, link in product(logs, LINKS)]
     return tuple(sorted(fits, key=lambda fit: fit.deviance))
 
 

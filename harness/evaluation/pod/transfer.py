@@ -231,8 +231,7 @@ class Mapod:
     @cached_property
     def sizes(self) -> np.ndarray:
         """Sizes at which the curves are drawn."""
-        simulated = self.simulated.sizes
-        return drawn_sizes(np.append(self.read.size, simulated[[0, -1]]), self.simulated.curve.log_size, ())
+        return drawn_sizes(np.append(self.read.size, self.simulated.sizes[[0, -1]]), self.simulated.curve.log_size, ())
 
     @cached_property
     def band(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -93,8 +93,7 @@ def efficiency_of(limit: SetUpLimit, ideal: IdealDamages) -> Efficiency:
         ideal_index = (np.where(known, ideal.needed[:, kept], 0.0) @ weights.T) / (known @ weights.T)
     curve, why, needed = None, "", np.full((2, 1 + DRAWS), np.nan)
     try:
-        fit = fit_hit_miss(index[which], hit, link=LINK, log_size=True, inspections=which)
-        curve = fit.curve
+        curve = fit_hit_miss(index[which], hit, link=LINK, log_size=True, inspections=which).curve
         targets = Targets(ideal.board[kept], index, hits, inspections)
         needed[:, 0] = [curve.size_at(share) for share in SHARES]
         needed[:, 1:] = refitted_sizes(targets, curve, SHARES)

@@ -183,9 +183,8 @@ def maxima_per_pixel(correlated: np.ndarray, thresholds: np.ndarray) -> np.ndarr
 
 def threshold_for(correlated: np.ndarray, maxima: float) -> float:
     """Return the threshold with this expected number of maxima per pixel."""
-    return float(
-        optimize.brentq(lambda t: np.log(maxima_per_pixel(correlated, np.array([t]))[0] / maxima), *RANGE, xtol=1e-4)
-    )
+    root = optimize.brentq(lambda t: np.log(maxima_per_pixel(correlated, np.array([t]))[0] / maxima), *RANGE, xtol=1e-4)
+    return float(root)
 
 
 def needed_indices(correlated: np.ndarray, threshold: float) -> np.ndarray:

@@ -206,9 +206,8 @@ def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | No
         if p < 0.05 and rises:
             deviance, b, terms = least, bent, 4
         elif p < 0.05:
-            note += (
-                f"{'; ' if note else ''}{seen.size_of} and depth interact (p = {p:.2g}), which the surface leaves out"
-            )
+            interaction = f"{seen.size_of} and depth interact (p = {p:.2g}), which the surface leaves out"
+            note = "; ".join(filter(None, (note, interaction)))
     level, columns = float(link_ppf(link, np.array(POD))), crossed[:, :terms]
     blocks = weights_in_blocks(draws, (seen.board, "damaged"))
     again = np.concatenate([_coefficients(columns, w * hit, w * ~hit, link, b[:terms]) for (w,) in blocks])
@@ -331,8 +330,7 @@ def limit_of(record: SetUpRecord, *, draws: int = DRAWS, tested: bool = False) -
             if max(at_least_one) > 1:
                 over_boards = largest_bound(statement.fits, at_least_one)
         if apart.unit is not None:
-            rows = (apart.size_mm, seen.hit, target_names(seen), apart.unit)
-            units = over_units(*rows, statement.curve, over_boards)
+            units = over_units(apart.size_mm, seen.hit, target_names(seen), apart.unit, statement.curve, over_boards)
     elif n and seen.hit.all():
         # If the POD of the 29th smallest target were below 90 %, so would that of the 28 smaller ones, and all 29
         # would be found in less than 5 % of studies. So a90 lies below its size, provided that POD grows with size.

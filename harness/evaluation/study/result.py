@@ -147,8 +147,7 @@ def _inspected(limits: Sequence[SetUpLimit], sweep: Mapping[str, Sequence[Any]])
             reasons.setdefault(text, []).append(limit.record.label)
     whose = {text: "" if len(reasons) == 1 else f"{', '.join(labels)}: " for text, labels in reasons.items()}
     words = ([in_words(f"{path}={canonical_json(value)}") for value in values] for path, values in sweep.items())
-    axes = (f"Varied: {'; '.join(each)}." for each in words)
-    return (*(f"{labels}{text}." for text, labels in whose.items()), *axes)
+    return (*(f"{labels}{text}." for text, labels in whose.items()), *(f"Varied: {'; '.join(each)}." for each in words))
 
 
 def _departures(

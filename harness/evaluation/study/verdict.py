@@ -77,10 +77,10 @@ class Comparison:
         return tuple(row for row in self.rows if row.mark in marks)
 
 
-def fewest_boards(set_ups: int, alpha: float = ALPHA) -> int:
+def fewest_boards(set_ups: int) -> int:
     """Return the fewest shared boards with which the tests can show that one of the set-ups is worse. If it is worse on
     every board, the p-value is 1 in 2^boards, multiplied by the questions of all set-ups and the limit's two tests."""
-    return int(np.floor(np.log2(2 * QUESTIONS * set_ups / alpha))) + 1
+    return int(np.floor(np.log2(2 * QUESTIONS * set_ups / ALPHA))) + 1
 
 
 def compare_studies(first: StudyRecord, second: StudyRecord, alpha: float = ALPHA) -> Comparison:

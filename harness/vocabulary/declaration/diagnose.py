@@ -32,8 +32,7 @@ def validated(model: type[C], source: Source, splices: shape.Splices) -> tuple[C
     declared, data, config = shape.Declared(model, source.data, splices), source.data, None
     for path, spliced in splices.items():
         try:
-            filled = spliced.from_data(shape.get(data, path) or {})
-            data = with_value_at(data, path, filled.to_data())
+            data = with_value_at(data, path, spliced.from_data(shape.get(data, path) or {}).to_data())
         except ValidationError as error:
             problems += problems_of(error, declared, source, path)
     try:
@@ -160,12 +159,12 @@ def _problem(path: KeyPath, error: Any, declared: shape.Declared, source: Source
     return Problem(f"`{dotted(path)}` is {shown(value)}: {text[0].lower()}{text[1:]}", place, legal, fix=fix)
 
 
-def nearest(word: object, words: Iterable[object], cutoff: float = 0.6) -> str | None:
+def nearest(word: object, words: Iterable[object]) -> str | None:
     """Return which of ``words`` the user most likely meant, ignoring case and dashes: the most similar spelling, else
     the shortest that contains the word (three letters or more), as realsense_l515 contains l515; None if neither."""
     folded = {str(known).lower().replace("-", "_"): str(known) for known in words}
     sought = str(word).lower().replace("-", "_")
-    found = difflib.get_close_matches(sought, folded, n=1, cutoff=cutoff)
+    found = difflib.get_close_matches(sought, folded, n=1)
     if not found and len(sought) >= LEAST_HELD:
         found = sorted((known for known in folded if sought in known), key=lambda known: (len(known), known))
     return folded[found[0]] if found else None
