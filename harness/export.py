@@ -82,9 +82,13 @@ def main(arguments: argparse.Namespace, command: str) -> int:
 
 
 def _write_beside(
-    folder: Path, arguments: argparse.Namespace, experiment: Experiment, targets: list[TargetConfig],
-    views: tuple[ExportedView, ...], command: str,
-) -> None:  # fmt: skip
+    folder: Path,
+    arguments: argparse.Namespace,
+    experiment: Experiment,
+    targets: list[TargetConfig],
+    views: tuple[ExportedView, ...],
+    command: str,
+) -> None:
     """Write the truth, the nominal poses for a registration, the declaration, and the provenance."""
     import numpy as np
 

@@ -99,9 +99,14 @@ def open_depth_folder(folder: Path, given: Given) -> Recording:
 
 
 def open_depth_list(
-    depths: Sequence[Path], given: Given, name: str, root: Path | None = None, colours: Sequence[Path | None] = (),
-    is_tum: bool = False, note: str = "",
-) -> Recording:  # fmt: skip
+    depths: Sequence[Path],
+    given: Given,
+    name: str,
+    root: Path | None = None,
+    colours: Sequence[Path | None] = (),
+    is_tum: bool = False,
+    note: str = "",
+) -> Recording:
     """Open depth PNGs in the order given. ``root``: folder of the capture, in or beside which their lens is sought.
     ``colours``: the colour picture of each, if any. Raises UserError if their lens is not known."""
     root = root or depths[0].parent

@@ -167,10 +167,16 @@ BLUR_PX = 0.5  # motion by this much of a pixel blurs an edge more than the sens
 
 
 def _recording(
-    path: Path, given: Given, read: Callable[[], Iterator[Frame]], size: tuple[int, int],
-    scaled_lens: Callable[[], Lens], files: tuple[Path, ...], poses: tuple[np.ndarray, np.ndarray, str], scale_m: float,
+    path: Path,
+    given: Given,
+    read: Callable[[], Iterator[Frame]],
+    size: tuple[int, int],
+    scaled_lens: Callable[[], Lens],
+    files: tuple[Path, ...],
+    poses: tuple[np.ndarray, np.ndarray, str],
+    scale_m: float,
     writer: str,
-) -> Recording:  # fmt: skip
+) -> Recording:
     """Return the recording of either program. ``size``: width, height. ``poses``: places, quaternions, their source."""
     lens, lens_files = lens_for(str(path), given, *size, scaled_lens)
     notes = () if lens_files or given.lens else (f"lens scaled from the colour pixels to {size[0]} x {size[1]}",)

@@ -134,9 +134,14 @@ KNOWN_MODELS = ("", "none", "pinhole", "plumb_bob", "brown_conrady", "rational_p
 
 
 def lens_for(
-    name: str, given: Given, width: int, height: int, own: Callable[[], Lens | None] = lambda: None,
-    beside: Sequence[Path] = (), hint: str = "",
-) -> tuple[Lens, tuple[Path, ...]]:  # fmt: skip
+    name: str,
+    given: Given,
+    width: int,
+    height: int,
+    own: Callable[[], Lens | None] = lambda: None,
+    beside: Sequence[Path] = (),
+    hint: str = "",
+) -> tuple[Lens, tuple[Path, ...]]:
     """Return the lens of depth images and the files that state it: --intrinsics, the named camera's, the capture's
     ``own``, or the first file named like a lens in the folders ``beside``. Raises UserError if no lens is stated
     (``hint`` ends its advice), or only that of other images."""

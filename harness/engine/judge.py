@@ -45,9 +45,16 @@ class JudgedCloud:
 
 
 def judge(
-    known: KnownCloud, detector_name: str, settings_json: str, threshold: float | None, radius_m: float, *,
-    overlap: float | None = None, hole_free: bool, learned: str | None = None,
-) -> JudgedCloud:  # fmt: skip
+    known: KnownCloud,
+    detector_name: str,
+    settings_json: str,
+    threshold: float | None,
+    radius_m: float,
+    *,
+    overlap: float | None = None,
+    hole_free: bool,
+    learned: str | None = None,
+) -> JudgedCloud:
     """Judge a detector on a cloud; without a threshold, only find the quiet threshold. ``learned``: path of a file."""
     cloud = known.cloud
     detector = detector_for(known, detector_name, settings_json, hole_free=hole_free, learned=learned)
@@ -117,9 +124,13 @@ def smeared(outlines: Sequence[np.ndarray], shape: tuple[int, ...], *, grid: boo
 
 
 def matched_places(
-    lines_m: Sequence[np.ndarray], areas: Sequence[np.ndarray], placed: Callable[[np.ndarray], np.ndarray],
-    levels: Sequence[Findings], radius_m: float, overlap: float | None,
-) -> list[tuple[dict[int, int], int]]:  # fmt: skip
+    lines_m: Sequence[np.ndarray],
+    areas: Sequence[np.ndarray],
+    placed: Callable[[np.ndarray], np.ndarray],
+    levels: Sequence[Findings],
+    radius_m: float,
+    overlap: float | None,
+) -> list[tuple[dict[int, int], int]]:
     """Match as `matched` does. ``lines_m``: centre lines of the damages. ``areas``: their masks (none without an
     ``overlap``). ``placed``: maps centres onto the face. ``levels``: the detections at each of several thresholds."""
     places_m = placed(np.concatenate([found.centres_m for found in levels]))

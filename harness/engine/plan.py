@@ -278,9 +278,13 @@ def unit_of(camera: CameraConfig, seed: int, role: Role, number: int) -> CameraC
 
 
 def batch_of(
-    declared: TargetConfig, role: Role, source: SimulatedSource, cache: Path, board: int | None = None,
+    declared: TargetConfig,
+    role: Role,
+    source: SimulatedSource,
+    cache: Path,
+    board: int | None = None,
     units: tuple[CameraConfig, ...] = (),
-) -> Batch:  # fmt: skip
+) -> Batch:
     """Return the trials of a role with one declared target, which shows its damage only in the role "damaged"."""
     target = declared.at_wavelength(camera_of(source.camera).optics.wavelength_nm)
     poses = (target.pose,) if source.views is None else poses_of(source.views, target.pose)

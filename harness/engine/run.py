@@ -144,9 +144,14 @@ MOST_TRACEBACKS = 200  # failures whose traceback stays in memory; the journal h
 
 
 def run_plan(
-    plan: SweepPlan, journal: Journal, engine: JobEngine, report: Report, *, shard: Shard = WHOLE,
+    plan: SweepPlan,
+    journal: Journal,
+    engine: JobEngine,
+    report: Report,
+    *,
+    shard: Shard = WHOLE,
     retry_failed: bool = False,
-) -> Outcome:  # fmt: skip
+) -> Outcome:
     """Run the trials that the journal lacks (with ``retry_failed``, also those that failed), and draw a whole sweep's
     pictures. A job that fails becomes a `Failure`; trials that need it are skipped. Raises UserError if nothing can be
     written or the engine is gone. KeyboardInterrupt passes through; the journal has all finished trials."""

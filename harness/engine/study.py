@@ -112,9 +112,14 @@ def _records(journal: Journal, outcome: Outcome) -> Iterator[dict[str, Any]]:
 
 
 def _write_study(
-    folder: Path, experiment: Experiment, plan: SweepPlan, outcome: Outcome, tables: ResultTables,
-    provenance: dict[str, Any], engine: JobEngine,
-) -> list[str | Grid]:  # fmt: skip
+    folder: Path,
+    experiment: Experiment,
+    plan: SweepPlan,
+    outcome: Outcome,
+    tables: ResultTables,
+    provenance: dict[str, Any],
+    engine: JobEngine,
+) -> list[str | Grid]:
     """Write a study's record, tables and report. Return what the terminal shows."""
     failed = failures_by_point(plan, outcome.failures, outcome.thresholds)
     study = record_of(experiment, plan, tables, failed, provenance)

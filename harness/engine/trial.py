@@ -352,9 +352,14 @@ def capture_of(set_up: SetUp, number: int, task: TrialTask, frames: int) -> Simu
 
 
 def _point_rows(
-    task: TrialTask, first: SetUp, views: dict[int, Cloud], maps: MapMaker | None, point: PointTask,
-    done: dict[str, Rows], seconds: dict[str, float],
-) -> Rows:  # fmt: skip
+    task: TrialTask,
+    first: SetUp,
+    views: dict[int, Cloud],
+    maps: MapMaker | None,
+    point: PointTask,
+    done: dict[str, Rows],
+    seconds: dict[str, float],
+) -> Rows:
     """Return the rows of one point, by table. ``done``: rows of earlier points, reused if their inputs are the same."""
     common: dict[str, Any] = {"variant": point.variant, "frames": point.frames, "repeat": task.repeat}
     if task.board is not None:

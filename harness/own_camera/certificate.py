@@ -97,9 +97,13 @@ def certified(found: Characteristics, poses: Sequence[np.ndarray] | None) -> Ite
 
 
 def write_certificate(
-    folder: Path, found: Characteristics, about: dict[str, str], poses: Sequence[np.ndarray] | None,
-    study: StudyRecord | None, command: str,
-) -> None:  # fmt: skip
+    folder: Path,
+    found: Characteristics,
+    about: dict[str, str],
+    poses: Sequence[np.ndarray] | None,
+    study: StudyRecord | None,
+    command: str,
+) -> None:
     """Write certificate.html and .json. ``about`` states unit, mode, firmware and warm-up. May raise UserError."""
     rows, limits = list(certified(found, poses)), [limit_of(set_up) for set_up in study.set_ups] if study else []
     surfaces = list(of_surfaces(found))

@@ -104,9 +104,16 @@ def beside(found: Characteristics, twin: Characteristics, known: Characteristics
 
 
 def write_page(
-    path: Path, sources: Mapping[str, Characteristics], rows: list[OwnFigure], title: str, answer: str, known: str,
-    command: str, facts: Mapping[str, Any], warnings: Sequence[str],
-) -> None:  # fmt: skip
+    path: Path,
+    sources: Mapping[str, Characteristics],
+    rows: list[OwnFigure],
+    title: str,
+    answer: str,
+    known: str,
+    command: str,
+    facts: Mapping[str, Any],
+    warnings: Sequence[str],
+) -> None:
     """Print the figures; write a page, its tables and provenance.json with further ``facts``. ``sources`` are measured,
     simulated, and perhaps those of the ``known`` camera. Raises UserError if they cannot be written."""
     found, folder = sources[MEASURED], path.parent

@@ -98,9 +98,13 @@ def finding_of(number: int, evidence: Evidence, detection: Detection, measured: 
 
 
 def write_findings(
-    folder: Path, judged: Judged, about: Mapping[str, Any], title: str, cloud_name: str = outputs.CLOUD.name,
+    folder: Path,
+    judged: Judged,
+    about: Mapping[str, Any],
+    title: str,
+    cloud_name: str = outputs.CLOUD.name,
     beside: Mapping[str, Callable[[Path], object]] | None = None,
-) -> tuple[Path, ...]:  # fmt: skip
+) -> tuple[Path, ...]:
     """Write all files of a run to ``folder``, or none. The JSON holds the plain data ``about`` besides the findings;
     ``beside`` maps names of further files to functions that write them. Raises UserError if writing fails."""
     is_new, (cloud, missing, detections) = not folder.exists(), (judged.cloud, judged.missing, judged.detections)

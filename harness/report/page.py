@@ -301,9 +301,15 @@ def _costs_grid(costs: pd.DataFrame) -> Grid:
 
 
 def write_report(
-    folder: Path, tables: ResultTables, examples: Sequence[ExampleCloud | MappedExample], provenance: Mapping[str, Any],
-    experiment_yaml_text: str, title: str, facts: Mapping[str, Any] | None = None, found: Summaries | None = None,
-) -> Path:  # fmt: skip
+    folder: Path,
+    tables: ResultTables,
+    examples: Sequence[ExampleCloud | MappedExample],
+    provenance: Mapping[str, Any],
+    experiment_yaml_text: str,
+    title: str,
+    facts: Mapping[str, Any] | None = None,
+    found: Summaries | None = None,
+) -> Path:
     """Write ``folder/report.html`` and return its path: the page of a set-up, of several set-ups, or of maps, with a
     page for each map of ``examples`` beside it. `harness.report.blocks.closing` describes ``provenance``; ``facts`` is
     the resolved experiment as plain data, ``found`` the result of `summaries`. Claims need the thesis' target.

@@ -307,9 +307,14 @@ def on_surface_tolerance_m(sigma_m: float, step_m: float) -> float:
 
 
 def edge_widths(
-    z_m: np.ndarray, front_z_m: np.ndarray, back_z_m: np.ndarray, from_edge_px: np.ndarray, tolerance_m: float,
-    reach_px: float, across: int,
-) -> dict[str, np.ndarray]:  # fmt: skip
+    z_m: np.ndarray,
+    front_z_m: np.ndarray,
+    back_z_m: np.ndarray,
+    from_edge_px: np.ndarray,
+    tolerance_m: float,
+    reach_px: float,
+    across: int,
+) -> dict[str, np.ndarray]:
     """Return widths (n,) in pixels within ``reach_px`` of an edge that lines of pixels along the axis ``across`` cross,
     for each of the frames (n, h, w): the ``gap`` without a range, the ``flying`` pixels with a range off both surfaces,
     and the share of lines ``with_flying`` pixels. All but the gap are NaN if noise hides the step. ``front_z_m`` and

@@ -56,7 +56,7 @@ OWN_FIGURES = Table(
     ),
     formats=("csv",),
     left=3,
-)  # fmt: skip
+)
 
 OWN_CURVES = Table(
     "curves",

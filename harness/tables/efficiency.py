@@ -29,20 +29,33 @@ EFFICIENCY = Table(
         Column("frames", "", "limit.record.frames", "number of averaged frames"),
         Column("detector", "detector", "limit.record.detector", "name of the detector"),
         Column("detector_version", "", "limit.record.detector_version", "version of the detector"),
-        Column("ideal_a50_mm", "ideal a50 (mm)", lambda row: _ideal_size(row.half), "diameter that the ideal observer "
-               "finds 50 % of the time, with its 95 % interval over boards", interval=True),
+        Column(
+            "ideal_a50_mm",
+            "ideal a50 (mm)",
+            lambda row: _ideal_size(row.half),
+            "diameter that the ideal observer finds 50 % of the time, with its 95 % interval over boards",
+            interval=True,
+        ),
         Column("ideal_is_at_most", "", "half.at_most", "whether it misses nothing: its sizes are then upper bounds"),
         Column("a50_mm", "a50 (mm)", lambda row: a50_of(row.limit), "the detector's a50", interval=True),
         Column("ideal_a90_mm", "ideal a90 (mm)", lambda row: _ideal_size(row.most), IDEAL_A90, interval=True),
         Column("a90_mm", "a90 (mm)", lambda row: a90_of(row.limit), "the detector's a90", interval=True),
         Column("ideal_index_50", "", "half.ideal_index", f"{INDEX} that it finds 50 % of the time"),
         Column("index_50", "d' at 50 %", ("half.index", "half.index_interval"), INDEX_50),
-        Column("efficiency_50_share", "efficiency at 50 %", ("half.efficiency", "half.interval"),
-               "(ideal_index_50 / index_50) squared, interval over boards"),
+        Column(
+            "efficiency_50_share",
+            "efficiency at 50 %",
+            ("half.efficiency", "half.interval"),
+            "(ideal_index_50 / index_50) squared, interval over boards",
+        ),
         Column("ideal_index_90", "", "most.ideal_index", f"{INDEX} that it finds 90 % of the time"),
         Column("index_90", "d' at 90 %", ("most.index", "most.index_interval"), INDEX_90),
-        Column("efficiency_90_share", "efficiency at 90 %", ("most.efficiency", "most.interval"),
-               "(ideal_index_90 / index_90) squared, interval over boards"),
+        Column(
+            "efficiency_90_share",
+            "efficiency at 90 %",
+            ("most.efficiency", "most.interval"),
+            "(ideal_index_90 / index_90) squared, interval over boards",
+        ),
         replace(CALLS[0], value=("limit.false_calls.rate_per_m2", "limit.false_calls.interval_per_m2")),
         Column("units", "", "ideal.units", "number of units whose noise the ideal observer knows"),
         Column("kurtosis", "", "ideal.kurtosis", "excess kurtosis of that noise; 0 if Gaussian"),
@@ -50,7 +63,7 @@ EFFICIENCY = Table(
     ),
     title="efficiency: detectors compared with the ideal observer",
     left=2,
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)

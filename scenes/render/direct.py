@@ -225,9 +225,13 @@ def _slopes_kept(off, steps, axes, weights, slopes):  # type: ignore[no-untyped-
 
 
 def direct_light(
-    lit: LitScene, slopes: np.ndarray, footprint: Quadrilaterals, frequencies_hz: Frequencies,
-    closely: np.ndarray | None = None, roughly: np.ndarray | None = None,
-) -> DirectLight:  # fmt: skip
+    lit: LitScene,
+    slopes: np.ndarray,
+    footprint: Quadrilaterals,
+    frequencies_hz: Frequencies,
+    closely: np.ndarray | None = None,
+    roughly: np.ndarray | None = None,
+) -> DirectLight:
     """Return the direct light of every pixel of a region with central rays ``slopes`` (h, w, 2). If the rays to a
     pixel's centre and corners meet one evenly lit plane, its light follows from these. Other pixels are sampled by
     sub-rays: a few on a curved surface, many where the footprint meets an edge or the edge of a shadow, in the pixels

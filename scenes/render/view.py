@@ -206,9 +206,16 @@ class _Walk:
         return np.stack([*(values[2 * k] + 1j * values[2 * k + 1] for k in range(lines)), values[-1]])
 
     def _vertex(
-        self, sample: Any, vertex: Any, before: Any, before_normal: Any, direction: Any, length: Any, throughput: Any,
+        self,
+        sample: Any,
+        vertex: Any,
+        before: Any,
+        before_normal: Any,
+        direction: Any,
+        length: Any,
+        throughput: Any,
         totals: list[Any],
-    ) -> tuple[Any, ...]:  # fmt: skip
+    ) -> tuple[Any, ...]:
         """Continue at the next vertex, or begin the next path. ``length``: that up to ``before``, the ray's start."""
         lit, mi, dr, fresh = self.lit, self.lit.mi, self.lit.dr, vertex == 0
         which = *self._uniform(sample, 0), self._uniform(sample, 2)[0]
@@ -409,9 +416,14 @@ def render_view(target: Target, optics: Optics, config: RenderConfig) -> NoiseFr
 
 
 def indirect_light(
-    lit: LitScene, target: Target, optics: Optics, slopes: np.ndarray, direct: DirectLight, inside: np.ndarray,
+    lit: LitScene,
+    target: Target,
+    optics: Optics,
+    slopes: np.ndarray,
+    direct: DirectLight,
+    inside: np.ndarray,
     config: RenderConfig,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray]:
     """Return indirect phasors (f + 1, h, w) and their noise in metres of range (h, w). That of the face comes from its
     nodes, all other from paths through the pixel's sub-rays; ``inside`` (h, w) the outline, noise sets their number."""
     frequencies, shape = optics.frequencies_hz, direct.range_m.shape

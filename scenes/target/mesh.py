@@ -198,9 +198,15 @@ def _sagitta_m(config: TargetConfig) -> float:
 
 
 def sheet(
-    face: Face, size_m: tuple[float, float], top_m: float, bottom_m: float, sagitta_m: float,
-    centre_m: tuple[float, float] = (0.0, 0.0), angle_rad: float = 0.0, flat_back: bool = False,
-) -> trimesh.Trimesh:  # fmt: skip
+    face: Face,
+    size_m: tuple[float, float],
+    top_m: float,
+    bottom_m: float,
+    sagitta_m: float,
+    centre_m: tuple[float, float] = (0.0, 0.0),
+    angle_rad: float = 0.0,
+    flat_back: bool = False,
+) -> trimesh.Trimesh:
     """Return a watertight sheet over a rectangle in plan, between two parallels of the face (offsets along normals).
     Its facets stay within ``sagitta_m`` of the face; a flat sheet has 12 triangles. ``flat_back``: its lower side is a
     plane. Board frame. Raises UserError if the face needs more than MAX_CELLS."""
