@@ -9,24 +9,25 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy import special, stats
-from synthetic_study import PIXEL_GRID, RADIUS_MM, THRESHOLD, SetUp, Study, Tables, study_record, study_tables
+from synthetic_study import PIXEL_GRID, RADIUS_MM, THRESHOLD, SetUp, Study, study_record, study_tables
 
 from harness.evaluation.intervals import false_call_rate
 from harness.evaluation.study.curves import chance_hits, free_response, pixel_curves, roc_curve
 from harness.evaluation.study.limit import SetUpLimit, limit_of, surface_of
 from harness.evaluation.study.record import SetUpRecord
 from harness.evaluation.study.result import FRAMES, axis_lines, difference
+from harness.tables.trials import ResultTables
 
 LOUD = 20.0
 """False calls per square metre of a study in which chance hits are frequent enough to be counted."""
 
 
 @pytest.fixture(scope="module")
-def loud() -> Tables:
+def loud() -> ResultTables:
     return study_tables(Study((SetUp(false_calls_per_m2=LOUD),), boards=30, hole_free_boards=30))
 
 
-def two_boards(findings: list[tuple[str, int, float, float, str]]) -> Tables:
+def two_boards(findings: list[tuple[str, int, float, float, str]]) -> ResultTables:
     """Boards 0 and 1 with a damage at (0, 0) and (50, 0), hole-free board 9; findings (role, board, x, y, hole)."""
     place = {"hole": ["a", "b"], "true_x_mm": [0.0, 50.0], "true_y_mm": [0.0, 0.0]}
     holes = pd.DataFrame({"board": [0, 1], "repeat": 0, **place})
@@ -34,7 +35,7 @@ def two_boards(findings: list[tuple[str, int, float, float, str]]) -> Tables:
     rows = [(role, board, 0, x, y, hole) for role, board, x, y, hole in findings]
     table = pd.DataFrame(rows, columns=["role", "board", "repeat", "x_mm", "y_mm", "hole"])
     none = pd.DataFrame()
-    return Tables(holes=holes, sites=none, runs=runs, findings=table, operating=none, pixels=none)
+    return ResultTables(holes, runs, none, none, none, none, findings=table)
 
 
 class TestChance:
