@@ -73,7 +73,7 @@ def fit_ahat(
     n = len(sizes)
     names = np.arange(n) if inspections is None else np.asarray(inspections).astype(str)
     if not n == len(signals) == len(names):
-        raise UserError(f"{n} sizes, {len(signals)} signals and {len(names)}targets: each row needs one of each")
+        raise UserError(f"{n} sizes, {len(signals)} signals and {len(names)} targets: each row needs one of each")
     rows_each = rows_of_target(sizes, names)
     targets = round(float((1 / rows_each).sum()))
     low, high = -np.inf if left is None else left, np.inf if right is None else right
