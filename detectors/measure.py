@@ -173,8 +173,8 @@ def _sides(around: _Surroundings, near: np.ndarray) -> tuple[float, float, np.nd
 class _Surroundings:
     """A detection and its neighbourhood. ``near`` (h, w) bool: its ``own`` pixels, grown by one more than half of the
     blur, ``reach_px``. ``offset_m``: residual around it. ``sign``, ``peak_m``: of its own residual, less the offset.
-    ``origin_m``: the surface's point at (``u0``, ``v0``), the
-    detection's centroid. ``sharper_px``: smaller blurs to try, as noise may be blurred more than the scene."""
+    ``origin_m``: the surface's point at (``u0``, ``v0``), the detection's centroid. ``sharper_px``: smaller blurs to
+    try, as noise may be blurred more than the scene."""
 
     patch: HolePatch
     own: np.ndarray
