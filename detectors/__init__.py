@@ -18,12 +18,12 @@ GROUP = "tofpod.detectors"
 """Entry points of this group name a class ``C`` with ``C.settings_type`` (a Config) and ``C(settings)`` a Detector."""
 
 BUILT_IN = {
-    "fpfh_memory": "detectors.peers:FpfhMemoryDetector",
-    "local": "detectors.local:LocalDetector",
-    "m3c2": "detectors.peers:M3c2Detector",
-    "matched": "detectors.matched:MatchedDetector",
-    "plane_ransac": "detectors.peers:PlaneRansacDetector",
-    "thesis": "detectors.thesis:ThesisDetector",
+    "fpfh_memory": "detectors.methods.peers:FpfhMemoryDetector",
+    "local": "detectors.methods.local:LocalDetector",
+    "m3c2": "detectors.methods.peers:M3c2Detector",
+    "matched": "detectors.methods.matched:MatchedDetector",
+    "plane_ransac": "detectors.methods.peers:PlaneRansacDetector",
+    "thesis": "detectors.methods.thesis:ThesisDetector",
 }
 
 NEEDED = {"m3c2": "py4dgeo"}  # packages of the extra `peers`, by detector
@@ -45,11 +45,15 @@ def detector_type(name: str) -> Any:
     package = NEEDED.get(name) if offer.built_in else None
     if package is not None and find_spec(package) is None:
         fix = "pip install 'tofpod[peers]'"
-        raise UserError(f"detector {name!r} needs the package {package}, which is not installed: {fix}", fix=fix)
+        raise UserError(
+            f"detector {name!r} needs the package {package}, which is not installed: {fix}", fix=fix
+        )
     kind = DETECTORS.load(offer)
     settings_type = getattr(kind, "settings_type", None)
     if not (isinstance(settings_type, type) and issubclass(settings_type, Config)):
-        raise DETECTORS.broken(offer, "it has no `settings_type` that is a harness.vocabulary.config.Config")
+        raise DETECTORS.broken(
+            offer, "it has no `settings_type` that is a harness.vocabulary.config.Config"
+        )
     called = getattr(kind, "name", None)
     if isinstance(called, str) and called != name:
         # results use the detector's own name, experiments that of its entry point
@@ -64,4 +68,6 @@ def load_detector(name: str, settings: dict[str, Any]) -> Detector:
 
     kind = detector_type(name)
     settings_type = cast("type[Config]", kind.settings_type)
-    return cast("Detector", kind(settings_of(settings_type, settings, f"settings of detector {name!r}")))
+    return cast(
+        "Detector", kind(settings_of(settings_type, settings, f"settings of detector {name!r}"))
+    )

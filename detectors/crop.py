@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from detectors.masks import grown, holes_filled, inset, nearest_pixel, notches_filled, parts_with
-from detectors.smooth_surfaces import Surfaces, raster, smooth_surfaces
+from detectors.surfaces.smooth_surfaces import Surfaces, raster, smooth_surfaces
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud
@@ -74,7 +74,9 @@ class Candidate:
         """Sides, longer first, of the smallest rectangle in the mean plane that holds 99 % of the surface."""
         plan = self._plane[0] @ self._plane[1][:, 1:]
         turn = math.radians(float(cv2.minAreaRect(plan.astype(np.float32))[2]))
-        along = plan @ np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+        along = plan @ np.array(
+            [[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]
+        )
         low, high = np.quantile(along, (0.005, 0.995), axis=0)
         short, long = sorted(((high - low) / 0.99).tolist())
         return long, short
@@ -82,14 +84,19 @@ class Candidate:
     @cached_property
     def weight(self) -> float:
         """Share of the pixels, weighted by a Gaussian about the picture's centre and reduced at a grazing angle."""
-        row, column = (np.exp(-0.5 * ((np.arange(n) + 0.5) / n - 0.5) ** 2 / CENTRE_SPREAD**2) for n in self.own.shape)
+        row, column = (
+            np.exp(-0.5 * ((np.arange(n) + 0.5) / n - 0.5) ** 2 / CENTRE_SPREAD**2)
+            for n in self.own.shape
+        )
         weighted = float(row @ self.own @ column / (row.sum() * column.sum()))
         return weighted * min(1.0, (self._facing / GRAZING) ** 2)
 
     @cached_property
     def cut_off(self) -> float:
         """Share of the outline on the picture's edge, or without a pixel grid on the border of the cloud."""
-        outline = self.filled & ~(cv2.erode(self.filled.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0)
+        outline = self.filled & ~(
+            cv2.erode(self.filled.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
+        )
         if self.grid.organised:
             edge = np.ones(self.filled.shape, dtype=bool)
             edge[1:-1, 1:-1] = False
@@ -111,7 +118,9 @@ class Candidate:
     def _some(self) -> np.ndarray:
         """An even sample (n, 3) of its points."""
         places = np.flatnonzero(self.own)
-        return np.asarray(self.grid.points_m.reshape(-1, 3)[places[:: max(1, len(places) // MOST_SAMPLES)]])
+        return np.asarray(
+            self.grid.points_m.reshape(-1, 3)[places[:: max(1, len(places) // MOST_SAMPLES)]]
+        )
 
     @cached_property
     def _plane(self) -> tuple[np.ndarray, np.ndarray]:
@@ -144,7 +153,11 @@ def described_text(candidate: Candidate) -> str:
     """Return distance, extent, share of the view and tilt as a text."""
     long, short = (f"{side / MM:.0f}" for side in candidate.extent_m)
     near, middle, far = candidate.depths_m
-    share = f"{100 * candidate.share:.2g}" if candidate.share < 0.095 else f"{100 * candidate.share:.0f}"
+    share = (
+        f"{100 * candidate.share:.2g}"
+        if candidate.share < 0.095
+        else f"{100 * candidate.share:.0f}"
+    )
     size = f"{long} x {short} mm, {share} % of the view, tilted by {candidate.tilt_deg:.0f} degrees"
     return f"{middle:.2f} m away ({near:.2f} to {far:.2f} m), {size}"
 
@@ -158,7 +171,9 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
 
     def encloses(outer: int, inner: int) -> bool:
         own = surfaces.own[inner]
-        return bool(np.count_nonzero(own & surfaces.filled[outer]) >= ENCLOSED * np.count_nonzero(own))
+        return bool(
+            np.count_nonzero(own & surfaces.filled[outer]) >= ENCLOSED * np.count_nonzero(own)
+        )
 
     def before(front: int, back: int) -> tuple[float, str] | None:
         """Return the probability that ``front`` is the target, and the reason for a doubt."""
@@ -169,15 +184,23 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
         covered = f"{100 * this.share:.2g} % of the view"
         if encloses(front, back):
             opening = surfaces.own[back].sum() / max(surfaces.filled[front].sum(), 1)
-            return _probability(0.5 / max(opening, 1e-6)), "a surface is seen through a large opening of another"
+            return _probability(
+                0.5 / max(opening, 1e-6)
+            ), "a surface is seen through a large opening of another"
         if ours.part >= SURROUNDED and ours.behind_m <= this.extent_m[1]:
             why = f"an object that covers {covered} lies on a larger surface or close to it"
             return _probability(this.weight / LYING_WEIGHT), why
         if other.cut_off < CUT_OFF:
-            ratio = this.extent_m[0] * this.extent_m[1] / max(other.extent_m[0] * other.extent_m[1], 1e-12)
+            ratio = (
+                this.extent_m[0]
+                * this.extent_m[1]
+                / max(other.extent_m[0] * other.extent_m[1], 1e-12)
+            )
             why = f"an object that covers {covered} stands in front of a surface whose outline is whole"
             return _probability(ratio / OBSTACLE_AREA), why
-        return _probability(this.weight / STANDING_WEIGHT), f"the nearer surface covers only {covered}"
+        return _probability(
+            this.weight / STANDING_WEIGHT
+        ), f"the nearer surface covers only {covered}"
 
     def judged(i: int, j: int) -> tuple[float, str]:
         """Return the probability that surface i rather than j is the target, and the reason for a doubt."""
@@ -191,9 +214,13 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
         # if the two only meet or are apart, weight, a frontal view and nearness decide
         this, other = described[i], described[j]
         ratio = this.weight / max(other.weight, 1e-9)
-        facing = math.cos(math.radians(this.tilt_deg)) / max(math.cos(math.radians(other.tilt_deg)), 1e-2)
+        facing = math.cos(math.radians(this.tilt_deg)) / max(
+            math.cos(math.radians(other.tilt_deg)), 1e-2
+        )
         near = other.depths_m[1] / max(this.depths_m[1], 1e-6)
-        return _probability(ratio**0.5 * facing**2 * near), "two surfaces are about as large and as near"
+        return _probability(
+            ratio**0.5 * facing**2 * near
+        ), "two surfaces are about as large and as near"
 
     table = [[judged(i, j) for j in numbers] for i in numbers]
     odds = [sum(math.log(probability) for probability, _ in row) for row in table]
@@ -207,19 +234,29 @@ def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...],
             outline = notches_filled(outline, radius_px)
         for other in numbers:
             border = borders[other].get(number)
-            stands = border and (table[other][number][0] >= 0.5 or border.behind_m > described[other].extent_m[0])
+            stands = border and (
+                table[other][number][0] >= 0.5 or border.behind_m > described[other].extent_m[0]
+            )
             if border and stands and border.is_step and encloses(number, other):
                 nearer = grid.points_m[..., 2] < described[other].depths_m[2] + border.behind_m / 2
                 joined = surfaces.filled[other] | (nearer & ~surfaces.own[number])
-                outline = outline & ~grown(parts_with(joined, surfaces.own[other]), surfaces.reach_px)
+                outline = outline & ~grown(
+                    parts_with(joined, surfaces.own[other]), surfaces.reach_px
+                )
         candidates.append(replace(described[number], outline=outline))
     against = [(place, *table[order[0]][other]) for place, other in enumerate(order[1:], start=2)]
     close = [(place, why) for place, probability, why in against if probability < DOUBTFUL_BELOW]
     doubts = [f"{why} (--target {place} takes the other)" for place, why in close]
     doubts = [f"it is doubtful which surface is the target: {'; '.join(doubts)}"] if doubts else []
     if (alike := sum(2 * each.share >= candidates[0].share for each in candidates[1:])) >= CROWD:
-        doubts.append(f"{alike} other surfaces are half as large as target 1 or larger: the scene may hold no target")
-    further = [str(n) for n, each in enumerate(candidates[1:], 2) if candidates[0].continues(each, surfaces.contact_m)]
+        doubts.append(
+            f"{alike} other surfaces are half as large as target 1 or larger: the scene may hold no target"
+        )
+    further = [
+        str(n)
+        for n, each in enumerate(candidates[1:], 2)
+        if candidates[0].continues(each, surfaces.contact_m)
+    ]
     if further:
         also = "targets {} lie" if len(further) > 1 else "target {} lies"
         part = f"{also.format(' and '.join(further))} in the plane of target 1 and may belong to it"
@@ -282,7 +319,9 @@ class BoxCrop(_Crop):
         for name in ("x_mm", "y_mm", "z_mm"):
             low, high = getattr(self, name)
             if not low < high:
-                raise ValueError(f"{name}: the lower limit {low:g} must be below the upper limit {high:g}")
+                raise ValueError(
+                    f"{name}: the lower limit {low:g} must be below the upper limit {high:g}"
+                )
         return self
 
 
@@ -337,7 +376,11 @@ def crop(cloud: Cloud, config: AnyCrop) -> np.ndarray:
     if isinstance(config, BoxCrop):
         limits = zip("xyz", (config.x_mm, config.y_mm, config.z_mm), strict=True)
         asked = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in limits)
-        asked += "" if config.range_max_m is None else f" mm and sqrt(x^2 + z^2) < {1e3 * config.range_max_m:g}"
+        asked += (
+            ""
+            if config.range_max_m is None
+            else f" mm and sqrt(x^2 + z^2) < {1e3 * config.range_max_m:g}"
+        )
         unit = "; the cloud's unit is probably not the metre" if z1 > 50_000 or z1 < 5 else ""
         what = f"the crop box ({asked} mm) holds none of the cloud's {len(points)} points{unit}"
         fix = "change crop.x_mm, crop.y_mm, crop.z_mm, or use crop.kind: auto"
@@ -366,12 +409,23 @@ def _choice_of(cloud: Cloud, config: AutoCrop) -> Choice:
         inset_px = math.ceil((inset_px - 1) / spacings) + 1 if inset_px else 0
     candidates, doubts = _candidates(smooth_surfaces(grid, config.crease_deg, smooth_px), grid)
     if wanted is not None and wanted > len(candidates):
-        known = "".join(f"\n  --target {n}: {described_text(each)}" for n, each in enumerate(candidates, start=1))
+        known = "".join(
+            f"\n  --target {n}: {described_text(each)}"
+            for n, each in enumerate(candidates, start=1)
+        )
         legal = f"1 to {len(candidates)}:{known}" if candidates else "none"
         fix = "choose one of these, or draw the outline with --crop polygon:u,v,u,v,u,v"
-        raise UserError(f"--target {wanted}: there are {len(candidates)} large smooth surfaces", legal=legal, fix=fix)
+        raise UserError(
+            f"--target {wanted}: there are {len(candidates)} large smooth surfaces",
+            legal=legal,
+            fix=fix,
+        )
     taken = wanted or 1
-    mask = candidates[taken - 1].outline & grid.valid if candidates else np.zeros(grid.valid.shape, bool)
+    mask = (
+        candidates[taken - 1].outline & grid.valid
+        if candidates
+        else np.zeros(grid.valid.shape, bool)
+    )
     mask = inset(mask, inset_px)
     if not cloud.organised:
         kept, mask = mask, cloud.valid.copy()
@@ -382,9 +436,14 @@ def _choice_of(cloud: Cloud, config: AutoCrop) -> Choice:
 
 def _box(cloud: Cloud, config: BoxCrop) -> np.ndarray:
     x, y, z = np.moveaxis(cloud.points_m, -1, 0)
-    limits = [(v, low * MM, high * MM) for v, (low, high) in ((x, config.x_mm), (y, config.y_mm), (z, config.z_mm))]
+    limits = [
+        (v, low * MM, high * MM)
+        for v, (low, high) in ((x, config.x_mm), (y, config.y_mm), (z, config.z_mm))
+    ]
     with np.errstate(invalid="ignore"):
-        inside = np.logical_and.reduce([cloud.valid, *((v > low) & (v < high) for v, low, high in limits)])
+        inside = np.logical_and.reduce(
+            [cloud.valid, *((v > low) & (v < high) for v, low, high in limits)]
+        )
         if config.range_max_m is not None:
             inside &= np.hypot(x, z) < config.range_max_m
     return np.asarray(inside)
@@ -394,7 +453,9 @@ def _polygon(cloud: Cloud, config: PolygonCrop) -> np.ndarray:
     if not cloud.organised:
         what = "a polygon in pixels cannot crop a cloud without a pixel grid"
         raise UserError(what, legal="crop.kind none, box or auto")
-    v, u = np.mgrid[cloud.region.row0 : cloud.region.row1, cloud.region.col0 : cloud.region.col1].astype(float)
+    v, u = np.mgrid[
+        cloud.region.row0 : cloud.region.row1, cloud.region.col0 : cloud.region.col1
+    ].astype(float)
     inside = np.zeros(u.shape, dtype=bool)
     corners = np.array(config.vertices_px)
     for (u0, v0), (u1, v1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):

@@ -36,7 +36,9 @@ def notches_filled(mask: np.ndarray, radius_px: int) -> np.ndarray:
         return mask
     side = 2 * radius_px + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-    closed = cv2.morphologyEx(np.pad(mask.astype(np.uint8), side), cv2.MORPH_CLOSE, kernel)[side:-side, side:-side]
+    closed = cv2.morphologyEx(np.pad(mask.astype(np.uint8), side), cv2.MORPH_CLOSE, kernel)[
+        side:-side, side:-side
+    ]
     gaps = holes_filled(closed > 0) & ~mask
     return mask | parts_with(gaps, deep_in(gaps), connectivity=4)
 
@@ -61,7 +63,9 @@ def inset(mask: np.ndarray, pixels: int) -> np.ndarray:
     return mask & cv2.erode(holes_filled(mask).astype(np.uint8), kernel).astype(bool)
 
 
-def parts_with(mask: np.ndarray, seeds: np.ndarray, connectivity: int = 8, least: int = 0) -> np.ndarray:
+def parts_with(
+    mask: np.ndarray, seeds: np.ndarray, connectivity: int = 8, least: int = 0
+) -> np.ndarray:
     """Return the connected parts of the mask that hold a seed (h, w) and at least ``least`` pixels."""
     count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=connectivity)
     wanted = np.zeros(count, dtype=bool)
@@ -75,14 +79,18 @@ def parts_with(mask: np.ndarray, seeds: np.ndarray, connectivity: int = 8, least
 def nearest_pixel(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return each pixel's distance (h, w) to the mask, in pixels, and the flat index of the mask's nearest pixel."""
     beyond = (~mask).astype(np.uint8)
-    apart, labels = cv2.distanceTransformWithLabels(beyond, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
+    apart, labels = cv2.distanceTransformWithLabels(
+        beyond, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
     inside = np.flatnonzero(mask)
     flat = np.zeros(len(inside) + 1, dtype=np.int64)
     flat[labels.reshape(-1)[inside]] = inside
     return apart, flat[labels]
 
 
-def components(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def components(
+    nodes: np.ndarray, right: np.ndarray, down: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Number the sets of nodes (h, w) that links join, largest first; return the numbers (h, w) and the sizes.
     ``right`` and ``down`` (h, w) bool: whether a pixel is linked to the next in its row and in its column."""
     # links are pixels between those of the nodes

@@ -6,7 +6,12 @@ from typing import Any
 
 from harness.vocabulary.errors import UserError
 
-DEBIAN_PACKAGES = {"libGL": "libgl1", "libgomp": "libgomp1", "libX11": "libx11-6", "libudev": "libudev1"}
+DEBIAN_PACKAGES = {
+    "libGL": "libgl1",
+    "libgomp": "libgomp1",
+    "libX11": "libx11-6",
+    "libudev": "libudev1",
+}
 """Debian's packages of the system libraries that Open3D's wheel expects."""
 
 
@@ -19,10 +24,15 @@ def load_open3d() -> Any:
     try:
         import open3d
     except (ImportError, OSError) as error:
-        package = next((package for library, package in DEBIAN_PACKAGES.items() if library in str(error)), None)
+        package = next(
+            (package for library, package in DEBIAN_PACKAGES.items() if library in str(error)), None
+        )
         if package is None:
             raise
-        what, legal = f"this needs Open3D, which cannot start: {error}", ", ".join(DEBIAN_PACKAGES.values())
+        what, legal = (
+            f"this needs Open3D, which cannot start: {error}",
+            ", ".join(DEBIAN_PACKAGES.values()),
+        )
         legal = f"a system with the libraries of the Debian packages {legal}"
         raise MissingLibrary(what, legal=legal, fix=f"apt install {package}") from error
     return open3d

@@ -10,10 +10,10 @@ from typing import ClassVar, Generic, TypeVar
 import numpy as np
 from pydantic import Field
 
-from detectors.clusters import nested_clusters
+from detectors.findings.clusters import nested_clusters
+from detectors.findings.measure import HoleModelConfig, centres_of, measure_detection
 from detectors.interface import Detection, Detector, Evidence, Measurement
 from detectors.masks import on_grid as on_grid
-from detectors.measure import HoleModelConfig, centres_of, measure_detection
 from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import MM, Cloud
 
@@ -33,7 +33,7 @@ S = TypeVar("S", bound=ScoreMapConfig)
 class ScoreMapDetector(ABC, Generic[S]):
     """Implements `detectors.interface.Detector` except `analyse`. A subclass also sets ``name``, ``version`` and, for
     settings of its own, a ``settings_type`` that derives from `ScoreMapConfig`; the first line of its docstring is its
-    description in ``python -m harness.ls``. `on_grid` puts the scores of cropped pixels back on the cloud's grid."""
+    description in ``tofpod ls``. `on_grid` puts the scores of cropped pixels back on the cloud's grid."""
 
     settings_type: ClassVar[type[ScoreMapConfig]] = ScoreMapConfig
     name: str
@@ -50,15 +50,21 @@ class ScoreMapDetector(ABC, Generic[S]):
         """Return clusters of pixels whose score is above the threshold, strongest first."""
         return self.findings(cloud, evidence, [threshold])[0].detections
 
-    def findings(self, cloud: Cloud, evidence: Evidence, thresholds: Sequence[float]) -> list[Findings]:
+    def findings(
+        self, cloud: Cloud, evidence: Evidence, thresholds: Sequence[float]
+    ) -> list[Findings]:
         """Return the result of `find` at each of several rising thresholds."""
         pixels = above(evidence, thresholds[0])
         pixels = pixels[cloud.valid.reshape(-1)[pixels]]
         points, scores = cloud.points_m.reshape(-1, 3)[pixels], evidence.score.reshape(-1)[pixels]
         found = []
-        for labels, strengths in zip(*self._clusters(self.places(points), scores, thresholds), strict=True):
+        for labels, strengths in zip(
+            *self._clusters(self.places(points), scores, thresholds), strict=True
+        ):
             count = int(labels.max(initial=-1)) + 1
-            found.append(Findings(strengths[:count], pixels, labels, centres_of(points, labels, count)))
+            found.append(
+                Findings(strengths[:count], pixels, labels, centres_of(points, labels, count))
+            )
         return found
 
     def quiet_threshold(self, cloud: Cloud, evidence: Evidence) -> float:
@@ -85,7 +91,9 @@ class ScoreMapDetector(ABC, Generic[S]):
         self, places_m: np.ndarray, scores: np.ndarray, thresholds: Sequence[float]
     ) -> tuple[np.ndarray, np.ndarray]:
         distance_m = self.settings.cluster_distance_mm * MM
-        return nested_clusters(places_m, scores, distance_m, self.settings.min_points, np.array(thresholds))
+        return nested_clusters(
+            places_m, scores, distance_m, self.settings.min_points, np.array(thresholds)
+        )
 
     def measure(self, cloud: Cloud, evidence: Evidence, detection: Detection) -> Measurement:
         """Measure the thesis' extents and fit the model of a blurred hole."""
@@ -105,10 +113,16 @@ class Findings:
     @classmethod
     def of(cls, detections: Sequence[Detection]) -> Findings:
         """Convert detections to arrays."""
-        numbers = np.repeat(np.arange(len(detections)), [len(detection.pixels) for detection in detections])
-        pixels = np.concatenate([np.zeros(0, np.int64), *(detection.pixels for detection in detections)])
+        numbers = np.repeat(
+            np.arange(len(detections)), [len(detection.pixels) for detection in detections]
+        )
+        pixels = np.concatenate(
+            [np.zeros(0, np.int64), *(detection.pixels for detection in detections)]
+        )
         centres = np.array([detection.centre_m for detection in detections]).reshape(-1, 3)
-        return cls(np.array([detection.score for detection in detections]), pixels, numbers, centres)
+        return cls(
+            np.array([detection.score for detection in detections]), pixels, numbers, centres
+        )
 
     @property
     def detections(self) -> tuple[Detection, ...]:
@@ -118,10 +132,14 @@ class Findings:
         _, *groups = np.split(self.pixels[by_label], np.cumsum(counts)[:-1])
         of_each = zip(self.scores.tolist(), groups, self.centres_m, strict=True)
         found = (Detection(score, pixels, centre) for score, pixels, centre in of_each)
-        return tuple(sorted(found, key=lambda detection: (-detection.score, int(detection.pixels[0]))))
+        return tuple(
+            sorted(found, key=lambda detection: (-detection.score, int(detection.pixels[0])))
+        )
 
 
-def findings_at(detector: Detector, cloud: Cloud, evidence: Evidence, thresholds: Sequence[float]) -> list[Findings]:
+def findings_at(
+    detector: Detector, cloud: Cloud, evidence: Evidence, thresholds: Sequence[float]
+) -> list[Findings]:
     """Return a detector's detections at each of several rising thresholds."""
     own = next(vars(each) for each in type(detector).__mro__ if "find" in vars(each))
     if "findings" in own:

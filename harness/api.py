@@ -30,10 +30,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from detectors import load_detector
-from detectors.average import AverageConfig
-from detectors.average import average as averaged
+from detectors.averages.average import AverageConfig
+from detectors.averages.average import average as averaged
 from detectors.recordings import open_capture
-from harness.engine.work import EngineOptions
 from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.record import read_record
 from harness.experiment.load import load_experiment
@@ -41,6 +40,7 @@ from harness.inspection.arguments import DEFAULT_DETECTOR
 from harness.inspection.run import analysed, judged, threshold_of
 from harness.report.findings import Finding, Judged, findings_figure
 from harness.report.study_page import draw_overlay
+from harness.runs.options import EngineOptions
 from harness.target import declared
 from harness.vocabulary.declaration.diagnose import settings_of
 from harness.vocabulary.errors import UserError
@@ -61,7 +61,9 @@ __all__ = [
 ]  # fmt: skip
 
 
-def target(what: str | Path | Mapping[str, Any], board: int = 0, *, hole_free: bool = False) -> TargetConfig:
+def target(
+    what: str | Path | Mapping[str, Any], board: int = 0, *, hole_free: bool = False
+) -> TargetConfig:
     """Return a target by its name, from a YAML or JSON file, or from a declaration as plain data. ``board`` selects a
     damaged board of a family (``name: drawn``). Raises UserError with every mistake in the declaration.
 
@@ -76,7 +78,12 @@ def target(what: str | Path | Mapping[str, Any], board: int = 0, *, hole_free: b
 
 
 def render(
-    target: TargetConfig, camera: str, *, unit_seed: int = 1, cache: str | Path = "results/.cache/renders", **work: Any
+    target: TargetConfig,
+    camera: str,
+    *,
+    unit_seed: int = 1,
+    cache: str | Path = "results/.cache/renders",
+    **work: Any,
 ) -> SimulatedUnit:
     """Render what a unit of a camera sees of a target, without noise. ``unit_seed`` draws the unit's fixed pattern;
     ``cache`` is the folder for stored renders; ``work`` holds settings of `scenes.optics.RenderConfig`, such as
@@ -88,7 +95,9 @@ def render(
     """
     config = settings_of(CameraConfig, {"name": camera, "unit_seed": unit_seed}, "camera")
     facts, settings = camera_of(config), settings_of(RenderConfig, work, "render")
-    view, _ = cached_view(target.at_wavelength(facts.optics.wavelength_nm), facts.optics, settings, Path(cache))
+    view, _ = cached_view(
+        target.at_wavelength(facts.optics.wavelength_nm), facts.optics, settings, Path(cache)
+    )
     return SimulatedUnit(facts, config, view)
 
 
@@ -111,7 +120,7 @@ def load(*paths: str | Path, unit: str | None = None) -> FrameSource:
 
 def average(frames: FrameSource, method: str = "mean", **settings: Any) -> Cloud:
     """Average all frames to a cloud, whose ``points_m`` (h, w, 3) are in the camera's frame, NaN where invalid.
-    ``settings`` are those of `detectors.average.AverageConfig`. Raises UserError.
+    ``settings`` are those of `detectors.averages.average.AverageConfig`. Raises UserError.
 
     >>> tofpod.average(tofpod.frames(unit, 3), "median").n_frames
     3
@@ -119,7 +128,9 @@ def average(frames: FrameSource, method: str = "mean", **settings: Any) -> Cloud
     return averaged(frames, settings_of(AverageConfig, {"method": method, **settings}, "average"))
 
 
-def detect(cloud: Cloud, detector: str = DEFAULT_DETECTOR, threshold: float | None = None, **settings: Any) -> Judged:
+def detect(
+    cloud: Cloud, detector: str = DEFAULT_DETECTOR, threshold: float | None = None, **settings: Any
+) -> Judged:
     """Search for damage. Without a ``threshold`` (in units of the detector's score), the cloud's own noise sets it, as
     in ``python -m harness.detect``; ``evidence.warnings`` of the result say if that is not reliable. ``settings`` are
     those of the detector; the default detector chooses the shape of its surface by evidence unless they state it.
@@ -148,7 +159,9 @@ def findings_table(found: Judged) -> pd.DataFrame:
     """
     import pandas as pd
 
-    return pd.DataFrame([asdict(finding) for finding in found.findings], columns=[*Finding.__dataclass_fields__])
+    return pd.DataFrame(
+        [asdict(finding) for finding in found.findings], columns=[*Finding.__dataclass_fields__]
+    )
 
 
 def plot(found: Judged, title: str = "") -> Figure:
@@ -156,7 +169,9 @@ def plot(found: Judged, title: str = "") -> Figure:
     return findings_figure(found.cloud, found.evidence, found.detections, title)
 
 
-def sweep(experiment: str | Path, *changes: str, out: str | Path = "results", jobs: int = 1) -> Path:
+def sweep(
+    experiment: str | Path, *changes: str, out: str | Path = "results", jobs: int = 1
+) -> Path:
     """Run an experiment, or its missing trials, and return its results folder. ``changes`` are those of ``--set``, such
     as ``"repeats=5"``. With ``jobs`` above 1 it starts processes, so that a script needs ``if __name__ ==
     "__main__":``. Raises UserError for a wrong experiment, or if trials failed.
@@ -166,14 +181,19 @@ def sweep(experiment: str | Path, *changes: str, out: str | Path = "results", jo
     ...
     harness.vocabulary.declaration.yaml_source.DeclarationError: ...
     """
-    from harness.engine.study import run_study  # imports pandas
+    from harness.runs.study import run_study  # imports pandas
 
     found, out = load_experiment(Path(experiment), changes), Path(out)
-    code = run_study(found, out, EngineOptions(jobs=jobs, serial=jobs == 1), f"tofpod.sweep({str(experiment)!r})")
+    code = run_study(
+        found, out, EngineOptions(jobs=jobs, serial=jobs == 1), f"tofpod.sweep({str(experiment)!r})"
+    )
     if code == 130:
         raise KeyboardInterrupt
     if code:
-        raise UserError(f"{experiment}: trials failed, as printed above", fix="correct the cause and run it again")
+        raise UserError(
+            f"{experiment}: trials failed, as printed above",
+            fix="correct the cause and run it again",
+        )
     return found.folder(out)
 
 
@@ -183,7 +203,10 @@ def table(folder: str | Path, name: str) -> pd.DataFrame:
 
     tables = {path.stem: path for path in sorted(Path(folder).glob("*.parquet"))}
     if name not in tables:
-        raise UserError(f"{folder}: has no table {name!r}", legal=", ".join(tables) or "a folder that a sweep wrote")
+        raise UserError(
+            f"{folder}: has no table {name!r}",
+            legal=", ".join(tables) or "a folder that a sweep wrote",
+        )
     return pd.read_parquet(tables[name])
 
 

@@ -20,9 +20,15 @@ from scenes.sensor.camera import NO_EFFECTS, CameraConfig, camera_of, number_pat
 from scenes.sensor.source import SimulatedUnit
 from scenes.target import custom
 
-LEAST_DRAWS = 48  # frames drawn with and without the damage, to find how much noisier it makes a pixel
-FINEST_STEP_MM = 1e-3  # rounding step of the drawn frames; recorded ranges already contain the camera's own
-BEYOND_PX = 2  # pixels beyond the reach of the camera's filter around the damage's rim that may change
+LEAST_DRAWS = (
+    48  # frames drawn with and without the damage, to find how much noisier it makes a pixel
+)
+FINEST_STEP_MM = (
+    1e-3  # rounding step of the drawn frames; recorded ranges already contain the camera's own
+)
+BEYOND_PX = (
+    2  # pixels beyond the reach of the camera's filter around the damage's rim that may change
+)
 AROUND_PX = 8  # further pixels of the small board; its rim disturbs both renders alike
 
 
@@ -57,16 +63,25 @@ def unit_config(name: str, lens: Lens) -> tuple[CameraConfig, bool]:
     facts = camera_of(CameraConfig(name=name))
     same = (facts.nominal_lens.width, facts.nominal_lens.height) == (lens.width, lens.height)
     numbers = {"engine.output_step_mm": FINEST_STEP_MM, **(numbers_of_lens(lens) if same else {})}
-    known, kept = number_paths(facts.to_data()), ("noise", "multipath", "wiggling", "ambient", "saturation")
+    known, kept = (
+        number_paths(facts.to_data()),
+        ("noise", "multipath", "wiggling", "ambient", "saturation"),
+    )
     effects = NO_EFFECTS.model_copy(update=dict.fromkeys(kept, True))
-    return CameraConfig(name=name, effects=effects, numbers={k: v for k, v in numbers.items() if k in known}), same
+    return CameraConfig(
+        name=name, effects=effects, numbers={k: v for k, v in numbers.items() if k in known}
+    ), same
 
 
 KINDS = ("holes", "dents", "flaws")  # fields of a declaration that list damage
 
 
 def local_board(
-    target: custom.TargetConfig, damage: custom.AnyDamage, place_m: np.ndarray, normal: np.ndarray, side_mm: float
+    target: custom.TargetConfig,
+    damage: custom.AnyDamage,
+    place_m: np.ndarray,
+    normal: np.ndarray,
+    side_mm: float,
 ) -> custom.TargetConfig:
     """Return a board of ``target``'s material with this damage alone at its centre, which lies at ``place_m`` (3,) in
     the camera's frame, its face towards ``normal`` (3,), a unit vector to the camera."""
@@ -79,29 +94,49 @@ def local_board(
         tilt_y_deg=float(np.degrees(np.arctan2(x, z))),
     )
     alone = damage.model_copy(update={"centre_mm": (0.0, 0.0)})
-    kept = {name: tuple(alone for each in getattr(target, name) if each.id == damage.id) for name in KINDS}
+    kept = {
+        name: tuple(alone for each in getattr(target, name) if each.id == damage.id)
+        for name in KINDS
+    }
     board = target.board.model_copy(update={"width_mm": side_mm, "height_mm": side_mm})
     backing = target.backing and target.backing.model_copy(update={"size_mm": None})
     return target.model_copy(update={**kept, "board": board, "backing": backing, "pose": pose})
 
 
 def implant_of(
-    config: CameraConfig, same: bool, lens: Lens, board: custom.TargetConfig, frames: int, seed: int, cache: Path
+    config: CameraConfig,
+    same: bool,
+    lens: Lens,
+    board: custom.TargetConfig,
+    frames: int,
+    seed: int,
+    cache: Path,
 ) -> Implant:
     """Return the difference that the damage of `local_board` makes to ``frames`` frames (or more) of a recording with
     this lens. ``config``, ``same``: those of `unit_config`. Raises UserError if the board leaves the view."""
     camera = camera_of(config)
     declared = board.at_wavelength(camera.optics.wavelength_nm)
     count, drawn, smooth = max(frames, LEAST_DRAWS), [], []
-    without_noise = config.model_copy(update={"effects": config.effects.model_copy(update={"noise": False})})
+    without_noise = config.model_copy(
+        update={"effects": config.effects.model_copy(update={"noise": False})}
+    )
     for target in (declared, declared.hole_free()):
         view, _ = cached_view(target, camera.optics, RenderConfig(), cache)
-        unit, quiet = SimulatedUnit(camera, config, view), SimulatedUnit(camera, without_noise, view)
-        drawn.append(np.stack([frame.z_m for frame in unit.capture(count, seed, "implant").frames()]).astype(float))
+        unit, quiet = (
+            SimulatedUnit(camera, config, view),
+            SimulatedUnit(camera, without_noise, view),
+        )
+        drawn.append(
+            np.stack([frame.z_m for frame in unit.capture(count, seed, "implant").frames()]).astype(
+                float
+            )
+        )
         smooth.append(next(quiet.capture(1, seed).frames()).z_m.astype(float))
     with np.errstate(invalid="ignore", divide="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # pixels that no frame shows
-        means, spreads = zip(*((np.nanmean(z, axis=0), np.nanvar(z, axis=0)) for z in drawn), strict=True)
+        means, spreads = zip(
+            *((np.nanmean(z, axis=0), np.nanvar(z, axis=0)) for z in drawn), strict=True
+        )
         # without noise the mean has no scatter; a pixel at a gate may need noise to be valid
         middle = [np.where(np.isfinite(z), z, mean) for z, mean in zip(smooth, means, strict=True)]
         more = np.sqrt(np.clip(1.0 - spreads[1] / spreads[0], 0.0, 1.0))
@@ -116,15 +151,22 @@ def implant_of(
     half = board.board.width_mm / 2 * MM
     corners = np.array([(x, y, 0.0) for x in (-half, half) for y in (-half, half)])
     ends = lens.project(transform_points(board.pose.T_camera_board, corners))
-    (left, top), (right, bottom) = np.floor(ends.min(axis=0)).astype(int), np.ceil(ends.max(axis=0)).astype(int)
+    (left, top), (right, bottom) = (
+        np.floor(ends.min(axis=0)).astype(int),
+        np.ceil(ends.max(axis=0)).astype(int),
+    )
     onto = Region(top, bottom + 1, left, right + 1).grown(0, lens.height, lens.width)
-    at = camera.nominal_lens.project(np.concatenate([lens.region_slopes(onto), np.ones((*onto.shape, 1))], axis=-1))
+    at = camera.nominal_lens.project(
+        np.concatenate([lens.region_slopes(onto), np.ones((*onto.shape, 1))], axis=-1)
+    )
     rows_columns = [at[..., 1] - region.row0, at[..., 0] - region.col0]
 
     def moved(image: np.ndarray) -> np.ndarray:
         return np.asarray(ndimage.map_coordinates(image.astype(float), rows_columns, order=1))
 
-    return Implant(onto, moved(shift_m), np.stack([*map(moved, noise_m)]), np.stack([*map(moved, lost)]) > 0.5)
+    return Implant(
+        onto, moved(shift_m), np.stack([*map(moved, noise_m)]), np.stack([*map(moved, lost)]) > 0.5
+    )
 
 
 def side_mm(damage: custom.AnyDamage, distance_m: float, config: CameraConfig) -> float:

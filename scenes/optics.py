@@ -42,7 +42,9 @@ class Optics:
     def cone(self, slopes: np.ndarray) -> np.ndarray:
         """Return the emitter's light along rays from it (..., 2) relative to the axis."""
         full, cutoff = np.cos(np.radians([self.full_half_angle_deg, self.cutoff_half_angle_deg]))
-        return np.clip((1 / np.sqrt(1 + (slopes**2).sum(axis=-1)) - cutoff) / (full - cutoff), 0.0, 1.0)
+        return np.clip(
+            (1 / np.sqrt(1 + (slopes**2).sum(axis=-1)) - cutoff) / (full - cutoff), 0.0, 1.0
+        )
 
     def content(self) -> dict[str, Any]:
         """Return all data that can change a render; they are equal for cameras that share renders."""
@@ -64,13 +66,19 @@ def wave_numbers(frequencies_hz: tuple[float, ...]) -> np.ndarray:
 
 COARSE = 4  # sub-rays per side on a smooth surface: the midpoint rule leaves 1e-4 mm
 FINE = 256  # sub-rays where a footprint meets an edge: one of them is 0.4 % of a step
-BEAM_REACH = 3.0  # deviations of a beam within which edges are considered: 1 % of the light lies beyond
+BEAM_REACH = (
+    3.0  # deviations of a beam within which edges are considered: 1 % of the light lies beyond
+)
 GOLDEN = (np.sqrt(5) - 1) / 2
 
 
 def footprint_of(lens: Lens, region: Region, beam_fwhm_rad: float | None) -> Quadrilaterals:
     """Return the footprints of a region's pixels: beams if the camera has a beam width."""
-    return Beams(lens, region, beam_fwhm_rad / FWHM_PER_DEVIATION) if beam_fwhm_rad else Quadrilaterals(lens, region)
+    return (
+        Beams(lens, region, beam_fwhm_rad / FWHM_PER_DEVIATION)
+        if beam_fwhm_rad
+        else Quadrilaterals(lens, region)
+    )
 
 
 class Quadrilaterals:
@@ -81,13 +89,17 @@ class Quadrilaterals:
 
     def __init__(self, lens: Lens, region: Region) -> None:
         # slopes (h + 1, w + 1, 2) of the corners of the region's pixels
-        self.corner = lens.region_slopes(Region(region.row0, region.row1 + 1, region.col0, region.col1 + 1), -0.5)
+        self.corner = lens.region_slopes(
+            Region(region.row0, region.row1 + 1, region.col0, region.col1 + 1), -0.5
+        )
 
     def axes(self, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
         """Return (n, 3, k): a pixel's sub-rays are these vectors, weighted by `grid` or `lattice`; z is 1."""
         c00, c01, c10, c11 = (self.corner[rows + i, cols + j] for i in (0, 1) for j in (0, 1))
         axes = np.stack([c00, c01 - c00, c10 - c00, c00 - c01 - c10 + c11], axis=-1)
-        return np.concatenate([axes, np.broadcast_to([1.0, 0.0, 0.0, 0.0], (len(axes), 1, 4))], axis=1)
+        return np.concatenate(
+            [axes, np.broadcast_to([1.0, 0.0, 0.0, 0.0], (len(axes), 1, 4))], axis=1
+        )
 
     def grid(self, side: int = COARSE) -> np.ndarray:
         """Return weights (k, side^2) of the centres of side x side cells of a pixel, row by row."""
@@ -116,7 +128,9 @@ class Beams(Quadrilaterals):
         self._slopes, self._deviation_rad = lens.region_slopes(region), deviation_rad
         # away from the axis, an angle spans a larger slope, and so more pixels, by 1 + slope^2
         widest = 1 + float((self._slopes**2).sum(axis=-1).max())
-        self.reach_px = 1 + int(np.ceil(BEAM_REACH * deviation_rad * widest * max(lens.fx, lens.fy)))
+        self.reach_px = 1 + int(
+            np.ceil(BEAM_REACH * deviation_rad * widest * max(lens.fx, lens.fy))
+        )
 
     def axes(self, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
         """Return (n, 3, k): the central ray and two axes across it, for angles."""
@@ -172,10 +186,17 @@ class NoiseFreeView:
 class RenderConfig(Config):
     """Effort for the simulation of indirect light. ``bounces: 0`` leaves direct light only."""
 
-    bounces: int = Field(10, ge=0, le=32, description="reflections beyond the first; albedo 0.6 leaves 0.4 % after 10")
+    bounces: int = Field(
+        10,
+        ge=0,
+        le=32,
+        description="reflections beyond the first; albedo 0.6 leaves 0.4 % after 10",
+    )
     face_spacing_mm: float = Field(80.0, gt=0, description="spacing of the nodes on the face")
     face_samples: int = Field(8192, ge=8, description="light paths for each node on the face")
-    hole_noise_mm: float = Field(0.1, gt=0, description="aim for the noise of range in pixels off the face")
+    hole_noise_mm: float = Field(
+        0.1, gt=0, description="aim for the noise of range in pixels off the face"
+    )
     hole_samples: int = Field(8192, ge=8, description="most light paths for each of those pixels")
     rest_samples: int = Field(16, ge=8, description="light paths for each pixel around the board")
     seed: int = Field(1, ge=0, le=1_000_000)

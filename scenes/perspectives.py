@@ -26,7 +26,9 @@ def check_in_view(config: TargetConfig, optics: Optics) -> None:
     face = _face_before_lens(config, CHECKED_STEPS)
     places = np.array([damage.centre_m for damage in config.damages]).reshape(-1, 2)
     centres = transform_points(config.pose.T_camera_board, face_of(config.board).point(*places.T))
-    if not len(centres) or not optics.lens.images(centres).any():  # if damage is in view, so is a part of the face
+    if (
+        not len(centres) or not optics.lens.images(centres).any()
+    ):  # if damage is in view, so is a part of the face
         seen_region(config, optics)
         if len(centres):
             message = f"none of the target's {len(centres)} damages is in view of {optics.title}"
@@ -34,9 +36,13 @@ def check_in_view(config: TargetConfig, optics: Optics) -> None:
             raise UserError(message, legal=legal, fix="change target.pose, or move the damage")
     range_m = face[..., 2] if optics.limits_along == "axis" else np.sqrt((face**2).sum(axis=-1))
     if range_m.max() < optics.nearest_m or range_m.min() > optics.farthest_m:
-        message = f"the target's face lies {range_m.min():.3f} to {range_m.max():.3f} m from the camera"
+        message = (
+            f"the target's face lies {range_m.min():.3f} to {range_m.max():.3f} m from the camera"
+        )
         legal = f"{optics.nearest_m:g} to {optics.farthest_m:g} m for {optics.title}"
-        raise UserError(message, legal=legal, fix="change target.pose.distance_m (or target.distance_m)")
+        raise UserError(
+            message, legal=legal, fix="change target.pose.distance_m (or target.distance_m)"
+        )
 
 
 def seen_region(config: TargetConfig, optics: Optics) -> Region:
@@ -46,7 +52,11 @@ def seen_region(config: TargetConfig, optics: Optics) -> Region:
     in_view = lens.images(face)
     if not in_view.any():
         fix = "move the target towards the axis (offset) or turn it to the camera (tilt)"
-        raise UserError(f"the target is out of view of {optics.title}", legal="a part of the face in view", fix=fix)
+        raise UserError(
+            f"the target is out of view of {optics.title}",
+            legal="a part of the face in view",
+            fix=fix,
+        )
     if not in_view.all():
         return lens.whole
     uv = lens.project(face)
@@ -61,7 +71,11 @@ def _face_before_lens(config: TargetConfig, steps: int) -> np.ndarray:
     if nearest_m <= NEAREST_M:
         legal = f"all of the face at least {NEAREST_M:g} m in front of the camera"
         fix = "raise target.pose.distance_m (or target.distance_m) or lower its tilt"
-        raise UserError(f"the target's nearest point is {nearest_m:.3f} m in front of the lens", legal=legal, fix=fix)
+        raise UserError(
+            f"the target's nearest point is {nearest_m:.3f} m in front of the lens",
+            legal=legal,
+            fix=fix,
+        )
     return face
 
 
@@ -79,9 +93,15 @@ class _Guess(Config):
 
 class _Spread(_Guess):
     count: Annotated[int, Field(ge=1, le=MAX_VIEWS)]
-    spread_deg: Annotated[float, Field(gt=0.0, le=120.0)] = Field(description="angle between the outermost views")
-    distance_jitter_mm: float = Field(0.0, ge=0.0, le=500.0, description="deviation of distances but the first")
-    aim_jitter_mm: float = Field(0.0, ge=0.0, le=500.0, description="deviation of the aim, to the sides and up or down")
+    spread_deg: Annotated[float, Field(gt=0.0, le=120.0)] = Field(
+        description="angle between the outermost views"
+    )
+    distance_jitter_mm: float = Field(
+        0.0, ge=0.0, le=500.0, description="deviation of distances but the first"
+    )
+    aim_jitter_mm: float = Field(
+        0.0, ge=0.0, le=500.0, description="deviation of the aim, to the sides and up or down"
+    )
 
 
 class ArcViews(_Spread):
@@ -103,8 +123,12 @@ class HandHeldViews(_Guess):
 
     kind: Literal["hand_held"]
     count: Annotated[int, Field(ge=1, le=MAX_VIEWS)]
-    sway_deg: Annotated[float, Field(ge=0.0, le=60.0)] = Field(10.0, description="largest rotation about each axis")
-    sway_mm: Annotated[float, Field(ge=0.0, le=500.0)] = Field(40.0, description="largest shift along each axis")
+    sway_deg: Annotated[float, Field(ge=0.0, le=60.0)] = Field(
+        10.0, description="largest rotation about each axis"
+    )
+    sway_mm: Annotated[float, Field(ge=0.0, le=500.0)] = Field(
+        40.0, description="largest shift along each axis"
+    )
 
 
 class ListedViews(_Guess):
@@ -131,13 +155,19 @@ def poses_of(views: AnyViews, pose: PoseConfig) -> tuple[PoseConfig, ...]:
         return tuple(_moved(pose, *shift) for shift in _walk(views))
     half, poses, turns = views.spread_deg / 2, [], _grid(views.count)
     if isinstance(views, ArcViews):
-        turns = [(share, 0.0) if views.about == "x" else (0.0, share) for share in _shares(views.count)]
+        turns = [
+            (share, 0.0) if views.about == "x" else (0.0, share) for share in _shares(views.count)
+        ]
     for number, (turn_x, turn_y) in enumerate(turns):
         aside = up = distance = 0.0
         if number > 0:  # the first view keeps its pose
             distance = float(random_stream(views.seed, "distance jitter", number).standard_normal())
             aside, up = random_stream(views.seed, "aim jitter", number).standard_normal(2).tolist()
-        shifts = aside * views.aim_jitter_mm, up * views.aim_jitter_mm, distance * views.distance_jitter_mm
+        shifts = (
+            aside * views.aim_jitter_mm,
+            up * views.aim_jitter_mm,
+            distance * views.distance_jitter_mm,
+        )
         poses.append(_moved(pose, turn_x * half, turn_y * half, 0.0, *shifts))
     return tuple(poses)
 
@@ -167,7 +197,9 @@ def _shares(wanted: int) -> list[float]:
     """Return 0, 1, -1, 1/2, -1/2, 1/4, -1/4, 3/4 ... of half the spread: odd multiples of powers of two."""
     shares, step = [0.0, 1.0, -1.0], 0.5
     while len(shares) < wanted:
-        shares += [sign * step * odd for odd in range(1, round(1 / step), 2) for sign in (1.0, -1.0)]
+        shares += [
+            sign * step * odd for odd in range(1, round(1 / step), 2) for sign in (1.0, -1.0)
+        ]
         step /= 2
     return shares[:wanted]
 

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+ROOT = Path(__file__).resolve().parents[1]
+
 
 def pytest_configure(config: pytest.Config) -> None:
     """Mitsuba starts before any test imports Open3D, whose C++ library LLVM cannot use (`scenes.render.scene`); not in
@@ -29,15 +31,23 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def _share_compilation(number: int, count: int) -> None:
     """Import all test files, each process from another one on: it finds compiled what the others had before it."""
-    files = sorted(Path(__file__).parent.glob("test_*.py"))
+    files = sorted(Path(__file__).parent.rglob("test_*.py"))
     first = len(files) * number // count
     for file in (*files[first:], *files[:first]):
         with suppress(Exception, pytest.skip.Exception):  # the collection reports it
-            import_module(file.stem)
+            import_module(".".join(file.relative_to(ROOT).with_suffix("").parts))
 
 
 LONGEST = (
-    *("engine_cluster", "engine", "detect_program", "detect_views", "engine_learning", "study_page", "pod_program"),
+    *(
+        "engine_cluster",
+        "engine",
+        "detect_program",
+        "detect_views",
+        "engine_learning",
+        "study_page",
+        "pod_program",
+    ),
     *(
         "compare",
         "experiment_files",
@@ -102,8 +112,8 @@ def control_detectors(monkeypatch: pytest.MonkeyPatch) -> None:
     """The detectors ``oracle`` and ``blind``, which test the harness, by their names."""
     from detectors import BUILT_IN
 
-    monkeypatch.setitem(BUILT_IN, "oracle", "control_detectors:Oracle")
-    monkeypatch.setitem(BUILT_IN, "blind", "control_detectors:BlindDetector")
+    monkeypatch.setitem(BUILT_IN, "oracle", "tests.support.control_detectors:Oracle")
+    monkeypatch.setitem(BUILT_IN, "blind", "tests.support.control_detectors:BlindDetector")
 
 
 @pytest.fixture
@@ -127,23 +137,28 @@ def unsaved(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="session")
 def tiny_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished sweep before the thesis' target, by worker processes, with tiny.yaml beside it; not to be changed."""
-    from tiny_sweep import TINY, finished
+    from tests.support.tiny_sweep import TINY, finished
 
-    return made_once(tmp_path_factory, "sweep", lambda home: finished(home, TINY, "--jobs", "1")) / "out"
+    return (
+        made_once(tmp_path_factory, "sweep", lambda home: finished(home, TINY, "--jobs", "1"))
+        / "out"
+    )
 
 
 @pytest.fixture(scope="session")
 def study_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished study of random boards, by one process, likewise."""
-    from tiny_sweep import STUDY, finished
+    from tests.support.tiny_sweep import STUDY, finished
 
-    return made_once(tmp_path_factory, "study", lambda home: finished(home, STUDY, "--serial")) / "out"
+    return (
+        made_once(tmp_path_factory, "study", lambda home: finished(home, STUDY, "--serial")) / "out"
+    )
 
 
 @pytest.fixture(scope="session")
 def dataset_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a finished data set of ten boards, ``set``; not to be changed."""
-    from tiny_dataset import write
+    from tests.support.tiny_dataset import write
 
     def make(home: Path) -> None:
         assert write(home, "set") == 0

@@ -32,7 +32,9 @@ LEGAL_RAW = (
     "--raw WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]]: TYPE u2 (the default), >u2, u4, f4 ..; STEP bytes from pixel to pixel; "
     "BYTES before the first frame"
 )
-LEGAL_PICTURES = "a page or more of one channel in 16 bits or floating point, or of x, y, z in floating point"
+LEGAL_PICTURES = (
+    "a page or more of one channel in 16 bits or floating point, or of x, y, z in floating point"
+)
 EXPORT = "Location = pc.Location; Color = pc.Color; save('cloud.mat','Location','Color','-v7')"
 """The MATLAB line that saves a point cloud ``pc`` as arrays."""
 
@@ -67,9 +69,13 @@ def load_mat(path: Path) -> dict[str, np.ndarray]:
     with read_errors(f"{path}: cannot be read as a MATLAB file", LEGAL_MAT, fix):
         try:
             # cells and structs hold no frames, and deeply nested ones end the process without a message
-            flat = [name for name, _, kind in scipy.io.whosmat(path) if kind not in ("cell", "struct")]
+            flat = [
+                name for name, _, kind in scipy.io.whosmat(path) if kind not in ("cell", "struct")
+            ]
         except TypeError as error:
-            raise ValueError("it holds a MATLAB object, which cannot be read outside MATLAB") from error
+            raise ValueError(
+                "it holds a MATLAB object, which cannot be read outside MATLAB"
+            ) from error
         loaded = scipy.io.loadmat(path, variable_names=flat)
     arrays = {}
     for name, value in loaded.items():
@@ -85,7 +91,9 @@ def load_mat(path: Path) -> dict[str, np.ndarray]:
 def load_picture(path: Path) -> dict[str, np.ndarray]:
     """Return a TIFF's pages, or a PFM, of numbers or x, y, z. Raises UserError for broken files and pictures."""
     level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the messages below replace its output
+    cv2.utils.logging.setLogLevel(
+        cv2.utils.logging.LOG_LEVEL_SILENT
+    )  # the messages below replace its output
     try:
         with read_errors(f"{path}: cannot be read", LEGAL_PICTURES):
             is_read, pages = cv2.imreadmulti(str(path), flags=cv2.IMREAD_UNCHANGED)
@@ -96,12 +104,33 @@ def load_picture(path: Path) -> dict[str, np.ndarray]:
                 raise ValueError(f"{stack.shape[3]} channels of {stack.dtype}, which is a picture")
     finally:
         cv2.utils.logging.setLogLevel(level)
-    return {"": stack[..., ::-1] if stack.ndim == 4 else stack}  # OpenCV gives the last channel first
+    return {
+        "": stack[..., ::-1] if stack.ndim == 4 else stack
+    }  # OpenCV gives the last channel first
 
 
 SENSOR_SIZES = (
-    *((640, 576), (320, 288), (512, 512), (1024, 1024), (640, 480), (512, 424), (320, 240), (224, 172), (224, 171)),
-    *((256, 192), (160, 120), (240, 180), (1024, 768), (1280, 720), (848, 480), (1280, 960), (1280, 1024)),
+    *(
+        (640, 576),
+        (320, 288),
+        (512, 512),
+        (1024, 1024),
+        (640, 480),
+        (512, 424),
+        (320, 240),
+        (224, 172),
+        (224, 171),
+    ),
+    *(
+        (256, 192),
+        (160, 120),
+        (240, 180),
+        (1024, 768),
+        (1280, 720),
+        (848, 480),
+        (1280, 960),
+        (1280, 1024),
+    ),
 )  # (width, height) of the depth images of usual cameras
 SAME_SCENE, SEVERAL = 0.05, 8
 """Largest relative difference of the median pixel between successive frames, and number of frames examined."""
@@ -123,7 +152,9 @@ class RawLoader:
     @classmethod
     def stated(cls, text: str) -> RawLoader:
         """Parse WIDTHxHEIGHT[:TYPE[/STEP][:BYTES]]. Raises UserError for anything else."""
-        match = re.fullmatch(r"(\d{1,5})x(\d{1,5})(?::([<>]?[uif][248])(?:/(\d{1,3}))?)?(?::(\d{1,12}))?", text)
+        match = re.fullmatch(
+            r"(\d{1,5})x(\d{1,5})(?::([<>]?[uif][248])(?:/(\d{1,3}))?)?(?::(\d{1,12}))?", text
+        )
         if match is None:
             raise UserError(f"--raw {text}: is not a layout", legal=LEGAL_RAW)
         width, height, kind, step, offset = match.groups()
@@ -131,8 +162,16 @@ class RawLoader:
         kind = kind or "u2"
         own = np.dtype(kind).itemsize
         if int(step or own) < own:
-            raise UserError(f"--raw {text}: a number of {own} bytes in every {step}", legal=LEGAL_RAW)
-        return cls(int(width), int(height), kind if kind[0] in "<>" else f"<{kind}", int(step or own), int(offset or 0))
+            raise UserError(
+                f"--raw {text}: a number of {own} bytes in every {step}", legal=LEGAL_RAW
+            )
+        return cls(
+            int(width),
+            int(height),
+            kind if kind[0] in "<>" else f"<{kind}",
+            int(step or own),
+            int(offset or 0),
+        )
 
     def __call__(self, path: Path) -> dict[str, np.ndarray]:
         """Map the frames (n, h, w). Raises UserError if there is none."""
@@ -140,26 +179,42 @@ class RawLoader:
         frame = self.width * self.height * self.step
         if size < frame:
             needs = f"a frame of {self.width} x {self.height} numbers in steps of {self.step} bytes needs {frame}"
-            raise UserError(f"{path}: has {size} bytes from byte {self.offset} on, but {needs}", legal=LEGAL_RAW)
+            raise UserError(
+                f"{path}: has {size} bytes from byte {self.offset} on, but {needs}", legal=LEGAL_RAW
+            )
         content = np.memmap(path, np.uint8, "r", self.offset, (size // frame * frame,))
         strides = (frame, self.width * self.step, self.step)
-        return {"": np.ndarray((size // frame, self.height, self.width), kind, content, strides=strides)}
+        return {
+            "": np.ndarray((size // frame, self.height, self.width), kind, content, strides=strides)
+        }
 
     def refuse_doubtful(self, path: Path, frames: np.ndarray) -> int:
         """Return the number of bytes after the last frame. Raises UserError if neighbours differ too much."""
         rough = _apart(frames[0][:, 1:], frames[0][:, :-1])
         if not rough < NEIGHBOURS:
-            what = f"in this layout the median pixel differs from its neighbour by {100 * rough:.3g} %"
-            raise UserError(f"{path}: {what}: this layout is wrong", legal=LEGAL_RAW, fix=raw_layout_of(path).fix)
+            what = (
+                f"in this layout the median pixel differs from its neighbour by {100 * rough:.3g} %"
+            )
+            raise UserError(
+                f"{path}: {what}: this layout is wrong",
+                legal=LEGAL_RAW,
+                fix=raw_layout_of(path).fix,
+            )
         return (path.stat().st_size - self.offset) % (self.width * self.height * self.step)
 
 
 def raw_layout_of(path: Path) -> UserError:
     """Return the error for a file of bare numbers, with the layouts of common cameras that fit its size."""
     size = path.stat().st_size
-    layouts = {f"{w}x{h}": size // (w * h) for w, h in SENSOR_SIZES if size % (w * h) == 0 and size >= 2 * w * h}
+    layouts = {
+        f"{w}x{h}": size // (w * h)
+        for w, h in SENSOR_SIZES
+        if size % (w * h) == 0 and size >= 2 * w * h
+    }
     ranked = sorted(layouts, key=lambda wh: layouts[wh] != 2)[:4]
-    fitting = " or ".join(f"--raw {wh}" + ("" if (n := layouts[wh]) == 2 else f":u2/{n}" * (n < 17)) for wh in ranked)
+    fitting = " or ".join(
+        f"--raw {wh}" + ("" if (n := layouts[wh]) == 2 else f":u2/{n}" * (n < 17)) for wh in ranked
+    )
     fix = "state the layout" + (f"; its size fits {fitting}" if fitting else "")
     return UserError(f"{path}: the layout of its {size} bytes is unknown", legal=LEGAL_RAW, fix=fix)
 
@@ -194,7 +249,9 @@ def open_arrays(path: Path, given: Given) -> Recording:
     files: tuple[Path, ...] = ()
     if distances.ndim == 3:
         hint = "; for a height map, state the distance between its pixels: --pitch 0.5mm"
-        lens, files = lens_for(str(path), given, width, height, beside=[path.parent, path.parent.parent], hint=hint)
+        lens, files = lens_for(
+            str(path), given, width, height, beside=[path.parent, path.parent.parent], hint=hint
+        )
     scale_m = given.scale_m or default_metres(distances.dtype)
 
     def read() -> Iterator[Frame]:
@@ -222,7 +279,9 @@ def open_array_list(paths: Sequence[Path], given: Given, name: str) -> Recording
 
 def _refuse_other_planes(name: str, key: str, frames: np.ndarray, left_over: int) -> None:
     """Raise UserError if the first planes (n, h, w) are not frames of one scene, but x and y, colour or amplitude."""
-    changed = [each for each in map(_apart, frames[:SEVERAL], frames[1:SEVERAL]) if math.isfinite(each)]
+    changed = [
+        each for each in map(_apart, frames[:SEVERAL], frames[1:SEVERAL]) if math.isfinite(each)
+    ]
     worst = max(changed, default=0.0)
     if len(frames) > 1 and (left_over or not worst < SAME_SCENE):
         more = f" and {left_over} bytes more" * bool(left_over)
@@ -239,7 +298,9 @@ def _stack(path: Path, load: ArraysLoader, given: Given) -> Stack:
     if array.size == 0:
         raise UserError(f"{name}: is empty {array.shape}", legal=LEGAL_AXES)
     note = ""
-    if array.ndim == 4 and 1 in array.shape[1::2]:  # (n, 1, h, w) or (n, h, w, 1), as networks take images
+    if (
+        array.ndim == 4 and 1 in array.shape[1::2]
+    ):  # (n, 1, h, w) or (n, h, w, 1), as networks take images
         array = array.squeeze(axis=1 if array.shape[1] == 1 else 3)
     if _frames_are_last(array):
         note = f"{name} {array.shape}: the frames are assumed to lie along the last axis"
@@ -252,10 +313,15 @@ def _stack(path: Path, load: ArraysLoader, given: Given) -> Stack:
         found = next((beside[key] for key in names if key in beside), None)
         return found if found is not None and found.size == size else None
 
-    rgb, amplitude = named(COLOUR_NAMES, 3 * math.prod(shape)), named(AMPLITUDE_NAMES, math.prod(shape))
+    rgb, amplitude = (
+        named(COLOUR_NAMES, 3 * math.prod(shape)),
+        named(AMPLITUDE_NAMES, math.prod(shape)),
+    )
     if rgb is not None:
         if rgb.dtype.kind == "f":
-            rgb = np.nan_to_num(np.clip(np.rint(rgb * 255.0 if np.nanmax(rgb) <= 1.0 else rgb), 0, 255))
+            rgb = np.nan_to_num(
+                np.clip(np.rint(rgb * 255.0 if np.nanmax(rgb) <= 1.0 else rgb), 0, 255)
+            )
         rgb = rgb.astype(np.uint8).reshape(*shape, 3)
     amplitude = None if amplitude is None else amplitude.reshape(shape).astype(np.float32)
     return array.reshape((*shape, 3) if has_points else shape), rgb, amplitude, organised, note
@@ -266,7 +332,9 @@ def _frames_are_last(array: np.ndarray) -> bool:
     planes, the content decides: x, y and z of points are not nearly equal everywhere, repeated distances are."""
     if not _is_deep(array):
         return False
-    return array.shape[2] != 3 or all(_apart(array[..., k], array[..., 2]) < SAME_SCENE for k in (0, 1))
+    return array.shape[2] != 3 or all(
+        _apart(array[..., k], array[..., 2]) < SAME_SCENE for k in (0, 1)
+    )
 
 
 def _is_deep(array: np.ndarray) -> bool:
@@ -280,7 +348,9 @@ def _apart(first: np.ndarray, second: np.ndarray) -> float:
     return float(np.median(np.abs(before - after) / before)) if both.any() else float("inf")
 
 
-def _named_array(name: str, arrays: Arrays, usual: Sequence[str], given: str | None) -> tuple[str, np.ndarray]:
+def _named_array(
+    name: str, arrays: Arrays, usual: Sequence[str], given: str | None
+) -> tuple[str, np.ndarray]:
     """Return (name, array): the one that NAME[:NUMBER] selects, else one with a usual name, else the only one."""
     held = ", ".join(f"{key} {value.shape}".strip() for key, value in arrays.items()) or "nothing"
     key, _, number = (given or "").partition(":")
@@ -289,24 +359,39 @@ def _named_array(name: str, arrays: Arrays, usual: Sequence[str], given: str | N
         found = found or [key for key in arrays if "depth" in key.lower()] or list(arrays)
         if len(found) != 1:
             what = f"{name}: no array, or several arrays, that could be the depth (it holds {held})"
-            fix = f"choose one, for instance --array {found[0]} (add --pitch for a height map)" if found else None
-            raise UserError(what, legal=f"one array named {', '.join(usual)}; {LEGAL_AXES}", fix=fix)
+            fix = (
+                f"choose one, for instance --array {found[0]} (add --pitch for a height map)"
+                if found
+                else None
+            )
+            raise UserError(
+                what, legal=f"one array named {', '.join(usual)}; {LEGAL_AXES}", fix=fix
+            )
         (key,) = found
     if key not in arrays:
-        raise UserError(f"{name}: holds no array {key}", legal=held, fix=f"--array {next(iter(arrays), '')}")
+        raise UserError(
+            f"{name}: holds no array {key}", legal=held, fix=f"--array {next(iter(arrays), '')}"
+        )
     array, name = arrays[key], f"{name}: {key}" if key else name
     if number:
         array = np.moveaxis(array, -1, 0) if _is_deep(array) and array.shape[2] != 3 else array
         if not number.isdigit() or array.ndim < 3 or int(number) >= len(array):
-            raise UserError(f"--array {given}: no such part of {name} {array.shape}", legal="NAME, or NAME:0 onwards")
+            raise UserError(
+                f"--array {given}: no such part of {name} {array.shape}",
+                legal="NAME, or NAME:0 onwards",
+            )
         array, name = array[int(number)], f"{name if key else name + ': '}:{number}"
     refuse_narrow(name, array.dtype)
     return name, array
 
 
-def _axes(name: str, shape: tuple[int, ...], lens: Lens | None) -> tuple[bool, tuple[int, int, int], bool]:
+def _axes(
+    name: str, shape: tuple[int, ...], lens: Lens | None
+) -> tuple[bool, tuple[int, int, int], bool]:
     """Return (holds points, (n, h, w), has a pixel grid) of an array's shape."""
-    is_lists = shape[-1:] == (3,) and (len(shape) == 2 or (len(shape) == 3 and shape[1] >= FRAMES_OF_POINTS * shape[0]))
+    is_lists = shape[-1:] == (3,) and (
+        len(shape) == 2 or (len(shape) == 3 and shape[1] >= FRAMES_OF_POINTS * shape[0])
+    )
     if is_lists:
         frames, points = (1, *shape[:-1])[-2:]
         if lens is not None and points == lens.width * lens.height:
@@ -316,13 +401,22 @@ def _axes(name: str, shape: tuple[int, ...], lens: Lens | None) -> tuple[bool, t
     n, *grid = (1, 1, *(shape[:-1] if has_points else shape))[-3:]
     is_table = len(shape) == 2 and min(shape) < FEWEST_ROWS
     if (len(shape) == 4 and not has_points) or len(shape) not in (2, 3, 4) or is_table:
-        fix = "if rows hold more numbers than x, y and z, save only these: array[:, :3]" if is_table else None
+        fix = (
+            "if rows hold more numbers than x, y and z, save only these: array[:, :3]"
+            if is_table
+            else None
+        )
         raise UserError(f"{name}: a shape of {shape} is not a capture", legal=LEGAL_AXES, fix=fix)
     return has_points, (n, grid[0], grid[1]), True
 
 
 HEIGHT_NAMES = ("height", "heights", "heightmap", "height_map", "elevation", "dem", "map", "h", "z")
-DOWN_NAMES = ("depth", "distance", "range", "z_depth")  # names of arrays whose numbers grow away from the viewer
+DOWN_NAMES = (
+    "depth",
+    "distance",
+    "range",
+    "z_depth",
+)  # names of arrays whose numbers grow away from the viewer
 DISTANCE_M = 1.0
 RELIEF = (5e-4, 0.5)
 """Plausible relief (1st to 99th percentile) over the map's shorter side: of two units, 1000 apart, only one fits."""
@@ -338,27 +432,41 @@ def _open_height_map(path: Path, load: ArraysLoader, given: Given) -> Recording:
     name, heights = _map_in(path, load, given.array)
     known = heights[np.isfinite(heights)].astype(np.float64)
     if known.size == 0:
-        raise UserError(f"{name}: has no finite height", legal="numbers, and NaN where there is no height")
+        raise UserError(
+            f"{name}: has no finite height", legal="numbers, and NaN where there is no height"
+        )
     relief = float(np.ptp(np.quantile(known, (0.01, 0.99))))
     height, width = heights.shape
     side_m = min(height, width) * pitch_m
-    plausible = (UNITS_M[u] for u in ("mm", "m", "um") if RELIEF[0] <= relief * UNITS_M[u] / side_m < RELIEF[1])
+    plausible = (
+        UNITS_M[u]
+        for u in ("mm", "m", "um")
+        if RELIEF[0] <= relief * UNITS_M[u] / side_m < RELIEF[1]
+    )
     scale_m = next(plausible, None) if given.scale_m is None else given.scale_m
     if scale_m is None:
         what = f"{name}: the unit of its heights is not stated: they span {relief:.4g} over {1e3 * side_m:.4g} mm"
         raise UserError(what, fix="state it: --unit mm, --unit m or --unit um")
     is_down = name.rpartition(" ")[2].partition(":")[0].lower() in DOWN_NAMES
-    direction = "grow away from the viewer, as its name says" if is_down else "grow towards the viewer: holes are low"
+    direction = (
+        "grow away from the viewer, as its name says"
+        if is_down
+        else "grow towards the viewer: holes are low"
+    )
     z_step_m = 0.0 if (known % 1).any() else scale_m  # whole numbers were rounded, others were not
     read = partial(_map_frames, path, load, given.array, pitch_m, scale_m if is_down else -scale_m)
     note = f"height map {name}: {width} x {height} pixels of {1e3 * pitch_m:.4g} mm; its numbers {direction}"
     notes = (note, f"the median height lies at z = {1e3 * DISTANCE_M:g} mm")
     origin = f"the map's relief, {relief:.4g} over {1e3 * side_m:.4g} mm (--unit states another)"
-    found = Recording(path.name, read, (height, width), scale_m, z_step_m, (path,), notes=notes, unit_from=origin)
+    found = Recording(
+        path.name, read, (height, width), scale_m, z_step_m, (path,), notes=notes, unit_from=origin
+    )
     return replace(found, projection="parallel")
 
 
-def _map_frames(path: Path, load: ArraysLoader, array: str | None, pitch_m: float, scale_m: float) -> Iterator[Frame]:
+def _map_frames(
+    path: Path, load: ArraysLoader, array: str | None, pitch_m: float, scale_m: float
+) -> Iterator[Frame]:
     """Yield the map as a frame. If ``scale_m`` is below 0, heights grow towards the viewer."""
     name, heights = _map_in(path, load, array)
     known = np.isfinite(heights)
@@ -366,7 +474,10 @@ def _map_frames(path: Path, load: ArraysLoader, array: str | None, pitch_m: floa
     z_m += DISTANCE_M - (np.median(z_m[known]) if known.any() else 0.0)
     z_m[~known] = np.nan
     v, u = np.mgrid[: heights.shape[0], : heights.shape[1]]
-    xy_m = np.stack([u - (heights.shape[1] - 1) / 2, v - (heights.shape[0] - 1) / 2], axis=-1) * pitch_m
+    xy_m = (
+        np.stack([u - (heights.shape[1] - 1) / 2, v - (heights.shape[0] - 1) / 2], axis=-1)
+        * pitch_m
+    )
     xy_m[~known] = np.nan
     reason = np.where(known, Reason.VALID, Reason.NO_RETURN).astype(np.uint8)
     yield Frame(name, z_m.astype(np.float32), reason, xy_m=xy_m)

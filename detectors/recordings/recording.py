@@ -31,8 +31,14 @@ def read_errors(what: str, legal: str, fix: str = "copy or export it again") -> 
     except UserError:
         raise
     except Exception as error:
-        why = "there is not enough memory for the size that it states" if isinstance(error, MemoryError) else str(error)
-        raise UserError(f"{what} ({(why or type(error).__name__)[:200]})", legal=legal, fix=fix) from error
+        why = (
+            "there is not enough memory for the size that it states"
+            if isinstance(error, MemoryError)
+            else str(error)
+        )
+        raise UserError(
+            f"{what} ({(why or type(error).__name__)[:200]})", legal=legal, fix=fix
+        ) from error
 
 
 @dataclass(frozen=True)
@@ -77,12 +83,21 @@ class Recording:
 
     @classmethod
     def begun(
-        cls, name: str, read: Callable[[], Iterator[Frame]], scale_m: float, is_whole: bool = False, **more: Any
+        cls,
+        name: str,
+        read: Callable[[], Iterator[Frame]],
+        scale_m: float,
+        is_whole: bool = False,
+        **more: Any,
     ) -> Recording:
         """Return a recording of the first frame's size and step. Raises UserError without a frame."""
         first = next(read(), None)
         if first is None:
-            raise UserError(f"{name}: contains no frame", legal="at least one frame", fix="copy or record it again")
+            raise UserError(
+                f"{name}: contains no frame",
+                legal="at least one frame",
+                fix="copy or record it again",
+            )
         step_m = scale_m if is_whole else rounding_step_m(first.z_m)
         return cls(name, read, first.z_m.shape, scale_m, step_m, **more)
 
@@ -113,9 +128,13 @@ class Recording:
             count += 1
             if frame.z_m.shape != self.shape:
                 what = "pixels" if self.organised else "points"
-                sizes = [f"{w} x {h}" if h > 1 else str(w) for h, w in (frame.z_m.shape, self.shape)]
+                sizes = [
+                    f"{w} x {h}" if h > 1 else str(w) for h, w in (frame.z_m.shape, self.shape)
+                ]
                 what = f"{frame.name}: {sizes[0]} {what}, but the first frame has {sizes[1]}"
-                raise UserError(what, legal="frames of one size", fix="run the differing frames separately")
+                raise UserError(
+                    what, legal="frames of one size", fix="run the differing frames separately"
+                )
             if self.slopes is not None and frame.xy_m is None:
                 rayless = np.isnan(self.slopes[..., 0]) & (frame.reason == Reason.VALID)
                 if rayless.any():
@@ -130,7 +149,9 @@ class Recording:
             yield frame
         if not judged:
             fix = "check the selected frames, and that the target was within the camera's range"
-            raise UserError(f"{self.name}: no valid pixel in {count} frame{'s' * (count != 1)}", fix=fix)
+            raise UserError(
+                f"{self.name}: no valid pixel in {count} frame{'s' * (count != 1)}", fix=fix
+            )
 
 
 @lru_cache(maxsize=2)

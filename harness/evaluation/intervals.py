@@ -81,7 +81,9 @@ def poisson_rate(count: ArrayLike, exposure: ArrayLike) -> tuple[np.ndarray, np.
 
 def mean_t(mean: ArrayLike, std: ArrayLike, n: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Return Student's interval from a sample's mean, standard deviation (n - 1) and size; NaN below two values."""
-    m, s, k = np.broadcast_arrays(np.asarray(mean, float), np.asarray(std, float), np.asarray(n, float))
+    m, s, k = np.broadcast_arrays(
+        np.asarray(mean, float), np.asarray(std, float), np.asarray(n, float)
+    )
     size = np.where(k >= 2, k, np.nan)
     half = special.stdtrit(size - 1, UPPER) * s / np.sqrt(size)
     return m - half, m + half
@@ -113,7 +115,9 @@ def standardised_bias(bias: float, std: float, n: int) -> Interval:
     return Interval(ratio - half, ratio + half)
 
 
-def bootstrap(statistic: Callable[[np.ndarray], np.ndarray], n: int, *, resamples: int = RESAMPLES) -> Interval:
+def bootstrap(
+    statistic: Callable[[np.ndarray], np.ndarray], n: int, *, resamples: int = RESAMPLES
+) -> Interval:
     """Return the percentile bootstrap over ``n`` exchangeable units (repeats, or blocks of pixels), with the same draws
     every time. ``statistic`` maps indices (resamples, n) to values (resamples,); NaN are left out."""
     if n < 2:
@@ -128,7 +132,9 @@ def percentiles(draws: np.ndarray, confidence: float = CONFIDENCE) -> Interval:
     known = draws[~np.isnan(draws)]
     if len(known) < 2 or len(known) < 0.5 * len(draws):
         return UNKNOWN
-    low, high = np.quantile(known, [(1 - confidence) / 2, (1 + confidence) / 2], method="inverted_cdf")
+    low, high = np.quantile(
+        known, [(1 - confidence) / 2, (1 + confidence) / 2], method="inverted_cdf"
+    )
     return Interval(float(low), float(high))
 
 
@@ -148,7 +154,9 @@ class FalseCallRate:
 def false_call_rate(calls: int, area_m2: float) -> FalseCallRate:
     """Return the rate of ``calls`` false calls on ``area_m2`` of unflawed surface, a Poisson count; exact limits."""
     if calls < 0 or not area_m2 > 0:
-        raise UserError(f"{calls} false calls on {area_m2:g} m2", legal="0 calls or more, an area above 0")
+        raise UserError(
+            f"{calls} false calls on {area_m2:g} m2", legal="0 calls or more, an area above 0"
+        )
     low, high = poisson_rate(calls, area_m2)
     return FalseCallRate(calls / area_m2, Interval(float(low), float(high)), calls, area_m2)
 
@@ -175,16 +183,22 @@ def threshold_for_rate(
     k) distributed (Wilks 1941). Use other runs for judging. Raises UserError if the runs are too few."""
     scores = np.asarray(highest_scores_per_run, float).ravel()
     if not (area_m2 > 0 and rate_per_m2 > 0):
-        raise UserError(f"area {area_m2:g} m2, wanted rate {rate_per_m2:g} per m2", legal="both above 0")
+        raise UserError(
+            f"area {area_m2:g} m2, wanted rate {rate_per_m2:g} per m2", legal="both above 0"
+        )
     if np.any(np.isnan(scores)) or np.any(np.isposinf(scores)):
-        raise UserError("not every highest score is a number", legal="a finite score, or -inf for no finding")
+        raise UserError(
+            "not every highest score is a number", legal="a finite score, or -inf for no finding"
+        )
     n, wanted = len(scores), -float(np.expm1(-rate_per_m2 * area_m2))
     # the margin is for rounding where (n + 1) * wanted is a whole number
     k = min(int(np.floor((n + 1) * wanted * (1 + 1e-12))) - 1, n - 1)
     if k < 0:
         what = f"{n} hole-free runs of {area_m2:.2g} m² are too few for a rate of {rate_per_m2:g} per m² of false calls"
         fix = "simulate more hole-free boards, or ask for a higher rate"
-        raise UserError(what, legal=f"at least {int(np.ceil(1 / wanted * (1 - 1e-12))) - 1} runs", fix=fix)
+        raise UserError(
+            what, legal=f"at least {int(np.ceil(1 / wanted * (1 - 1e-12))) - 1} runs", fix=fix
+        )
     value = float(np.sort(scores)[n - 1 - k])
     above = int(np.sum(scores > value))
     bound = float(special.betaincinv(above + 1, n - above, confidence))

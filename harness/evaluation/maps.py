@@ -15,7 +15,7 @@ import pandas as pd
 from harness.evaluation.intervals import UNKNOWN, Interval, bootstrap, mean_t
 from harness.evaluation.set_ups import compare_set_ups
 from harness.evaluation.summary import HoleState, found_holes, with_columns
-from harness.tables.trials import ResultTables
+from harness.records.trials import ResultTables
 from harness.vocabulary.path_names import value_text
 
 VIEWS, REGISTRATION, MERGE = "mapping.views", "mapping.registration.method", "mapping.merge.kind"
@@ -23,7 +23,9 @@ VIEWS, REGISTRATION, MERGE = "mapping.views", "mapping.registration.method", "ma
 CAMERA_UNIT = "source.camera.unit_seed"
 MANY = 50  # number of frames per view at which maps are compared, if they have as many
 THESIS_REGISTRATION, THESIS_MERGE = "cpd", "grid"
-LARGE_MM = 25.4 * 3 / 8  # diameter from which two views are claimed to measure sizes better than one view
+LARGE_MM = (
+    25.4 * 3 / 8
+)  # diameter from which two views are claimed to measure sizes better than one view
 FEWEST_BOTH = 2  # fewest repeats in which both maps must measure a hole to compare it
 
 
@@ -46,7 +48,13 @@ def maps_of(tables: ResultTables) -> list[MapSetUp]:
     varied = [str(path) for path in tables.axes["path"] if path not in (VIEWS, REGISTRATION, MERGE)]
     runs, seen = tables.runs, dict[Any, Any]()
     if not runs.empty and "views_used" in runs:
-        seen = (runs["views_used"] + runs["views_left_out"]).groupby(runs["variant"]).max().dropna().to_dict()
+        seen = (
+            (runs["views_used"] + runs["views_left_out"])
+            .groupby(runs["variant"])
+            .max()
+            .dropna()
+            .to_dict()
+        )
 
     def views(row: pd.Series) -> int:
         try:
@@ -68,12 +76,21 @@ def compare_maps(tables: ResultTables, summary: pd.DataFrame) -> pd.DataFrame:
     """Return the rows of `compare_set_ups` for all set-ups with a map, and the fields of `MapSetUp`. Over runs on the
     damaged board: mean ``views_left_out``, median ``seconds_map``, and the noise's deviation ``surface_std_mm``."""
     maps = pd.DataFrame([asdict(each) for each in maps_of(tables)])
-    compared = compare_set_ups(tables, summary, [str(name) for name in maps["variant"]], half_sizes=False)
+    compared = compare_set_ups(
+        tables, summary, [str(name) for name in maps["variant"]], half_sizes=False
+    )
     if compared.empty:
         return compared
-    columns = {"views_left_out": ("views_left_out", "mean"), "seconds_map": ("seconds_map", "median")}
+    columns = {
+        "views_left_out": ("views_left_out", "mean"),
+        "seconds_map": ("seconds_map", "median"),
+    }
     columns |= {"surface_std_mm": ("surface_noise_mm", "std")}
-    means = tables.runs[tables.runs["role"] == "damaged"].groupby(["variant", "frames"], as_index=False).agg(**columns)
+    means = (
+        tables.runs[tables.runs["role"] == "damaged"]
+        .groupby(["variant", "frames"], as_index=False)
+        .agg(**columns)
+    )
     return compared.merge(maps, "left", "variant").merge(means, "left", ["variant", "frames"])
 
 
@@ -127,13 +144,18 @@ def size_errors(first: pd.DataFrame, second: pd.DataFrame) -> SizeErrors:
     change = (errors(second) - errors(first)).dropna(axis="columns", thresh=FEWEST_BOTH)
     diameters = first.groupby("hole")["true_diameter_mm"].first().astype(float)
     holes = sorted(change.columns, key=lambda hole: diameters[hole])
-    sizes, differences = np.array([diameters[hole] for hole in holes]), np.asarray(change[holes], float)
+    sizes, differences = (
+        np.array([diameters[hole] for hole in holes]),
+        np.asarray(change[holes], float),
+    )
     return SizeErrors(tuple(map(str, holes)), sizes, differences)
 
 
 def run_ratio(first: pd.DataFrame, second: pd.DataFrame, column: str) -> Change:
     """Return the paired change of a column's logarithm over runs on the damaged board; its ``exp`` is a ratio."""
-    return change_of(np.log((_by_repeat(second)[column] / _by_repeat(first)[column]).to_numpy(float)))
+    return change_of(
+        np.log((_by_repeat(second)[column] / _by_repeat(first)[column]).to_numpy(float))
+    )
 
 
 def _by_repeat(runs: pd.DataFrame) -> pd.DataFrame:
@@ -168,21 +190,29 @@ class MapCase:
     def variant(self, views: int, registration: str, merge: str) -> str | None:
         """Return the name of the set-up. All registrations of a single view are the same, so any of them will do."""
         alike = [each for each in self.set_ups if (each.views, each.merge) == (views, merge)]
-        chosen = [each for each in alike if each.registration == registration] or (alike if views == 1 else [])
+        chosen = [each for each in alike if each.registration == registration] or (
+            alike if views == 1 else []
+        )
         return chosen[0].variant if chosen else None
 
     def frames(self, variant: str) -> list[int]:
         """Return the numbers of frames with which this variant was finished, ascending."""
-        return sorted(int(n) for n in self.summary["frames"][self.summary["variant"] == variant].unique())
+        return sorted(
+            int(n) for n in self.summary["frames"][self.summary["variant"] == variant].unique()
+        )
 
     def common_frames(self, *variants: str | None) -> int | None:
         """Return `MANY` if all variants have it, else the most that all have; None if a variant is missing."""
         if any(variant is None for variant in variants):
             return None
-        shared = set.intersection(*(set(self.frames(variant)) for variant in variants if variant is not None))
+        shared = set.intersection(
+            *(set(self.frames(variant)) for variant in variants if variant is not None)
+        )
         return MANY if MANY in shared else max(shared, default=None)
 
-    def named(self, views: int, registration: str, merge: str, frames: int | None = None) -> Map | None:
+    def named(
+        self, views: int, registration: str, merge: str, frames: int | None = None
+    ) -> Map | None:
         """Return the map of that name with this number of frames (default: that of `common_frames`), if any."""
         variant = self.variant(views, registration, merge)
         chosen = self.common_frames(variant) if frames is None else frames
@@ -193,7 +223,9 @@ class MapCase:
     def single(self, frames: int | None = None) -> Map | None:
         """Return the map of a single view, by the thesis' merging if that was tried."""
         merges = [THESIS_MERGE, *(each.merge for each in self.set_ups)]
-        singles = (self.named(1, THESIS_REGISTRATION, merge, frames) for merge in dict.fromkeys(merges))
+        singles = (
+            self.named(1, THESIS_REGISTRATION, merge, frames) for merge in dict.fromkeys(merges)
+        )
         return next((each for each in singles if each is not None), None)
 
     def holes(self, chosen: Map) -> pd.DataFrame:
@@ -211,7 +243,10 @@ class MapCase:
     def registrations(self, frames: int) -> pd.DataFrame:
         """Return the registrations of the set-ups with this number of frames."""
         rows = self.tables.registrations
-        return rows[(rows["frames"] == frames) & rows["variant"].isin([each.variant for each in self.set_ups])]
+        return rows[
+            (rows["frames"] == frames)
+            & rows["variant"].isin([each.variant for each in self.set_ups])
+        ]
 
 
 def _rows(table: pd.DataFrame, chosen: Map) -> pd.DataFrame:
@@ -222,10 +257,16 @@ def map_cases(tables: ResultTables, summary: pd.DataFrame) -> list[MapCase]:
     """Make one case for each place, in the order of the set-ups."""
     maps = maps_of(tables)
     places = dict.fromkeys(each.place for each in maps if not each.is_variation)
-    alike = tables.variants.assign(**{CAMERA_UNIT: ""}) if CAMERA_UNIT in tables.variants else tables.variants
+    alike = (
+        tables.variants.assign(**{CAMERA_UNIT: ""})
+        if CAMERA_UNIT in tables.variants
+        else tables.variants
+    )
     without = {each.variant: each.place for each in maps_of(replace(tables, variants=alike))}
     groups = ((place, [each for each in maps if each.place == place]) for place in places)
-    return [MapCase(tables, summary, group, place, without[group[0].variant]) for place, group in groups]
+    return [
+        MapCase(tables, summary, group, place, without[group[0].variant]) for place, group in groups
+    ]
 
 
 @dataclass(frozen=True)
@@ -254,14 +295,26 @@ def against_one(case: MapCase, registration: str, merge: str) -> AgainstOne | No
     assert single is not None and several is not None
     sizes = size_errors(case.holes(single), case.holes(several))
     large = sizes.diameters_mm >= LARGE_MM - 1e-9
-    states, runs = (case.status(single), case.status(several)), (case.runs(single), case.runs(several))
+    states, runs = (
+        (case.status(single), case.status(several)),
+        (case.runs(single), case.runs(several)),
+    )
     lost, gained = (
-        tuple(hole for hole, state in before.items() if state == "found" and after.get(hole) == "missed")
+        tuple(
+            hole
+            for hole, state in before.items()
+            if state == "found" and after.get(hole) == "missed"
+        )
         for before, after in (states, states[::-1])
     )
     before_mm, now_mm = (rows["threshold"] * rows["scale_mm"] for rows in map(_by_repeat, runs))
-    threshold, noise = change_of((now_mm - before_mm).to_numpy(float)), run_ratio(*runs, "surface_noise_mm")
-    return AgainstOne(frames, sizes, sizes.change(large), sizes.change(~large), threshold, noise, lost, gained)
+    threshold, noise = (
+        change_of((now_mm - before_mm).to_numpy(float)),
+        run_ratio(*runs, "surface_noise_mm"),
+    )
+    return AgainstOne(
+        frames, sizes, sizes.change(large), sizes.change(~large), threshold, noise, lost, gained
+    )
 
 
 def label_of(registration: str, merge: str, place: str = "") -> str:
@@ -278,14 +331,20 @@ def span(interval: Interval, digits: int = 2) -> str:
     """Return ``0.10 to 0.20``, or that the interval is unknown."""
     if not interval.known:
         return "interval unknown"
-    low, high = (round(end, digits) + 0.0 for end in (interval.low, interval.high))  # + 0.0 turns -0.0 into 0.0
+    low, high = (
+        round(end, digits) + 0.0 for end in (interval.low, interval.high)
+    )  # + 0.0 turns -0.0 into 0.0
     return f"{low:.{digits}f} to {high:.{digits}f}"
 
 
 def change_text(change: Change) -> str:
     """Return ``+0.12 mm (0.05 to 0.19)``."""
     known = np.isfinite(change.mean)
-    return f"{round(change.mean, 2) + 0.0:+.2f} mm ({span(change.interval)})" if known else "not compared"
+    return (
+        f"{round(change.mean, 2) + 0.0:+.2f} mm ({span(change.interval)})"
+        if known
+        else "not compared"
+    )
 
 
 def ratio_text(change: Change) -> str:
@@ -318,7 +377,9 @@ def summarise_registrations(registrations: pd.DataFrame) -> pd.DataFrame:
     both `PARTS`: median, root mean square, the value that covariances predict, and the ``_ratio`` of actual to
     predicted (1: honest, above 1: too sure) with a bootstrap over repeats. ``guess_mm``: error of the initial guess."""
     groups = registrations.groupby(["method", "frames"], sort=False)
-    return pd.DataFrame([{"method": method, "frames": frames} | _summary(part) for (method, frames), part in groups])
+    return pd.DataFrame(
+        [{"method": method, "frames": frames} | _summary(part) for (method, frames), part in groups]
+    )
 
 
 def by_views(registrations: pd.DataFrame, counts: Sequence[int]) -> pd.DataFrame:
@@ -329,7 +390,11 @@ def by_views(registrations: pd.DataFrame, counts: Sequence[int]) -> pd.DataFrame
             rows = of_map(registrations, method, views)
             if len(rows):
                 parts.append(summarise_registrations(rows).assign(views=views))
-    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=["method", "frames", "views"])
+    return (
+        pd.concat(parts, ignore_index=True)
+        if parts
+        else pd.DataFrame(columns=["method", "frames", "views"])
+    )
 
 
 def trusted(registrations: pd.DataFrame) -> pd.DataFrame:
@@ -344,9 +409,15 @@ def per_pair(registrations: pd.DataFrame, column: str) -> pd.Series:
     return (rows[column] ** 2).groupby(rows["view"]).mean().pow(0.5)
 
 
-def paired_ratio(first: pd.DataFrame, second: pd.DataFrame, column: str) -> tuple[float, float, float, int]:
+def paired_ratio(
+    first: pd.DataFrame, second: pd.DataFrame, column: str
+) -> tuple[float, float, float, int]:
     """Return the geometric mean of second / first over pairs of views, Student's interval, number; NaN below two."""
-    both = per_pair(first, column).to_frame("first").join(per_pair(second, column).rename("second"), how="inner")
+    both = (
+        per_pair(first, column)
+        .to_frame("first")
+        .join(per_pair(second, column).rename("second"), how="inner")
+    )
     both = both[(both > 0).all(axis=1)]
     if len(both) < 2:
         return np.nan, np.nan, np.nan, len(both)
@@ -357,7 +428,9 @@ def paired_ratio(first: pd.DataFrame, second: pd.DataFrame, column: str) -> tupl
 
 def _summary(part: pd.DataFrame) -> dict[str, Any]:
     good, failures = trusted(part), part.loc[part["failure"] != "", "failure"]
-    order = sorted(failures.value_counts(sort=False).items(), key=lambda item: (-int(item[1]), str(item[0])))
+    order = sorted(
+        failures.value_counts(sort=False).items(), key=lambda item: (-int(item[1]), str(item[0]))
+    )
     row: dict[str, Any] = {
         **{"n": len(part), "failed": len(failures)},
         "reasons": [f"{reason} ({count})" for reason, count in order[:MOST_REASONS]],
@@ -370,7 +443,9 @@ def _summary(part: pd.DataFrame) -> dict[str, Any]:
         actual, known = errors["actual"], errors.notna().all(axis=1)
         rms = np.sqrt((errors[known] ** 2).mean())
         # units resampled
-        sums = np.asarray((errors[known] ** 2).groupby([good.loc[known, key] for key in UNIT]).sum(), float)
+        sums = np.asarray(
+            (errors[known] ** 2).groupby([good.loc[known, key] for key in UNIT]).sum(), float
+        )
         ratio = _ratio(sums, np.arange(len(sums))[None]).item() if rms["predicted"] > 0 else np.nan
         ends = bootstrap(partial(_ratio, sums), len(sums)) if rms["predicted"] > 0 else UNKNOWN
         row |= {

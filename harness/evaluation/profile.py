@@ -6,7 +6,9 @@ from typing import Literal
 import numpy as np
 
 FEWEST_PIXELS = 12  # valid pixels inside the outline to distinguish two shapes; with fewer, one ring is the whole hole
-FEWEST_VALID = 0.5  # least share of valid pixels inside the outline: fewer may show only one side of the hole
+FEWEST_VALID = (
+    0.5  # least share of valid pixels inside the outline: fewer may show only one side of the hole
+)
 CLEARLY = 0.8  # a shape fits clearly better if its rms misfit is at most this share of the other's (fixed beforehand)
 
 
@@ -71,7 +73,11 @@ def true_residual_mm(cloud: ExampleCloud, hole: HoleInView) -> np.ndarray:
     few for six coefficients."""
     v, u = np.indices(cloud.residual_mm.shape)
     outer = max(3 * hole.radius_px, 1.2 * hole.radius_px + 4)
-    face = cloud.inside & np.isfinite(cloud.z_truth_mm) & (np.hypot(u - hole.u_px, v - hole.v_px) <= outer)
+    face = (
+        cloud.inside
+        & np.isfinite(cloud.z_truth_mm)
+        & (np.hypot(u - hole.u_px, v - hole.v_px) <= outer)
+    )
     for known in cloud.truth:
         face &= relative_radius(cloud, known) > 1.2
     if face.sum() < 12:
@@ -93,13 +99,17 @@ def hole_shape(cloud: ExampleCloud, hole: HoleInView) -> HoleShape | None:
     true_depth = true_residual_mm(cloud, hole)
     known = outline & np.isfinite(true_depth)
     flat, round_ = (_misfit(measured, shape) for shape in (np.ones_like(rho), bowl(rho)))
-    true_flat, true_round = (_misfit(true_depth[known], shape) for shape in (np.ones(known.sum()), bowl(radius[known])))
+    true_flat, true_round = (
+        _misfit(true_depth[known], shape) for shape in (np.ones(known.sum()), bowl(radius[known]))
+    )
     return HoleShape(hole.hole, int(valid.sum()), flat, round_, true_flat, true_round)
 
 
 def hole_shapes(cloud: ExampleCloud) -> list[HoleShape]:
     """Return the shapes of all holes that are large and valid enough, smallest first."""
-    shapes = (hole_shape(cloud, hole) for hole in sorted(cloud.truth, key=lambda hole: hole.diameter_mm))
+    shapes = (
+        hole_shape(cloud, hole) for hole in sorted(cloud.truth, key=lambda hole: hole.diameter_mm)
+    )
     return [shape for shape in shapes if shape is not None]
 
 

@@ -14,7 +14,7 @@ from scipy.optimize import isotonic_regression
 
 from harness.evaluation.intervals import percentiles
 from harness.evaluation.summary import false_calls, noise_against_frames
-from harness.tables.trials import EFFECTS, ResultTables
+from harness.records.trials import EFFECTS, ResultTables
 
 MEASURES = ("extent", "model")
 KEYS = ["variant", "frames"]
@@ -55,7 +55,9 @@ class Ladder:
         of_holes = np.empty((RESAMPLES, holes))
         for size in np.unique(self.diameters_mm):
             alike = self.diameters_mm == size
-            of_holes[:, alike] = rng.multinomial(alike.sum(), np.full(alike.sum(), 1 / alike.sum()), RESAMPLES)
+            of_holes[:, alike] = rng.multinomial(
+                alike.sum(), np.full(alike.sum(), 1 / alike.sum()), RESAMPLES
+            )
         return self._half_sizes(of_repeats, of_holes)
 
     def _half_sizes(self, of_repeats: np.ndarray, of_holes: np.ndarray) -> np.ndarray:
@@ -95,7 +97,10 @@ def half_size(sizes_mm: np.ndarray, rates: np.ndarray) -> np.ndarray:
 
 def set_ups_of(tables: ResultTables) -> list[str]:
     """Return the labels of the experiment's set-ups in their order, without variations."""
-    return [str(name) for name in tables.variants["variant"][~tables.variants["is_variation"].astype(bool)]]
+    return [
+        str(name)
+        for name in tables.variants["variant"][~tables.variants["is_variation"].astype(bool)]
+    ]
 
 
 def compare_set_ups(
@@ -105,29 +110,44 @@ def compare_set_ups(
     only for set-ups, and with ``half_sizes``, as they need a bootstrap. ``<measure>_*``: for each measure, of all
     single diameters of found holes against the truth. ``<measure>_place_*``: of distances from the largest hole (none
     if several are largest). Also: noise of averaged z on probes, means over hole-free runs of ``tables.noise``."""
-    summary, halved = summary[summary["variant"].isin(variants)], set_ups_of(tables) if half_sizes else []
+    summary, halved = (
+        summary[summary["variant"].isin(variants)],
+        set_ups_of(tables) if half_sizes else [],
+    )
     groups = summary.groupby(KEYS, sort=False)
     table = pd.DataFrame([_row(tables, part, variant in halved) for (variant, _), part in groups])
     if table.empty:
         return table
-    noise = noise_against_frames(tables.probes)[[*KEYS, "temporal_rms_mm", "offset_mm", "pattern_mm"]]
+    noise = noise_against_frames(tables.probes)[
+        [*KEYS, "temporal_rms_mm", "offset_mm", "pattern_mm"]
+    ]
     calls = false_calls(tables.runs)
     calls = calls[calls["role"] == "damaged"]
     calls = calls[[*KEYS, "runs", "false_calls", "threshold", "threshold_mm", "surface_noise_mm"]]
     for part in (noise, calls):
         table = table.merge(part, "left", KEYS)
-    table = table.rename(columns={"temporal_rms_mm": "temporal_mm", "surface_noise_mm": "surface_mm"})
+    table = table.rename(
+        columns={"temporal_rms_mm": "temporal_mm", "surface_noise_mm": "surface_mm"}
+    )
     if len(tables.noise):  # empty for maps: their pixels are not those of a camera
-        columns = [name for name in tables.noise.columns if name not in ("repeat", *tables.axes["path"])]
-        table = table.merge(tables.noise[columns].groupby(KEYS, as_index=False).mean(), "left", KEYS)
+        columns = [
+            name for name in tables.noise.columns if name not in ("repeat", *tables.axes["path"])
+        ]
+        table = table.merge(
+            tables.noise[columns].groupby(KEYS, as_index=False).mean(), "left", KEYS
+        )
     order = {variant: place for place, variant in enumerate(variants)}
-    return table.sort_values(KEYS, key=lambda c: c.map(order) if c.name == "variant" else c, ignore_index=True)
+    return table.sort_values(
+        KEYS, key=lambda c: c.map(order) if c.name == "variant" else c, ignore_index=True
+    )
 
 
 def _row(tables: ResultTables, part: pd.DataFrame, half_sizes: bool) -> dict[str, Any]:
     """Return a summary of the holes of one set-up at one number of frames, from its summary rows ``part``."""
     first = part.iloc[0]
-    trials = tables.holes[(tables.holes["variant"] == first["variant"]) & (tables.holes["frames"] == first["frames"])]
+    trials = tables.holes[
+        (tables.holes["variant"] == first["variant"]) & (tables.holes["frames"] == first["frames"])
+    ]
     found = list(part["hole"][part["status"] == "found"])
     row: dict[str, Any] = {
         "variant": first["variant"],
@@ -142,7 +162,11 @@ def _row(tables: ResultTables, part: pd.DataFrame, half_sizes: bool) -> dict[str
     if half_sizes:
         ladder = ladder_of(trials)
         interval = percentiles(ladder.half_draws_mm)
-        row |= {"half_mm": ladder.half_mm, "half_low_mm": interval.low, "half_high_mm": interval.high}
+        row |= {
+            "half_mm": ladder.half_mm,
+            "half_low_mm": interval.low,
+            "half_high_mm": interval.high,
+        }
     of_found = trials[trials["hole"].isin(found)]
     largest = int((part["true_diameter_mm"] == part["true_diameter_mm"].max()).sum())
     # Distances count from the largest hole; if several are largest, any may be the largest cluster.
@@ -166,32 +190,71 @@ def effect_costs(tables: ResultTables) -> pd.DataFrame:
         return EFFECTS.frame([])
     names = dict(zip(tables.axes["path"], tables.axes["name"], strict=True))
     axes, nothing, found = list(tables.axes["path"])[1:], frozenset[str](), list[dict[str, Any]]()
-    for values, part in set_ups.groupby(axes, sort=False, dropna=False) if axes else [((), set_ups)]:
-        place = ", ".join(f"{names[path]}={value}" for path, value in zip(axes, values, strict=True))
+    for values, part in (
+        set_ups.groupby(axes, sort=False, dropna=False) if axes else [((), set_ups)]
+    ):
+        place = ", ".join(
+            f"{names[path]}={value}" for path, value in zip(axes, values, strict=True)
+        )
         switches = {str(row["variant"]): json.loads(row["switches"]) for _, row in part.iterrows()}
-        by_switches = {frozenset(name for name, is_on in row.items() if is_on): name for name, row in switches.items()}
+        by_switches = {
+            frozenset(name for name, is_on in row.items() if is_on): name
+            for name, row in switches.items()
+        }
         everything = max(by_switches, key=len)
-        effects = [(name.replace("_", " "), frozenset([name])) for name in switches[by_switches[everything]]]
+        effects = [
+            (name.replace("_", " "), frozenset([name]))
+            for name in switches[by_switches[everything]]
+        ]
         wanted = [(effect, "nothing", nothing, alone) for effect, alone in effects]
-        wanted += [(effect, "all others", everything - alone, everything) for effect, alone in effects]
+        wanted += [
+            (effect, "all others", everything - alone, everything) for effect, alone in effects
+        ]
         wanted.append(("all", "nothing", nothing, everything))
-        for frames, rows in tables.holes[tables.holes["variant"].isin(by_switches.values())].groupby("frames"):
+        for frames, rows in tables.holes[
+            tables.holes["variant"].isin(by_switches.values())
+        ].groupby("frames"):
             by_variant = {str(name): ladder_of(part) for name, part in rows.groupby("variant")}
-            ladders = {on: by_variant[variant] for on, variant in by_switches.items() if variant in by_variant}
+            ladders = {
+                on: by_variant[variant]
+                for on, variant in by_switches.items()
+                if variant in by_variant
+            }
             for effect, against, off, on in wanted:
                 if cost := _cost(ladders, off, on):
-                    found.append({"place": place, "frames": frames, "effect": effect, "against": against, **cost})
+                    found.append(
+                        {
+                            "place": place,
+                            "frames": frames,
+                            "effect": effect,
+                            "against": against,
+                            **cost,
+                        }
+                    )
     return EFFECTS.frame(found)
 
 
-def _cost(ladders: Mapping[frozenset[str], Ladder], off: frozenset[str], on: frozenset[str]) -> dict[str, Any]:
+def _cost(
+    ladders: Mapping[frozenset[str], Ladder], off: frozenset[str], on: frozenset[str]
+) -> dict[str, Any]:
     """Return the paired difference of two set-ups with its interval, and whether both sizes lie on the ladder (else it
     is only a bound); empty if either was not finished, or not with the same repeats."""
-    if off not in ladders or on not in ladders or ladders[off].detected.shape != ladders[on].detected.shape:
+    if (
+        off not in ladders
+        or on not in ladders
+        or ladders[off].detected.shape != ladders[on].detected.shape
+    ):
         return {}
     before, after = ladders[off], ladders[on]
-    with np.errstate(invalid="ignore"):  # both off the ladder: a difference of infinities is unknown
+    with np.errstate(
+        invalid="ignore"
+    ):  # both off the ladder: a difference of infinities is unknown
         ends = percentiles(after.half_draws_mm - before.half_draws_mm)
         mm = float(np.subtract(after.half_mm, before.half_mm))
     on_ladder = not (before.at_the_end or after.at_the_end)
-    return {"loss_mm": mm, "loss_low_mm": ends.low, "loss_high_mm": ends.high, "on_ladder": on_ladder}
+    return {
+        "loss_mm": mm,
+        "loss_low_mm": ends.low,
+        "loss_high_mm": ends.high,
+        "on_ladder": on_ladder,
+    }

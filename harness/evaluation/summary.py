@@ -11,7 +11,7 @@ from scipy.optimize import nnls
 
 from harness.evaluation import intervals
 from harness.evaluation.intervals import Interval, bootstrap
-from harness.tables.trials import TRIALS, TRUTH
+from harness.records.trials import TRIALS, TRUTH
 
 HoleState = Literal["found", "missed", "undecided"]
 Measure = Literal["extent", "model"]
@@ -28,7 +28,9 @@ TRUTH_COLUMNS = [column.name for column in TRUTH]
 
 def by_hole(names: pd.Series) -> pd.Series:
     """Return a sort key: holes by number if they have one ("2" before "11"), then the others by name."""
-    return names.map(lambda name: (0, int(name), "") if str(name).isdecimal() else (1, 0, str(name)))
+    return names.map(
+        lambda name: (0, int(name), "") if str(name).isdecimal() else (1, 0, str(name))
+    )
 
 
 def summarise_holes(holes: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFrame:
@@ -44,7 +46,9 @@ def summarise_holes(holes: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFra
     out["detected"] = groups["detected"].sum().astype(int)
     out["rate"] = out["detected"] / out["n"]
     out["rate_low"], out["rate_high"] = intervals.wilson(out["detected"], out["n"])
-    out["status"] = np.select([out["rate_low"] > 0.5, out["rate_high"] < 0.5], ["found", "missed"], "undecided")
+    out["status"] = np.select(
+        [out["rate_low"] > 0.5, out["rate_high"] < 0.5], ["found", "missed"], "undecided"
+    )
     for measure in ("extent", "model"):
         out = pd.concat([out, _measured(groups, out, measure)], axis=1)
     out = pd.concat([out, _fitted(holes, out)], axis=1)
@@ -55,7 +59,11 @@ def summarise_holes(holes: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFra
 
 def with_columns(holes: pd.DataFrame) -> pd.DataFrame:
     """Return the table of holes, with its columns even if no trial on the damaged board ended."""
-    return holes if "hole" in holes else holes.reindex(columns=[column.name for column in TRIALS.columns])
+    return (
+        holes
+        if "hole" in holes
+        else holes.reindex(columns=[column.name for column in TRIALS.columns])
+    )
 
 
 def found_rule(trials: int) -> str:
@@ -76,15 +84,26 @@ def false_calls(runs: pd.DataFrame) -> pd.DataFrame:
     interval. Only runs judged at a threshold count. For hole-free runs that set it (their threshold is NaN),
     ``quiet_runs`` is their number and ``quiet_highest`` the highest of their quiet thresholds."""
     keys = ["variant", "frames"]
-    judged = runs[runs["threshold"].notna()].assign(threshold_mm=lambda r: r["threshold"] * r["scale_mm"])
-    counts, means = {"runs": ("repeat", "size"), "false_calls": ("false_calls", "sum")}, ("threshold", "threshold_mm")
+    judged = runs[runs["threshold"].notna()].assign(
+        threshold_mm=lambda r: r["threshold"] * r["scale_mm"]
+    )
+    counts, means = (
+        {"runs": ("repeat", "size"), "false_calls": ("false_calls", "sum")},
+        ("threshold", "threshold_mm"),
+    )
     counts |= {name: (name, "mean") for name in (*means, "surface_noise_mm")}
     out = judged.groupby([*keys, "role"], sort=False, as_index=False).agg(**counts)
     quiet = runs[runs["role"] == "hole_free"].groupby(keys, as_index=False)
-    out = out.merge(quiet.agg(quiet_runs=("repeat", "size"), quiet_highest=("quiet_threshold", "max")), "left", keys)
+    out = out.merge(
+        quiet.agg(quiet_runs=("repeat", "size"), quiet_highest=("quiet_threshold", "max")),
+        "left",
+        keys,
+    )
     out["false_calls"] = out["false_calls"].astype(int)
     out["per_run"] = out["false_calls"] / out["runs"]
-    out["per_run_low"], out["per_run_high"] = intervals.poisson_rate(out["false_calls"], out["runs"])
+    out["per_run_low"], out["per_run_high"] = intervals.poisson_rate(
+        out["false_calls"], out["runs"]
+    )
     return out.sort_values([*keys, "role"], key=_order, kind="stable", ignore_index=True)
 
 
@@ -93,7 +112,9 @@ def _measured(groups: Any, truth: pd.DataFrame, measure: Measure) -> pd.DataFram
     diameter, offset = groups[f"{measure}_diameter_mm"], groups[f"{measure}_offset_mm"]
     out = diameter.agg(measured="count", diameter_mean_mm="mean", diameter_std_mm="std")
     out["bias_mm"] = out["diameter_mean_mm"] - truth["true_diameter_mm"]
-    out["bias_low_mm"], out["bias_high_mm"] = intervals.mean_t(out["bias_mm"], out["diameter_std_mm"], out["measured"])
+    out["bias_low_mm"], out["bias_high_mm"] = intervals.mean_t(
+        out["bias_mm"], out["diameter_std_mm"], out["measured"]
+    )
     out = out.join(offset.agg(offset_mean_mm="mean", offset_std_mm="std"))
     out["offset_bias_mm"] = out["offset_mean_mm"] - truth["true_offset_mm"]
     out["error_mean_mm"] = groups[f"{measure}_error_mm"].mean()
@@ -102,7 +123,9 @@ def _measured(groups: Any, truth: pd.DataFrame, measure: Measure) -> pd.DataFram
 
 def _fitted(holes: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
     """Return depths, which only the model gives, and each fit's stated standard errors, compared with the truth."""
-    miss = (holes["model_diameter_mm"] - holes["true_diameter_mm"]).abs() / holes["model_diameter_se_mm"]
+    miss = (holes["model_diameter_mm"] - holes["true_diameter_mm"]).abs() / holes[
+        "model_diameter_se_mm"
+    ]
     covered = (miss <= 1.96).astype(float).where(miss.notna())
     columns = {"model_diameter_se_mean_mm": ("model_diameter_se_mm", "mean")}
     columns |= {"model_diameter_covered": ("covered", "mean")}
@@ -127,7 +150,10 @@ def hole_list(names: Iterable[str]) -> str:
     """Return hole names as text, runs of numbers joined: ``4–7, 9``; ``none``."""
     all_names = [str(name) for name in names]
     numbered = sorted(int(name) for name in all_names if name.isdecimal())
-    runs = [[number for _, number in run] for _, run in groupby(enumerate(numbered), lambda at: at[1] - at[0])]
+    runs = [
+        [number for _, number in run]
+        for _, run in groupby(enumerate(numbered), lambda at: at[1] - at[0])
+    ]
     parts = [str(run[0]) if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs]
     return ", ".join([*parts, *(name for name in all_names if not name.isdecimal())]) or "none"
 
@@ -164,18 +190,32 @@ def noise_against_frames(probes: pd.DataFrame) -> pd.DataFrame:
         moments = _moments(part)
         if len(moments):
             variance, offset, *_ = mean = moments.mean(axis=0)
-            pattern2, repeats = float(_pattern_variance(mean, len(moments))), int(part["repeats"].median())
-            temporal, systematic, total = np.sqrt([variance, offset**2 + pattern2, variance + offset**2 + pattern2])
-            displacement, start = float(part["displacement_std_mm"].median()), (variant, frames, len(moments), repeats)
-            rows.append((*start, temporal, offset, np.sqrt(pattern2), systematic, displacement, total))
+            pattern2, repeats = (
+                float(_pattern_variance(mean, len(moments))),
+                int(part["repeats"].median()),
+            )
+            temporal, systematic, total = np.sqrt(
+                [variance, offset**2 + pattern2, variance + offset**2 + pattern2]
+            )
+            displacement, start = (
+                float(part["displacement_std_mm"].median()),
+                (variant, frames, len(moments), repeats),
+            )
+            rows.append(
+                (*start, temporal, offset, np.sqrt(pattern2), systematic, displacement, total)
+            )
     table = pd.DataFrame(rows, columns=COLUMNS)
-    table = table.sort_values("frames", kind="stable").sort_values("variant", kind="stable", ignore_index=True)
+    table = table.sort_values("frames", kind="stable").sort_values(
+        "variant", kind="stable", ignore_index=True
+    )
     first = table.groupby("variant")[["frames", "temporal_rms_mm"]].transform("first")
     table["guide_mm"] = first["temporal_rms_mm"] * np.sqrt(first["frames"] / table["frames"])
     return table
 
 
-def fit_floor(frames: Sequence[int] | np.ndarray, total_rms_mm: Sequence[float] | np.ndarray) -> float:
+def fit_floor(
+    frames: Sequence[int] | np.ndarray, total_rms_mm: Sequence[float] | np.ndarray
+) -> float:
     """Return the error that averaging cannot remove, in mm, of ``total^2 = white^2 / N + floor^2``: least squares with
     both parts non-negative, weighted for equal relative error. NaN below two different numbers of frames."""
     n, total2 = np.asarray(frames, float), np.asarray(total_rms_mm, float) ** 2
@@ -198,7 +238,9 @@ def noise_law(probes: pd.DataFrame, variant: str) -> NoiseLaw | None:
     present = usable.groupby("pixel")["frames"].nunique()
     common = present.index[present == len(frames)].sort_values()
     parts = [usable[usable["frames"] == n].set_index("pixel").loc[common] for n in frames]
-    stacked = np.stack([_moments(part) for part in parts], axis=1)  # (pixels, frames, 4), only pixels that have all
+    stacked = np.stack(
+        [_moments(part) for part in parts], axis=1
+    )  # (pixels, frames, 4), only pixels that have all
     pixels = len(stacked)
     if pixels < 2 or not (stacked[..., 0].mean(axis=0) > 0).all():
         return None
@@ -223,13 +265,20 @@ def noise_law(probes: pd.DataFrame, variant: str) -> NoiseLaw | None:
     whole = np.arange(blocks)[None]
     exponent, change = float(slope(whole)[0]), float(ratio(whole)[0])
     intervals = bootstrap(slope, blocks), bootstrap(ratio, blocks)
-    return NoiseLaw(exponent, intervals[0], change, intervals[1], int(frames[0]), int(frames[-1]), pixels)
+    return NoiseLaw(
+        exponent, intervals[0], change, intervals[1], int(frames[0]), int(frames[-1]), pixels
+    )
 
 
 def _moments(part: pd.DataFrame) -> np.ndarray:
     """Return (pixels, 4): temporal variance, mean error, its square, temporal variance left in the mean error."""
-    error, variance = part["mean_error_mm"].to_numpy(float), part["temporal_std_mm"].to_numpy(float) ** 2
-    moments = np.stack([variance, error, error**2, variance / part["repeats"].to_numpy(float)], axis=-1)
+    error, variance = (
+        part["mean_error_mm"].to_numpy(float),
+        part["temporal_std_mm"].to_numpy(float) ** 2,
+    )
+    moments = np.stack(
+        [variance, error, error**2, variance / part["repeats"].to_numpy(float)], axis=-1
+    )
     return moments[np.isfinite(moments).all(axis=1)]
 
 

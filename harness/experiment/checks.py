@@ -9,7 +9,13 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from detectors import detector_names
-from harness.experiment.schema import CaptureSource, ExperimentConfig, SimulatedSource, recording_of, splices_of
+from harness.experiment.schema import (
+    CaptureSource,
+    ExperimentConfig,
+    SimulatedSource,
+    recording_of,
+    splices_of,
+)
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.diagnose import nearest, validated, wrong_choice
 from harness.vocabulary.declaration.yaml_source import KeyPath, Problem, Source
@@ -44,7 +50,10 @@ def resolved(source: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
     if config is None or problems:
         return config, problems
     if config.capture.average.frames is not None:
-        place, message = source.key_place_of(("capture", "average", "frames")), "the number of frames is set by"
+        place, message = (
+            source.key_place_of(("capture", "average", "frames")),
+            "the number of frames is set by",
+        )
         problems.append(Problem(f"{message} `capture.frames`", place, fix="remove this key"))
     if isinstance(config.source, SimulatedSource):
         for check in (_target_problems, _mapping_problems, _flat_field_problems):
@@ -71,16 +80,26 @@ def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Proble
         return
     if config.sensitivity is not None:
         fix = "sweep the key, or run the study once for each value with --set"
-        yield Problem("a study cannot have a sensitivity", source.key_place_of(("sensitivity",)), fix=fix)
+        yield Problem(
+            "a study cannot have a sensitivity", source.key_place_of(("sensitivity",)), fix=fix
+        )
     # the criterion of a hit and the wanted rate of false calls are rules of the study, equal for all set-ups
     for path in config.sweep:
-        if path.split(".")[0] == "matching" or path == "threshold" or path.startswith("threshold.calibrate"):
+        if (
+            path.split(".")[0] == "matching"
+            or path == "threshold"
+            or path.startswith("threshold.calibrate")
+        ):
             message = f"`{path}` is a rule of the study and cannot be an axis of it"
-            fix = "run the study once for each value with --set, and compare them with harness.compare"
+            fix = (
+                "run the study once for each value with --set, and compare them with tofpod compare"
+            )
             yield Problem(message, source.key_place_of(("sweep", path)), fix=fix)
     if calibrate is not None and calibrate.boards is None:
         place = source.place_of(("threshold", "calibrate"))
-        yield Problem("a study calibrates its threshold on separate boards", place, fix="write `boards: 60`")
+        yield Problem(
+            "a study calibrates its threshold on separate boards", place, fix="write `boards: 60`"
+        )
     elif calibrate is not None and calibrate.boards is not None:
         # the number of boards bounds the rate that they can show, even if their whole face is judged: a new run exceeds
         # the highest of n with probability 1 / (n + 1), and has a false call with 1 - exp(-rate * area)
@@ -94,11 +113,15 @@ def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Proble
             yield Problem(message, boards_at, f"at least {needed}", fix=fix)
 
 
-def _target_problems(config: ExperimentConfig, simulated: SimulatedSource, source: Source) -> Iterator[Problem]:
+def _target_problems(
+    config: ExperimentConfig, simulated: SimulatedSource, source: Source
+) -> Iterator[Problem]:
     drawn = simulated.target if isinstance(simulated.target, DrawnTargetConfig) else None
     try:
         target = _declared(simulated.target)
-    except UserError as error:  # this includes a family of boards that are too full for their damage
+    except (
+        UserError
+    ) as error:  # this includes a family of boards that are too full for their damage
         yield Problem(error.message, source.place_of(TARGET), legal=error.legal, fix=error.fix)
         return
     if found := _unseen(simulated.camera, simulated.views, simulated.target):
@@ -148,7 +171,9 @@ def _unseen(
     return None
 
 
-def _unseen_pose(optics: Optics, views: AnyViews | None, target: TargetConfig) -> tuple[KeyPath, UserError] | None:
+def _unseen_pose(
+    optics: Optics, views: AnyViews | None, target: TargetConfig
+) -> tuple[KeyPath, UserError] | None:
     """Return the mistake of the first pose that sees nothing of the face within range, and the key that causes it."""
     try:
         poses = (target.pose,) if views is None else poses_of(views, target.pose)
@@ -164,13 +189,17 @@ def _unseen_pose(optics: Optics, views: AnyViews | None, target: TargetConfig) -
         except UserError as mistake:
             if views is None:
                 return TARGET, mistake
-            tilts = f"tilts {pose.tilt_x_deg:.3g} and {pose.tilt_y_deg:.3g}°, {pose.distance_m:.3g} m"
+            tilts = (
+                f"tilts {pose.tilt_x_deg:.3g} and {pose.tilt_y_deg:.3g}°, {pose.distance_m:.3g} m"
+            )
             message = f"view {number} of {len(poses)} ({tilts}): {mistake.message}"
             return VIEWS, UserError(message, legal=mistake.legal, fix=mistake.fix)
     return None
 
 
-def _mapping_problems(config: ExperimentConfig, simulated: SimulatedSource, source: Source) -> Iterator[Problem]:
+def _mapping_problems(
+    config: ExperimentConfig, simulated: SimulatedSource, source: Source
+) -> Iterator[Problem]:
     """Find contradictions between several views and their mapping into one cloud."""
     views, mapping = simulated.views, config.mapping
     if views is None and mapping is not None:
@@ -178,13 +207,23 @@ def _mapping_problems(config: ExperimentConfig, simulated: SimulatedSource, sour
         yield Problem("a mapping needs several views", source.place_of(("mapping",)), fix=fix)
     elif views is not None and mapping is None:
         fix = "declare mapping, for instance {registration: {method: marks}, merge: {kind: fusion}}"
-        yield Problem("several views need a mapping into one cloud", source.place_of(VIEWS), fix=fix)
-    elif views is not None and mapping is not None and (mapping.views or 0) > (count := view_count(views)):
+        yield Problem(
+            "several views need a mapping into one cloud", source.place_of(VIEWS), fix=fix
+        )
+    elif (
+        views is not None
+        and mapping is not None
+        and (mapping.views or 0) > (count := view_count(views))
+    ):
         place = source.place_of(("mapping", "views"))
-        yield Problem(f"{mapping.views} views, but source.views has {count}", place, legal=f"1 to {count}")
+        yield Problem(
+            f"{mapping.views} views, but source.views has {count}", place, legal=f"1 to {count}"
+        )
 
 
-def _flat_field_problems(config: ExperimentConfig, simulated: SimulatedSource, source: Source) -> Iterator[Problem]:
+def _flat_field_problems(
+    config: ExperimentConfig, simulated: SimulatedSource, source: Source
+) -> Iterator[Problem]:
     """Report a flat field whose plane lies outside the camera's range."""
     try:
         flat_field, optics = config.capture.flat_field, camera_of(simulated.camera).optics
@@ -193,10 +232,14 @@ def _flat_field_problems(config: ExperimentConfig, simulated: SimulatedSource, s
     if flat_field is not None and not optics.nearest_m < flat_field.distance_m < optics.farthest_m:
         place = source.place_of(("capture", "flat_field"))
         legal = f"{optics.nearest_m:g} to {optics.farthest_m:g} m"
-        yield Problem(f"{optics.title} gives no range at {flat_field.distance_m:g} m", place, legal=legal)
+        yield Problem(
+            f"{optics.title} gives no range at {flat_field.distance_m:g} m", place, legal=legal
+        )
 
 
-def _capture_problems(config: ExperimentConfig, capture: CaptureSource, source: Source) -> Iterator[Problem]:
+def _capture_problems(
+    config: ExperimentConfig, capture: CaptureSource, source: Source
+) -> Iterator[Problem]:
     """Find files that are missing or cannot be read, and keys that only a simulated source can have."""
     missing = [number for number, name in enumerate(capture.paths) if not Path(name).exists()]
     for number, path in ((number, Path(capture.paths[number])) for number in missing):
@@ -205,18 +248,41 @@ def _capture_problems(config: ExperimentConfig, capture: CaptureSource, source: 
         yield Problem(f"{path}: there is no such file or folder", place, nearest=near)
     lens = capture.intrinsics
     if unknown := bool(lens) and lens not in camera_names() and not Path(str(lens)).is_file():
-        legal, place = f"a file, or one of {', '.join(camera_names())}", source.place_of(("source", "intrinsics"))
+        legal, place = (
+            f"a file, or one of {', '.join(camera_names())}",
+            source.place_of(("source", "intrinsics")),
+        )
         yield Problem(f"{lens}: is neither a file nor a camera", place, legal)
     try:
         if not missing and not unknown:
             recording_of(capture)
     except UserError as error:
-        yield Problem(error.message, source.place_of(("source", "paths")), legal=error.legal, fix=error.fix)
-    apart, hole_free = "a flat field needs a simulated unit", "only on hole-free repeats, which a capture does not have"
+        yield Problem(
+            error.message, source.place_of(("source", "paths")), legal=error.legal, fix=error.fix
+        )
+    apart, hole_free = (
+        "a flat field needs a simulated unit",
+        "only on hole-free repeats, which a capture does not have",
+    )
     for key, value, message, fix in (
-        ("capture.flat_field", config.capture.flat_field, apart, "use harness.flatfield, harness.detect --flat-field"),
-        ("mapping", config.mapping, "a mapping needs the views of a simulated source", "use harness.detect --register"),
-        ("threshold.calibrate", config.threshold.calibrate, f"a threshold can be calibrated {hole_free}", "give `k`"),
+        (
+            "capture.flat_field",
+            config.capture.flat_field,
+            apart,
+            "use tofpod flatfield, harness.detect --flat-field",
+        ),
+        (
+            "mapping",
+            config.mapping,
+            "a mapping needs the views of a simulated source",
+            "use harness.detect --register",
+        ),
+        (
+            "threshold.calibrate",
+            config.threshold.calibrate,
+            f"a threshold can be calibrated {hole_free}",
+            "give `k`",
+        ),
     ):
         if value is not None:
             yield Problem(message, source.place_of(tuple(key.split("."))), fix=fix)

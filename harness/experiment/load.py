@@ -7,22 +7,44 @@ from pathlib import Path
 from typing import Any
 
 from harness.experiment import checks
-from harness.experiment.schema import DETECTOR_SETTINGS, Experiment, ValuesVariation, declared_of, recording_of
+from harness.experiment.schema import (
+    DETECTOR_SETTINGS,
+    Experiment,
+    ValuesVariation,
+    declared_of,
+    recording_of,
+)
 from harness.experiment.unfold import OPTION, overridden, set_path, unfolded
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.diagnose import dotted
-from harness.vocabulary.declaration.yaml_source import DeclarationError, KeyPath, Source, read_yaml, to_yaml
+from harness.vocabulary.declaration.yaml_source import (
+    DeclarationError,
+    KeyPath,
+    Source,
+    read_yaml,
+    to_yaml,
+)
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import shipped
 from harness.vocabulary.provenance import check_version, stamp_of, stamped
-from scenes.sensor.camera import CameraConfig, camera_names, is_camera_path, load_camera, numbers_of_lens
+from scenes.sensor.camera import (
+    CameraConfig,
+    camera_names,
+    is_camera_path,
+    load_camera,
+    numbers_of_lens,
+)
 
 EXPERIMENT_VERSION = 1  # Version of the resolved experiment in a result folder; raised when a key changes its meaning
 STAMP_KIND = "experiment"
 
 
 def load_experiment(
-    path: Path, overrides: Sequence[str] = (), calibration: Path | None = None, *, quick: bool = False
+    path: Path,
+    overrides: Sequence[str] = (),
+    calibration: Path | None = None,
+    *,
+    quick: bool = False,
 ) -> Experiment:
     """Read an experiment, apply ``path=value`` overrides, validate and unfold it. Raises DeclarationError with all
     problems. The lens of a recording ``calibration`` replaces the camera file's nominal lens (`lens_numbers`).
@@ -60,7 +82,13 @@ def _quick(data: Any) -> list[str]:
     overrides = [f"title={json.dumps(f'{title} (a first look)')}"]
     overrides += ["sensitivity=null"] if shape.get(data, ("sensitivity",)) else []
     own = "threshold.calibrate"
-    for path in ("repeats", f"{own}.repeats", "study.boards", "study.hole_free_boards", f"{own}.boards"):
+    for path in (
+        "repeats",
+        f"{own}.repeats",
+        "study.boards",
+        "study.hole_free_boards",
+        f"{own}.boards",
+    ):
         number = shape.get(data, tuple(path.split(".")))
         if isinstance(number, int):
             fewer = min(number, 5) if path.endswith("repeats") else -(-number // 3)
@@ -76,7 +104,9 @@ def _experiment_file(path: Path) -> Path:
     own = shipped("experiments") / f"{path.name.removesuffix('.yaml')}.yaml"
     if not (own.is_file() or path.suffix or path.exists()):
         names = ", ".join(sorted(each.stem for each in own.parent.glob("*.yaml")))
-        raise UserError(f"{path}: there is no such file or experiment", legal=f"a YAML file, or one of {names}")
+        raise UserError(
+            f"{path}: there is no such file or experiment", legal=f"a YAML file, or one of {names}"
+        )
     return own if own.is_file() else path
 
 
@@ -92,10 +122,18 @@ def _with_absolute_paths(source: Source, folder: Path) -> Source:
     listed = shape.get(data, swept)
     named: list[KeyPath] = [checks.CAMERA_NAME]
     named += [(*swept, k) for k in range(len(listed) if isinstance(listed, list) else 0)]
-    files = [(*checks.TARGET, *at, "file") for at in ((), ("board", "shape"), ("material", "texture"))]
+    files = [
+        (*checks.TARGET, *at, "file") for at in ((), ("board", "shape"), ("material", "texture"))
+    ]
     if shape.get(data, ("source", "kind")) == "capture":
-        files += [("source", "paths", k) for k in range(len(shape.get(data, ("source", "paths")) or ()))]
-        files += [] if shape.get(data, ("source", "intrinsics")) in camera_names() else [("source", "intrinsics")]
+        files += [
+            ("source", "paths", k) for k in range(len(shape.get(data, ("source", "paths")) or ()))
+        ]
+        files += (
+            []
+            if shape.get(data, ("source", "intrinsics")) in camera_names()
+            else [("source", "intrinsics")]
+        )
     for at in (*named, *files):
         name = shape.get(data, at)
         if isinstance(name, str) and name and (at in files or is_camera_path(name)):
@@ -107,13 +145,27 @@ def _with_absolute_paths(source: Source, folder: Path) -> Source:
 def _with_calibration(source: Source, recording: Path) -> Source:
     """Add the recording's lens to the camera's replaced numbers; it takes precedence over the lens in the file."""
     if shape.get(source.data, ("source", "kind")) != "simulated":
-        raise UserError("a real capture has its own lens", fix="leave out --calibration, or use source.intrinsics")
+        raise UserError(
+            "a real capture has its own lens",
+            fix="leave out --calibration, or use source.intrinsics",
+        )
     swept = shape.get(source.data, ("sweep", ".".join(checks.CAMERA_NAME)))
     single = shape.get(source.data, checks.CAMERA_NAME)
-    names = swept if isinstance(swept, list) else [single] if isinstance(single, str) else [CameraConfig().name]
+    names = (
+        swept
+        if isinstance(swept, list)
+        else [single]
+        if isinstance(single, str)
+        else [CameraConfig().name]
+    )
     numbers = shape.get(source.data, checks.CAMERA_NUMBERS)
-    merged = {**(numbers if isinstance(numbers, dict) else {}), **lens_numbers(recording, map(str, names))}
-    return replace(source, data=set_path(source.data, checks.CAMERA_NUMBERS, merged, declared_of(source.data)))
+    merged = {
+        **(numbers if isinstance(numbers, dict) else {}),
+        **lens_numbers(recording, map(str, names)),
+    }
+    return replace(
+        source, data=set_path(source.data, checks.CAMERA_NUMBERS, merged, declared_of(source.data))
+    )
 
 
 def lens_numbers(recording: Path, cameras: Iterable[str]) -> dict[str, Any]:
@@ -130,7 +182,11 @@ def lens_numbers(recording: Path, cameras: Iterable[str]) -> dict[str, Any]:
         legal = "an Azure Kinect .mkv, or a folder of depth images with its intrinsics beside them"
         raise UserError(f"--calibration {recording}: holds no calibrated lens", legal=legal)
     for name in cameras:
-        nominal = load_camera(name).nominal_lens if name in camera_names() or is_camera_path(name) else lens
+        nominal = (
+            load_camera(name).nominal_lens
+            if name in camera_names() or is_camera_path(name)
+            else lens
+        )
         if (nominal.width, nominal.height) != (lens.width, lens.height):
             legal = f"{nominal.width} x {nominal.height}, as {name} has"
             fix = "name a recording of the same camera in the same mode, or choose another source.camera.name"

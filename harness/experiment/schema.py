@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from detectors import DETECTORS, detector_names, detector_type
-from detectors.average import AverageConfig
-from detectors.flat_field import FlatFieldConfig
-from detectors.mapping.settings import MappingConfig
+from detectors.averages.average import AverageConfig
+from detectors.averages.flat_field import FlatFieldConfig
+from detectors.views.mapping.settings import MappingConfig
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.yaml_source import Source
@@ -45,7 +45,9 @@ ListAsTuple = BeforeValidator(lambda values: tuple(values) if isinstance(values,
 """Strict mode rejects a list in place of a tuple; `Config` converts lists, but not those within a mapping."""
 AxisValues = Annotated[tuple[Any, ...], Field(min_length=1, max_length=1000), ListAsTuple]
 DottedPath = Annotated[str, Field(min_length=1, max_length=200)]
-Label = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]{1,80}$", description="one line of at most 80 characters")]
+Label = Annotated[
+    str, Field(pattern=r"^[^\x00-\x1f\x7f]{1,80}$", description="one line of at most 80 characters")
+]
 Reason = Annotated[str, Field(min_length=1, max_length=1000)]
 FileName = Annotated[str, Field(min_length=1, max_length=1000)]
 StudyFrames = Annotated[tuple[Frames, ...], Field(min_length=1, max_length=100), ListAsTuple]
@@ -58,7 +60,9 @@ class SimulatedSource(Config):
     target: AnyTargetConfig
     camera: CameraConfig = CameraConfig()
     render: RenderConfig = RenderConfig()
-    views: AnyViews | None = Field(None, discriminator="kind", description="several poses; null: the target's own")
+    views: AnyViews | None = Field(
+        None, discriminator="kind", description="several poses; null: the target's own"
+    )
 
 
 class CaptureSource(Config):
@@ -68,8 +72,12 @@ class CaptureSource(Config):
     paths: tuple[FileName, ...] = Field(
         min_length=1, max_length=100_000, description="files of depth frames, or a folder"
     )
-    unit: str | None = Field(None, description="unit of the stored depth, if the files do not state it")
-    intrinsics: FileName | None = Field(None, description="a file of lens intrinsics, or a camera's name")
+    unit: str | None = Field(
+        None, description="unit of the stored depth, if the files do not state it"
+    )
+    intrinsics: FileName | None = Field(
+        None, description="a file of lens intrinsics, or a camera's name"
+    )
 
 
 class CaptureConfig(Config):
@@ -78,10 +86,12 @@ class CaptureConfig(Config):
     frames: Frames
     average: AverageConfig = AverageConfig()
     flat_field: FlatFieldConfig | None = Field(
-        None, description="a plane captured first, whose fixed pattern is subtracted from every frame"
+        None,
+        description="a plane captured first, whose fixed pattern is subtracted from every frame",
     )
     exact: bool = Field(
-        False, description="true simulates each frame; false draws the mean if its distribution is the same"
+        False,
+        description="true simulates each frame; false draws the mean if its distribution is the same",
     )
 
 
@@ -99,13 +109,18 @@ class CalibrateConfig(Config):
     repeats: Repeats | None = None
     boards: Boards | None = Field(None, description="in a study: extra boards for calibration only")
     false_calls_per_m2: Annotated[float, Field(gt=0, le=1e6)] | None = Field(
-        None, description=f"in a study: the rate of false calls to meet; null: {DEFAULT_RATE_PER_M2:g}"
+        None,
+        description=f"in a study: the rate of false calls to meet; null: {DEFAULT_RATE_PER_M2:g}",
     )
 
     @model_validator(mode="before")
     @classmethod
     def _default_rate(cls, data: Any) -> Any:
-        needs = isinstance(data, dict) and data.get("boards") is not None and data.get("false_calls_per_m2") is None
+        needs = (
+            isinstance(data, dict)
+            and data.get("boards") is not None
+            and data.get("false_calls_per_m2") is None
+        )
         return {**data, "false_calls_per_m2": DEFAULT_RATE_PER_M2} if needs else data
 
     @model_validator(mode="after")
@@ -113,14 +128,18 @@ class CalibrateConfig(Config):
         if (self.repeats is None) == (self.boards is None):
             raise ValueError("give either `repeats` or, in a study, `boards`, and not both")
         if self.boards is None and self.false_calls_per_m2 is not None:
-            raise ValueError("`false_calls_per_m2` needs `boards`, since repeats of one board cannot show a rate")
+            raise ValueError(
+                "`false_calls_per_m2` needs `boards`, since repeats of one board cannot show a rate"
+            )
         return self
 
 
 class ThresholdConfig(Config):
     """The detector's threshold k, which is either given or calibrated."""
 
-    k: Annotated[float, Field(gt=0, le=1000)] | None = Field(None, description="in units of the detector's score")
+    k: Annotated[float, Field(gt=0, le=1000)] | None = Field(
+        None, description="in units of the detector's score"
+    )
     calibrate: CalibrateConfig | None = None
 
     @model_validator(mode="after")
@@ -148,7 +167,9 @@ class ValuesVariation(Config):
     path: DottedPath
     values: AxisValues
     reason: Reason
-    frames: StudyFrames | None = Field(None, description="numbers of frames; null: as in sensitivity.frames")
+    frames: StudyFrames | None = Field(
+        None, description="numbers of frames; null: as in sensitivity.frames"
+    )
 
 
 class LabelledVariation(Config):
@@ -157,16 +178,22 @@ class LabelledVariation(Config):
     label: Label
     set: Annotated[dict[DottedPath, Any], Field(min_length=1, max_length=50)]
     reason: Reason
-    frames: StudyFrames | None = Field(None, description="numbers of frames; null: as in sensitivity.frames")
+    frames: StudyFrames | None = Field(
+        None, description="numbers of frames; null: as in sensitivity.frames"
+    )
 
 
 class SensitivityConfig(Config):
     """Variations of the experiment, one at a time, each with a few numbers of frames and fewer repeats."""
 
     repeats: Repeats
-    calibration_repeats: Repeats | None = Field(None, description="hole-free runs; null: as in threshold")
+    calibration_repeats: Repeats | None = Field(
+        None, description="hole-free runs; null: as in threshold"
+    )
     frames: StudyFrames
-    vary: Annotated[tuple[ValuesVariation | LabelledVariation, ...], Field(min_length=1, max_length=500)]
+    vary: Annotated[
+        tuple[ValuesVariation | LabelledVariation, ...], Field(min_length=1, max_length=500)
+    ]
 
 
 class StudyConfig(Config):
@@ -177,14 +204,18 @@ class StudyConfig(Config):
     boards: Boards
     hole_free_boards: Boards
     units: Annotated[int, Field(ge=2, le=1000)] | None = Field(
-        None, description="number of units; null: only source.camera.unit_seed, so that limits hold for that unit alone"
+        None,
+        description="number of units; null: only source.camera.unit_seed, so that limits hold for that unit alone",
     )
 
 
 class ExperimentConfig(Config):
     """An experiment and the axes over which it is swept."""
 
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$", description="also the name of its results folder")
+    name: str = Field(
+        pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$",
+        description="also the name of its results folder",
+    )
     title: Annotated[str, Field(max_length=300)] = ""
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = Field(1, description="seed of the noise")
     source: Annotated[SimulatedSource | CaptureSource, Field(discriminator="kind")]
@@ -193,14 +224,20 @@ class ExperimentConfig(Config):
     detector: DetectorConfig = DetectorConfig()
     threshold: ThresholdConfig
     matching: MatchingConfig = MatchingConfig()
-    study: StudyConfig | None = Field(None, description="needs a family of boards (target: {name: drawn})")
+    study: StudyConfig | None = Field(
+        None, description="needs a family of boards (target: {name: drawn})"
+    )
     repeats: Repeats = Field(1, description="number of draws of the noise in each set-up")
-    sweep: Annotated[dict[DottedPath, AxisValues], Field(max_length=20)] = Field(default_factory=dict)
+    sweep: Annotated[dict[DottedPath, AxisValues], Field(max_length=20)] = Field(
+        default_factory=dict
+    )
     draws: Annotated[int, Field(ge=2, le=1000)] | None = Field(
-        None, description="number of set-ups of the sweep to run, drawn at random without duplicates; null: all"
+        None,
+        description="number of set-ups of the sweep to run, drawn at random without duplicates; null: all",
     )
     switches: DottedPath | None = Field(
-        None, description="path of a mapping of switches, which are on: none, each alone, all but each, and all"
+        None,
+        description="path of a mapping of switches, which are on: none, each alone, all but each, and all",
     )
     sensitivity: SensitivityConfig | None = None
 
@@ -208,7 +245,9 @@ class ExperimentConfig(Config):
     def simulated(self) -> SimulatedSource:
         """The source, which must be a simulated camera. Raises UserError for a real capture."""
         if isinstance(self.source, CaptureSource):
-            raise UserError(f"{self.name}: its source is a real capture, but a simulated camera is needed")
+            raise UserError(
+                f"{self.name}: its source is a real capture, but a simulated camera is needed"
+            )
         return self.source
 
 
@@ -263,15 +302,22 @@ class Experiment:
     @property
     def digest(self) -> str:
         """The digest over all points with their repeats, in order, which names the experiment's results."""
-        points = [[point.variant, point.label, point.digest, point.config.repeats] for point in self.points]
-        return digest(points if self.config.study is None else [self.config.study.to_data(), *points])
+        points = [
+            [point.variant, point.label, point.digest, point.config.repeats]
+            for point in self.points
+        ]
+        return digest(
+            points if self.config.study is None else [self.config.study.to_data(), *points]
+        )
 
     def folder(self, results: Path) -> Path:
         """Return the results folder, ``results/<name>/<digest>``. Raises UserError if a link leads out of it."""
         return inside(Path(results), self.config.name, self.digest)
 
 
-def point_of(label: str, variant: str, values: Mapping[str, Any], config: ExperimentConfig) -> Point:
+def point_of(
+    label: str, variant: str, values: Mapping[str, Any], config: ExperimentConfig
+) -> Point:
     """Return the point for a resolved declaration, with its digests."""
     source = config.source
     if isinstance(source, CaptureSource):
@@ -285,13 +331,24 @@ def point_of(label: str, variant: str, values: Mapping[str, Any], config: Experi
         target = source.target.to_data() if drawn else source.target.declare().to_data()
         camera, work = camera_of(source.camera), source.render.to_data()
         frames = {"kind": source.kind, "target": target, "render": work}
-        frames["camera"] = {**source.camera.to_data(), "name": camera.name, "facts": digest(camera.to_data())}
+        frames["camera"] = {
+            **source.camera.to_data(),
+            "name": camera.name,
+            "facts": digest(camera.to_data()),
+        }
         frames |= {} if source.views is None else {"views": source.views.to_data()}
     numbers = {key: value for key, value in config.to_data().items() if key not in NO_NUMBERS}
     numbers |= {"source": frames, "detector_version": detector_version(config)}
     offer = DETECTORS.offer(config.detector.name)
     numbers |= {} if offer.built_in else {"detector_from": offer.origin}
-    return Point(label, variant, values, config, digest(numbers), digest({"source": frames, "seed": config.seed}))
+    return Point(
+        label,
+        variant,
+        values,
+        config,
+        digest(numbers),
+        digest({"source": frames, "seed": config.seed}),
+    )
 
 
 def detector_version(config: ExperimentConfig) -> int:
@@ -308,4 +365,6 @@ def recording_of(source: CaptureSource) -> Recording:
     name = source.intrinsics
     lens = lens_named(name) if name and name in lens_names() else None
     file = Path(name) if name and lens is None else None
-    return open_capture([Path(path) for path in source.paths], unit=source.unit, intrinsics=file, lens=lens)
+    return open_capture(
+        [Path(path) for path in source.paths], unit=source.unit, intrinsics=file, lens=lens
+    )

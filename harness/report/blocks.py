@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import Markup, escape
 
-from harness.tables.text import Grid, many
 from harness.vocabulary.files import atomic_path
 from harness.vocabulary.provenance import GENERATOR
+from harness.vocabulary.text import Grid, many
 
 if TYPE_CHECKING:
     from jinja2 import Template
@@ -25,7 +25,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 HERE = Path(__file__).parent
-SHOWN_FIRST = (*("commit", "dirty", "seed", "started", "machine", "mitsuba_variant"), *("renders", "versions"))
+SHOWN_FIRST = (
+    *("commit", "dirty", "seed", "started", "machine", "mitsuba_variant"),
+    *("renders", "versions"),
+)
 """Keys of the provenance that every page shows, as "not recorded" if they are missing."""
 MOST_VALUES = 81  # most points of a line whose values are shown under the pointer
 SHOWN_APART = ("command", "seconds", "failures")
@@ -56,7 +59,11 @@ def template(name: str, folder: Path | None = None) -> Template:
 
 
 def page(
-    title: str, answer: str, body: Iterable[Markup], under: Iterable[Markup] = (), warnings: Iterable[str] = ()
+    title: str,
+    answer: str,
+    body: Iterable[Markup],
+    under: Iterable[Markup] = (),
+    warnings: Iterable[str] = (),
 ) -> str:
     """Return a whole page: ``title``, ``warnings``, the ``answer`` in large letters, parts ``under`` it, the body."""
     parts = {"body": joined(body), "under": joined(under), "warnings": list(warnings)}
@@ -65,7 +72,11 @@ def page(
 
 def tag(name: str, *content: str | Markup, **attributes: str) -> Markup:
     """Return an HTML element; attributes without a value are left out, ``kind`` is the class."""
-    named = ((key.replace("_", "-") if key != "kind" else "class", value) for key, value in attributes.items() if value)
+    named = (
+        (key.replace("_", "-") if key != "kind" else "class", value)
+        for key, value in attributes.items()
+        if value
+    )
     written = Markup("").join(Markup(' {}="{}"').format(key, value) for key, value in named)
     return Markup("<{0}{1}>{2}</{0}>").format(Markup(name), written, joined(content, ""))
 
@@ -88,7 +99,12 @@ def figure(figures: Mapping[str, str], name: str, caption: str) -> Markup:
     """Return a figure of ``figures`` (SVG text by name) with its caption, or a note that its data were not stored."""
     if name not in figures:
         return note("No data for this figure were stored.")
-    return tag("figure", tag("div", Markup(figures[name]), kind="scroll"), tag("figcaption", caption), id=name)
+    return tag(
+        "figure",
+        tag("div", Markup(figures[name]), kind="scroll"),
+        tag("figcaption", caption),
+        id=name,
+    )
 
 
 def fold(summary: str, *content: str | Markup, is_open: bool = False) -> Markup:
@@ -98,7 +114,9 @@ def fold(summary: str, *content: str | Markup, is_open: bool = False) -> Markup:
 
 def folded(tables: Sequence[tuple[str, Markup]]) -> list[Markup]:
     """Return titled tables in folds, of which the first is open."""
-    return [fold(title, content, is_open=not place) for place, (title, content) in enumerate(tables)]
+    return [
+        fold(title, content, is_open=not place) for place, (title, content) in enumerate(tables)
+    ]
 
 
 def command_of(command: str) -> list[Markup]:
@@ -106,7 +124,9 @@ def command_of(command: str) -> list[Markup]:
     return [subheading("Command"), tag("pre", command)]
 
 
-def closing(provenance: Mapping[str, Any], experiment_yaml_text: str, left_out: str = "") -> list[Markup]:
+def closing(
+    provenance: Mapping[str, Any], experiment_yaml_text: str, left_out: str = ""
+) -> list[Markup]:
     """Return the last sections of every sweep's page. ``left_out`` is a sentence on frames excluded from averages."""
     reasons: dict[str, list[str]] = {}
     for failure in provenance.get("failures", ()):
@@ -117,16 +137,26 @@ def closing(provenance: Mapping[str, Any], experiment_yaml_text: str, left_out: 
         more = f" and {len(parts_of) - NAMED} others" if len(parts_of) > NAMED else ""
         parts.append(tag("p", f"{', '.join(parts_of[:NAMED])}{more}: {why}", kind="fail"))
     parts += [paragraph(left_out)] if left_out else []
-    rows = [(stage, f"{float(value):.1f}") for stage, value in provenance.get("seconds", {}).items()]
+    rows = [
+        (stage, f"{float(value):.1f}") for stage, value in provenance.get("seconds", {}).items()
+    ]
     cost = Grid.of(("stage", "seconds"), rows).html() if rows else paragraph("Not recorded.")
     keys = [key for key in provenance if key not in (*SHOWN_FIRST, *SHOWN_APART)]
     lines = []
     for key in (*SHOWN_FIRST, *keys):
-        name, value = key.replace("_mm", " (mm)").replace("_", " "), plain(provenance.get(key, "not recorded"))
+        name, value = (
+            key.replace("_mm", " (mm)").replace("_", " "),
+            plain(provenance.get(key, "not recorded")),
+        )
         lines.append(tag("tr", tag("th", name, scope="row"), tag("td", value)))
     parts += [heading("Provenance")]
     table = tag("table", tag("tbody", joined(lines)), kind="prov")
-    folds = fold("Cost, versions and command", cost, table, *command_of(provenance.get("command", "not recorded")))
+    folds = fold(
+        "Cost, versions and command",
+        cost,
+        table,
+        *command_of(provenance.get("command", "not recorded")),
+    )
     return [*parts, folds, fold("The resolved experiment", tag("pre", experiment_yaml_text))]
 
 
@@ -144,7 +174,14 @@ def plain(value: Any) -> str:
 
 
 # Okabe and Ito's palette (Color Universal Design, 2008), which remains distinguishable with common colour blindness
-BLUE, ORANGE, GREEN, RED, SKY, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7"
+BLUE, ORANGE, GREEN, RED, SKY, PURPLE = (
+    "#0072B2",
+    "#E69F00",
+    "#009E73",
+    "#D55E00",
+    "#56B4E9",
+    "#CC79A7",
+)
 INK, GREY, PALE = "#1d2530", "#6b7480", "#e9ecef"
 DAMAGE = "#ff00ff"  # magenta, the colour of damage in the clouds of the thesis
 
@@ -173,15 +210,21 @@ def svg(name: str, size_in: tuple[float, float], alt: str, draw: Callable[[Figur
     the values of its lines, which are shown under the pointer. ``name`` seeds the ids in it, so that a page can hold
     several figures. The text contains no dates and no random numbers."""
     buffer = io.StringIO()
-    drawn = _save(buffer, size_in, draw, name, format="svg", metadata={"Date": None, "Creator": None})
+    drawn = _save(
+        buffer, size_in, draw, name, format="svg", metadata={"Date": None, "Creator": None}
+    )
     text = buffer.getvalue()
-    body = re.sub(r"<metadata>.*?</metadata>", "", text[text.index("<svg") :].strip(), flags=re.DOTALL)
+    body = re.sub(
+        r"<metadata>.*?</metadata>", "", text[text.index("<svg") :].strip(), flags=re.DOTALL
+    )
     body = re.sub(r'\bid="', f'id="{name}-', body)
     body = re.sub(r'(xlink:href="#|url\(#)', rf"\g<1>{name}-", body)
     for size in ("width", "height"):
         body = re.sub(rf'(<svg[^>]*?) {size}="[^"]*"', r"\1", body, count=1)
     values = json.dumps(_values(drawn), separators=(",", ":"), ensure_ascii=False)
-    return body.replace("<svg", f'<svg role="img" aria-label="{escape(alt)}" data-values="{escape(values)}"', 1)
+    return body.replace(
+        "<svg", f'<svg role="img" aria-label="{escape(alt)}" data-values="{escape(values)}"', 1
+    )
 
 
 def _values(figure: Figure) -> list[dict[str, Any]]:
@@ -189,17 +232,24 @@ def _values(figure: Figure) -> list[dict[str, Any]]:
     drawing and on the axes for at most `MOST_VALUES` points. Lengths are in points from the upper left."""
     panels, scale, height = [], 72 / figure.dpi, figure.bbox.height
     for axes in figure.axes:
-        names = {id(bars[0]): bars.get_label() for bars in axes.containers if hasattr(bars, "has_yerr")}
+        names = {
+            id(bars[0]): bars.get_label() for bars in axes.containers if hasattr(bars, "has_yerr")
+        }
         lines = []
         for line in axes.get_lines():
-            name, xy = str(names.get(id(line), line.get_label())), np.asarray(line.get_xydata(), float)
+            name, xy = (
+                str(names.get(id(line), line.get_label())),
+                np.asarray(line.get_xydata(), float),
+            )
             xy = xy[np.isfinite(xy).all(axis=1)]
             if name.startswith("_") or len(xy) < 2 or line.get_transform() != axes.transData:
                 continue
             xy = xy[np.unique(np.linspace(0, len(xy) - 1, MOST_VALUES).round().astype(int))]
             at = axes.transData.transform(xy)
             rows = np.column_stack([at[:, 0] * scale, (height - at[:, 1]) * scale, xy])
-            lines.append([name.replace("\n", " "), *(float(f"{value:.4g}") for value in rows.ravel())])
+            lines.append(
+                [name.replace("\n", " "), *(float(f"{value:.4g}") for value in rows.ravel())]
+            )
         left, low, right, top = axes.get_window_extent().extents
         if lines:
             box = [round(end * scale) for end in (left, height - top, right, height - low)]
@@ -219,7 +269,9 @@ def save_png(path: Path, size_in: tuple[float, float], draw: Callable[[Figure], 
         _save(temporary, size_in, draw, format="png", metadata={"Software": None})
 
 
-def _save(target: Any, size_in: Any, draw: Callable[[Figure], None], name: str = "", **how: Any) -> Figure:
+def _save(
+    target: Any, size_in: Any, draw: Callable[[Figure], None], name: str = "", **how: Any
+) -> Figure:
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from detectors.interface import Detection, Evidence, Measurement, MissingReturns
+from harness.records import outputs, trials
 from harness.report.clouds import residual_bar, residual_norm
-from harness.tables import outputs, trials
 from harness.vocabulary.files import atomic_path, plain_json
 from harness.vocabulary.geometry import MM, Cloud
 
@@ -76,13 +76,23 @@ class Judged:
         return tuple(finding_of(i, self.evidence, d, m) for i, (d, m) in enumerate(pairs, start=1))
 
 
-def finding_of(number: int, evidence: Evidence, detection: Detection, measured: Measurement) -> Finding:
+def finding_of(
+    number: int, evidence: Evidence, detection: Detection, measured: Measurement
+) -> Finding:
     """Return the row of a detection: the model's numbers if they exist, or else those of the extents."""
     modelled = math.isfinite(measured.model_diameter_m)
     placed = bool(np.isfinite(measured.model_centre_m).all())
-    x_mm, y_mm, z_mm = (float(m) / MM for m in (measured.model_centre_m if placed else measured.extent_centre_m))
+    x_mm, y_mm, z_mm = (
+        float(m) / MM for m in (measured.model_centre_m if placed else measured.extent_centre_m)
+    )
     diameter_m = measured.model_diameter_m if modelled else measured.extent_diameter_m
-    size_from = "extent" if not modelled else "contour" if math.isnan(measured.model_diameter_se_m) else "model"
+    size_from = (
+        "extent"
+        if not modelled
+        else "contour"
+        if math.isnan(measured.model_diameter_se_m)
+        else "model"
+    )
     depth_m, depth_from = measured.model_depth_m, size_from
     if detection.kind == "no return":
         size_from, depth_from = "area", "none"
@@ -93,8 +103,14 @@ def finding_of(number: int, evidence: Evidence, detection: Detection, measured: 
     place = (measured.u_px, measured.v_px, x_mm, y_mm, z_mm)
     sizes = (diameter_m / MM, depth_m / MM, measured.volume_m3 / MM**3)
     x, y, _ = measured.along
-    sides = (measured.length_m / MM, measured.width_m / MM, float(np.degrees(np.arctan2(y, x) + np.pi / 2) % 180 - 90))
-    return Finding(number, kind, *place, *sizes, measured.points, measured.score, *sides, size_from, depth_from)
+    sides = (
+        measured.length_m / MM,
+        measured.width_m / MM,
+        float(np.degrees(np.arctan2(y, x) + np.pi / 2) % 180 - 90),
+    )
+    return Finding(
+        number, kind, *place, *sizes, measured.points, measured.score, *sides, size_from, depth_from
+    )
 
 
 def write_findings(
@@ -107,11 +123,20 @@ def write_findings(
 ) -> tuple[Path, ...]:
     """Write all files of a run to ``folder``, or none. The JSON holds the plain data ``about`` besides the findings;
     ``beside`` maps names of further files to functions that write them. Raises UserError if writing fails."""
-    is_new, (cloud, missing, detections) = not folder.exists(), (judged.cloud, judged.missing, judged.detections)
+    is_new, (cloud, missing, detections) = (
+        not folder.exists(),
+        (judged.cloud, judged.missing, judged.detections),
+    )
     writers: dict[str, Callable[[Path], object]] = {
-        outputs.FINDINGS.name: lambda path: path.write_text(csv_text(judged.findings), encoding="utf-8"),
-        outputs.FINDINGS_DATA.name: lambda path: path.write_text(json_text(judged, about), encoding="utf-8"),
-        outputs.ANNOTATED.name: lambda path: _save(path, findings_figure(cloud, judged.evidence, detections, title)),
+        outputs.FINDINGS.name: lambda path: path.write_text(
+            csv_text(judged.findings), encoding="utf-8"
+        ),
+        outputs.FINDINGS_DATA.name: lambda path: path.write_text(
+            json_text(judged, about), encoding="utf-8"
+        ),
+        outputs.ANNOTATED.name: lambda path: _save(
+            path, findings_figure(cloud, judged.evidence, detections, title)
+        ),
         cloud_name: lambda path: path.write_bytes(ply_bytes(cloud, detections)),
         **(beside or {}),
     }
@@ -132,7 +157,11 @@ def write_findings(
 def csv_text(findings: Sequence[Finding]) -> str:
     """Return the content of findings.csv; unknown numbers are empty cells."""
     frame = trials.FINDINGS_OF_CAPTURE.frame(findings)
-    return str(frame.to_csv(index=False, float_format=trials.FINDINGS_OF_CAPTURE.digits, lineterminator="\n"))
+    return str(
+        frame.to_csv(
+            index=False, float_format=trials.FINDINGS_OF_CAPTURE.digits, lineterminator="\n"
+        )
+    )
 
 
 def json_text(judged: Judged, about: Mapping[str, Any]) -> str:
@@ -140,8 +169,14 @@ def json_text(judged: Judged, about: Mapping[str, Any]) -> str:
     rows = [
         asdict(finding)
         | {
-            "extent": {"diameter_mm": m.extent_diameter_m / MM, "centre_mm": m.extent_centre_m / MM},
-            "model": {**{f"{name}_mm": getattr(m, f"model_{name}_m") / MM for name in MODELLED}, "note": m.model_note},
+            "extent": {
+                "diameter_mm": m.extent_diameter_m / MM,
+                "centre_mm": m.extent_centre_m / MM,
+            },
+            "model": {
+                **{f"{name}_mm": getattr(m, f"model_{name}_m") / MM for name in MODELLED},
+                "note": m.model_note,
+            },
         }
         for finding, m in zip(judged.findings, judged.measurements, strict=True)
     ]
@@ -165,12 +200,17 @@ def ply_bytes(cloud: Cloud, detections: Sequence[Detection]) -> bytes:
 
 MODELLED = ("diameter", "diameter_se", "depth", "depth_se", "centre", "centre_se")
 WIDTH_IN, DPI = 11.0, 150
-TAKEN, OTHERS = "#ff00ff", ("#ff9f1c", "#2ec4b6", "#ffee32", "#4cc9f0", "#f94144", "#90be6d", "#bdb2ff")
+TAKEN, OTHERS = (
+    "#ff00ff",
+    ("#ff9f1c", "#2ec4b6", "#ffee32", "#4cc9f0", "#f94144", "#90be6d", "#bdb2ff"),
+)
 """Colours that differ from grey and from one another, also for viewers with red-green blindness."""
 Box = tuple[float, float, float, float]
 
 
-def findings_figure(cloud: Cloud, evidence: Evidence, detections: Sequence[Detection], title: str) -> Figure:
+def findings_figure(
+    cloud: Cloud, evidence: Evidence, detections: Sequence[Detection], title: str
+) -> Figure:
     """Draw the colour image (if known) above the residual in mm; without a pixel grid, draw a plan view in mm."""
     panels = 2 if cloud.organised and cloud.rgb is not None else 1
     box = _around(cloud, np.isfinite(evidence.residual_m))
@@ -183,7 +223,9 @@ def findings_figure(cloud: Cloud, evidence: Evidence, detections: Sequence[Detec
             axes[0].imshow(_bytes(cloud.rgb), extent=_edges(cloud), interpolation="nearest")
         axes[-1].set_facecolor("0.82")
         if cloud.organised:
-            shown = axes[-1].imshow(residual_mm, extent=_edges(cloud), interpolation="nearest", **style)
+            shown = axes[-1].imshow(
+                residual_mm, extent=_edges(cloud), interpolation="nearest", **style
+            )
         else:
             judged = np.isfinite(residual_mm)
             x, y = (cloud.points_m[..., k][judged] / MM for k in (0, 1))
@@ -196,26 +238,57 @@ def findings_figure(cloud: Cloud, evidence: Evidence, detections: Sequence[Detec
     return _figure(title, panels * _height_in(box), draw)
 
 
-def save_blind_map(path: Path, cloud: Cloud, missing: MissingReturns, detections: Sequence[Detection]) -> None:
+def save_blind_map(
+    path: Path, cloud: Cloud, missing: MissingReturns, detections: Sequence[Detection]
+) -> None:
     """Write a PNG with each pixel's share of frames without a return, the outline, and findings without a return."""
     box = _around(cloud, missing.outline)
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
-        style: dict[str, Any] = {"interpolation": "nearest", "cmap": "Greys", "vmin": 0, "vmax": 100}
+        style: dict[str, Any] = {
+            "interpolation": "nearest",
+            "cmap": "Greys",
+            "vmin": 0,
+            "vmax": 100,
+        }
         shown = axes.imshow(100 * missing.unseen, extent=_edges(cloud), **style)
-        figure.colorbar(shown, ax=axes, shrink=0.6).set_label("frames without a return, %", fontsize=8)
+        figure.colorbar(shown, ax=axes, shrink=0.6).set_label(
+            "frames without a return, %", fontsize=8
+        )
         if min(missing.outline.shape) > 1 and not missing.outline.all():
             height, width = missing.outline.shape
-            columns, rows = np.arange(width) + cloud.region.col0, np.arange(height) + cloud.region.row0
-            axes.contour(columns, rows, missing.outline, levels=[0.5], colors="#0070c0", linewidths=0.8)
+            columns, rows = (
+                np.arange(width) + cloud.region.col0,
+                np.arange(height) + cloud.region.row0,
+            )
+            axes.contour(
+                columns, rows, missing.outline, levels=[0.5], colors="#0070c0", linewidths=0.8
+            )
         _frame(axes, cloud, box)
-        _circle(axes, cloud, ((n, found) for n, found in enumerate(detections, start=1) if found.kind == "no return"))
+        _circle(
+            axes,
+            cloud,
+            (
+                (n, found)
+                for n, found in enumerate(detections, start=1)
+                if found.kind == "no return"
+            ),
+        )
 
-    _save(path, _figure(f"{100 * missing.blind:.2g} % of the target's pixels returned nothing", _height_in(box), draw))
+    _save(
+        path,
+        _figure(
+            f"{100 * missing.blind:.2g} % of the target's pixels returned nothing",
+            _height_in(box),
+            draw,
+        ),
+    )
 
 
-def save_targets(path: Path, grid: Cloud, outlines: Sequence[np.ndarray], texts: Sequence[str], taken: int) -> None:
+def save_targets(
+    path: Path, grid: Cloud, outlines: Sequence[np.ndarray], texts: Sequence[str], taken: int
+) -> None:
     """Write a PNG with the colour, amplitude or depth of a grid, outlines (h, w), texts, and numbers from 1."""
     import cv2
     from matplotlib.patheffects import withStroke
@@ -232,18 +305,29 @@ def save_targets(path: Path, grid: Cloud, outlines: Sequence[np.ndarray], texts:
             colour = TAKEN if chosen else next(colours)
             x, y = np.arange(-1, width + 1), np.arange(-1, height + 1)
             padded = np.pad(outline, 1)
-            axes.contour(x, y, padded.astype(float), [0.5], colors=colour, linewidths=2.4 if chosen else 1.4)
+            axes.contour(
+                x, y, padded.astype(float), [0.5], colors=colour, linewidths=2.4 if chosen else 1.4
+            )
             # the pixel that is farthest from the outline
             depth = cv2.distanceTransform(padded.astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
             v, u = np.unravel_index(int(depth.argmax()), depth.shape)
-            style: dict[str, Any] = {"fontsize": 22, "weight": "bold", "ha": "center", "va": "center", "color": colour}
+            style: dict[str, Any] = {
+                "fontsize": 22,
+                "weight": "bold",
+                "ha": "center",
+                "va": "center",
+                "color": colour,
+            }
             style["path_effects"] = [withStroke(linewidth=4, foreground="black")]
             axes.text(float(u), float(v), str(number), **style)
             how = "taken" if chosen else f"--target {number}"
             axes.plot([], [], color=colour, linewidth=3, label=f"{number} ({how}): {text}")
         figure.legend(loc="outside lower center", fontsize=9, frameon=False)
 
-    _save(path, _figure("", min(WIDTH_IN * 0.97 * height / width, 24.0) + 0.26 * len(outlines) + 0.6, draw))
+    _save(
+        path,
+        _figure("", min(WIDTH_IN * 0.97 * height / width, 24.0) + 0.26 * len(outlines) + 0.6, draw),
+    )
 
 
 def _figure(title: str, height_in: float, draw: Callable[[Figure], None]) -> Figure:
@@ -272,7 +356,9 @@ def _around(cloud: Cloud, part: np.ndarray) -> Box:
     rows, columns = np.nonzero(part)
     if not cloud.organised or not len(rows):
         return left, right, bottom, top
-    u0, u1, v0, v1 = (float(n) for n in (columns.min(), columns.max() + 1, rows.min(), rows.max() + 1))
+    u0, u1, v0, v1 = (
+        float(n) for n in (columns.min(), columns.max() + 1, rows.min(), rows.max() + 1)
+    )
     margin = max(u1 - u0, v1 - v0) / 12.0
     sides = left + np.array([u0 - margin, u1 + margin]), top + np.array([v1 + margin, v0 - margin])
     (a, b), (c, d) = np.clip(sides[0], left, right), np.clip(sides[1], top, bottom)
@@ -310,7 +396,15 @@ def _circle(axes: Axes, cloud: Cloud, numbered: Iterator[tuple[int, Detection]])
         axes.add_patch(Circle(centre, radius, fill=False, color=TAKEN, linewidth=0.9))
         at = (centre[0] + 0.71 * radius, centre[1] - 0.71 * radius)
         box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.6, "pad": 0.4}
-        axes.annotate(str(number), at, (1, 1), textcoords="offset points", bbox=box, fontsize=7, annotation_clip=True)
+        axes.annotate(
+            str(number),
+            at,
+            (1, 1),
+            textcoords="offset points",
+            bbox=box,
+            fontsize=7,
+            annotation_clip=True,
+        )
 
 
 def _bytes(rgb: Any) -> np.ndarray:

@@ -15,19 +15,39 @@ BEHIND = ("source.target.backing.distance_mm", "source.target.backing_distance_m
 
 def scene_svg(facts: Mapping[str, Any]) -> Markup:
     """Return the picture with its caption; empty if ``facts``, the resolved experiment, hold no simulated target."""
-    cameras, distances = _values(facts, "source.camera.name"), _values(facts, "source.target.distance_m")
+    cameras, distances = (
+        _values(facts, "source.camera.name"),
+        _values(facts, "source.target.distance_m"),
+    )
     if not (cameras and distances):
         return Markup("")
     names = [camera_title(name) for name in cameras]
     named = names[0] if len(names) == 1 else f"{len(names)} cameras"
-    distance = value_text("distance_m", [distances[0], distances[-1]]) if len(distances) > 1 else f"{distances[0]:g} m"
+    distance = (
+        value_text("distance_m", [distances[0], distances[-1]])
+        if len(distances) > 1
+        else f"{distances[0]:g} m"
+    )
     gaps = [gap for path in BEHIND for gap in _values(facts, path)]
-    gap = " or ".join(f"{gap_mm:g} mm" for gap_mm in gaps) if len(gaps) < 3 else f"{min(gaps):g} to {max(gaps):g} mm"
+    gap = (
+        " or ".join(f"{gap_mm:g} mm" for gap_mm in gaps)
+        if len(gaps) < 3
+        else f"{min(gaps):g} to {max(gaps):g} mm"
+    )
     behind = f", {gap} in front of another surface" if gaps else ""
     target = facts["source"]["target"].get("name", "target")
-    target = {"drawn": "target with damage drawn at random", "thesis": "board with eleven holes"}.get(target, target)
+    target = {
+        "drawn": "target with damage drawn at random",
+        "thesis": "board with eleven holes",
+    }.get(target, target)
     words = f"{', '.join(names)} at {distance} from a {target}{behind}. Not to scale."
-    labels = {"words": words, "camera": named, "distance": distance, "target": "target", "behind": gap}
+    labels = {
+        "words": words,
+        "camera": named,
+        "distance": distance,
+        "target": "target",
+        "behind": gap,
+    }
     return Markup(template("scene.html").render(**labels))
 
 

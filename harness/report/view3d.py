@@ -68,7 +68,9 @@ def view3d_html(scene: Scene3d, title: str) -> str:
     """Return the page as text; see `write_view3d`."""
     present = {circle.kind for circle in scene.circles}
     kinds = [(kind, *words) for kind, words in KINDS.items() if kind in present]
-    return template("view3d.html").render(title=title, facts=scene.facts, data=packed(scene), kinds=kinds)
+    return template("view3d.html").render(
+        title=title, facts=scene.facts, data=packed(scene), kinds=kinds
+    )
 
 
 def packed(scene: Scene3d) -> dict[str, Any]:
@@ -88,7 +90,10 @@ def packed(scene: Scene3d) -> dict[str, Any]:
         steps = np.clip(np.rint(scene.residual_mm[kept] / RESIDUAL_STEP_MM), -32767, 32767)
         residual = _base64(np.where(np.isfinite(steps), steps, NO_RESIDUAL), "<i2")
     if scene.view_of is not None:
-        view = _base64(np.where((number := scene.view_of[kept]) < 0, SEVERAL_CODE, number % SEVERAL_CODE), "<u1")
+        view = _base64(
+            np.where((number := scene.view_of[kept]) < 0, SEVERAL_CODE, number % SEVERAL_CODE),
+            "<u1",
+        )
     views = [(name, VIEW_COLOURS[n % len(VIEW_COLOURS)]) for n, name in enumerate(scene.view_names)]
     circles = [
         {

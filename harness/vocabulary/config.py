@@ -14,7 +14,11 @@ class Config(BaseModel):
     @classmethod
     def _lists_are_tuples(cls, data: Any) -> Any:
         # Strict mode accepts no list in place of a tuple, and YAML and JSON have only lists.
-        return {key: _as_tuple(value) for key, value in data.items()} if isinstance(data, dict) else data
+        return (
+            {key: _as_tuple(value) for key, value in data.items()}
+            if isinstance(data, dict)
+            else data
+        )
 
     def model_copy(self, **how: Any) -> Self:
         """Copy as pydantic does, but drop the values that the original has cached."""

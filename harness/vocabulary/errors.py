@@ -38,7 +38,9 @@ def exit_code_of(program: Callable[[], int]) -> int:
     """Run a program's body and return its exit code. A UserError gives one message on stderr and code 2, Ctrl-C gives
     130, and a closed output pipe (``| head``) silently gives 141. Further Ctrl-C are ignored during the shutdown."""
     owns_interrupt = threading.current_thread() is threading.main_thread()
-    owns_interrupt = owns_interrupt and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    owns_interrupt = (
+        owns_interrupt and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    )
 
     def interrupt(number: int, frame: object) -> None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -48,7 +50,9 @@ def exit_code_of(program: Callable[[], int]) -> int:
         signal.signal(signal.SIGINT, interrupt)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
-            stream.reconfigure(errors="replace")  # a terminal that lacks a character such as "±" shows "?"
+            stream.reconfigure(
+                errors="replace"
+            )  # a terminal that lacks a character such as "±" shows "?"
     try:
         code = program()
         sys.stdout.flush()

@@ -20,7 +20,9 @@ MM = 1e-3  # Metres in a millimetre
 INCH = 25.4e-3  # Metres in an inch (exact by definition)
 UW_CM2 = 1e-2  # Watts per square metre in a microwatt per square centimetre
 SPEED_OF_LIGHT_VACUUM = 299_792_458.0  # m/s, exact by definition
-REFRACTIVE_INDEX_AIR = 1.00027  # At 850 nm, 20 C, 101 kPa (Ciddor 1996): +-1e-5 over indoor weather, 10 um at 1 m
+REFRACTIVE_INDEX_AIR = (
+    1.00027  # At 850 nm, 20 C, 101 kPa (Ciddor 1996): +-1e-5 over indoor weather, 10 um at 1 m
+)
 SPEED_OF_LIGHT_AIR = SPEED_OF_LIGHT_VACUUM / REFRACTIVE_INDEX_AIR  # m/s in indoor air
 
 
@@ -47,7 +49,9 @@ def rotation_xyz_deg(about_x: float, about_y: float, about_z: float) -> np.ndarr
     ax, ay, az = np.deg2rad([about_x, about_y, about_z])
     rx = np.array([[1, 0, 0], [0, np.cos(ax), -np.sin(ax)], [0, np.sin(ax), np.cos(ax)]])
     ry = np.array([[np.cos(ay), 0, np.sin(ay)], [0, 1, 0], [-np.sin(ay), 0, np.cos(ay)]])
-    return np.array([[np.cos(az), -np.sin(az), 0], [np.sin(az), np.cos(az), 0], [0, 0, 1]]) @ ry @ rx
+    return (
+        np.array([[np.cos(az), -np.sin(az), 0], [np.sin(az), np.cos(az), 0], [0, 0, 1]]) @ ry @ rx
+    )
 
 
 @dataclass(frozen=True)
@@ -121,7 +125,9 @@ class Lens:
             return np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy], axis=-1)
         pixels = np.stack([u.ravel(), v.ravel()], axis=-1)[:, None, :]
         stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, UNDISTORT_STEPS, 1e-10)
-        return cv2.undistortPoints(pixels, self.matrix, np.array(self.distortion), criteria=stop).reshape(*u.shape, 2)
+        return cv2.undistortPoints(
+            pixels, self.matrix, np.array(self.distortion), criteria=stop
+        ).reshape(*u.shape, 2)
 
     def region_slopes(self, region: Region, shift_px: float = 0.0) -> np.ndarray:
         """Return (x/z, y/z) through the pixel centres of a region, shape (h, w, 2), or ``shift_px`` beside and below
@@ -130,7 +136,11 @@ class Lens:
         joint = known.joined(region)
         if slopes is None or joint != known:
             joint = joint.grown(SPARE_PX, self.height + 1, self.width + 1)
-            known = joint if slopes is not None and joint.area <= 2 * (known.area + region.area) else region
+            known = (
+                joint
+                if slopes is not None and joint.area <= 2 * (known.area + region.area)
+                else region
+            )
             v, u = np.mgrid[known.row0 : known.row1, known.col0 : known.col1] + shift_px
             slopes = self.slopes(u, v)
         _slopes[self, shift_px] = known, slopes
@@ -143,7 +153,9 @@ class Lens:
         import cv2
 
         flat = np.ascontiguousarray(points_camera_m.reshape(-1, 3), dtype=float)
-        pixels, _ = cv2.projectPoints(flat, np.zeros(3), np.zeros(3), self.matrix, np.array(self.distortion))
+        pixels, _ = cv2.projectPoints(
+            flat, np.zeros(3), np.zeros(3), self.matrix, np.array(self.distortion)
+        )
         return pixels.reshape(*points_camera_m.shape[:-1], 2)
 
     def images(self, points_camera_m: np.ndarray) -> np.ndarray:
@@ -152,7 +164,10 @@ class Lens:
         points = np.where(ahead[..., None], points_camera_m, [0.0, 0.0, 1.0])
         u, v = np.moveaxis(self.project(points), -1, 0)
         found = ahead & (u >= 0) & (u <= self.width - 1) & (v >= 0) & (v <= self.height - 1)
-        back = self.slopes(np.where(found, u, 0.0), np.where(found, v, 0.0)) - points[..., :2] / points[..., 2:]
+        back = (
+            self.slopes(np.where(found, u, 0.0), np.where(found, v, 0.0))
+            - points[..., :2] / points[..., 2:]
+        )
         return np.asarray(found & (np.abs(back).max(axis=-1) < SAME_SLOPE))
 
 
@@ -174,8 +189,13 @@ class OtherLens(Lens):
         return Lens(self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.distortion)
 
 
-_slopes: dict[tuple[Lens, float], tuple[Region, np.ndarray]] = {}  # of regions, the last used at the end
-MOST_LENSES, SPARE_PX = 6, 16  # a region of 640 x 576 pixels takes 6 MB and 0.3 s; margin of a region for several views
+_slopes: dict[
+    tuple[Lens, float], tuple[Region, np.ndarray]
+] = {}  # of regions, the last used at the end
+MOST_LENSES, SPARE_PX = (
+    6,
+    16,
+)  # a region of 640 x 576 pixels takes 6 MB and 0.3 s; margin of a region for several views
 
 
 class Reason(IntEnum):

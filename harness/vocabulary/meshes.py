@@ -12,7 +12,8 @@ from harness.vocabulary.files import bounded_bytes, limited_memory
 
 MOST_BYTES, FILES = 1 << 29, ".stl, .ply, .obj or .glb"
 FrontAxis = Annotated[
-    Literal["+x", "-x", "+y", "-y", "+z", "-z"], Field(description="the file's axis that points at the camera")
+    Literal["+x", "-x", "+y", "-y", "+z", "-z"],
+    Field(description="the file's axis that points at the camera"),
 ]
 FileUnit = Literal["mm", "cm", "m", "in"]
 UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
@@ -38,7 +39,9 @@ def read_mesh(file: str) -> Any:
     try:
         content = bounded_bytes(path, MOST_BYTES)
         with limited_memory():
-            mesh: Any = trimesh.load(io.BytesIO(content), file_type=path.suffix.lower().removeprefix("."), force="mesh")
+            mesh: Any = trimesh.load(
+                io.BytesIO(content), file_type=path.suffix.lower().removeprefix("."), force="mesh"
+            )
     except OSError as error:
         raise UserError(f"{file}: cannot be read ({error.strerror})") from error
     except (ValueError, KeyError, IndexError, TypeError, NotImplementedError) as error:
@@ -50,4 +53,6 @@ def read_mesh(file: str) -> Any:
 
 def front_first(mesh: Any, unit: str, front: str) -> np.ndarray:
     """Return a mesh's vertices (n, 3) in metres, with z along its front axis and y as close to upright as possible."""
-    return np.asarray(np.asarray(mesh.vertices, float) @ np.array(FRONTS[front], float).T * UNITS_M[unit])
+    return np.asarray(
+        np.asarray(mesh.vertices, float) @ np.array(FRONTS[front], float).T * UNITS_M[unit]
+    )

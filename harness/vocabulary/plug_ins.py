@@ -57,8 +57,13 @@ class PlugIns:
             from harness.vocabulary.declaration.diagnose import nearest
 
             near = nearest(name, self.names())
-            message = f"there is no {self.noun} {name!r}" + (f"; did you mean {near!r}?" if near else "")
-            fix = self.fix or f"install the package that offers it through the entry point group {self.group!r}"
+            message = f"there is no {self.noun} {name!r}" + (
+                f"; did you mean {near!r}?" if near else ""
+            )
+            fix = (
+                self.fix
+                or f"install the package that offers it through the entry point group {self.group!r}"
+            )
             raise UserError(message, legal=", ".join(self.names()), fix=fix)
         if len({offer.target for offer in found}) > 1:
             both = " and ".join(f"{offer.target} ({offer.origin})" for offer in found)
@@ -78,23 +83,37 @@ class PlugIns:
         except (Exception, SystemExit) as error:
             if offer.built_in:
                 raise
-            raise self.broken(offer, f"{type(error).__name__}: {error}", f"python -c 'import {module}'") from error
+            raise self.broken(
+                offer, f"{type(error).__name__}: {error}", f"python -c 'import {module}'"
+            ) from error
 
     def broken(self, offer: Offer, why: str, command: str = "") -> UserError:
         """Return the error for a plug-in that does not fit its group. ``command`` shows the user more."""
-        fix = f"repair or uninstall the package {offer.package}" + (f"; `{command}` shows more" if command else "")
+        fix = f"repair or uninstall the package {offer.package}" + (
+            f"; `{command}` shows more" if command else ""
+        )
         what = f"{self.noun} {offer.name!r} ({offer.target}, of the package {offer.origin}) cannot be loaded: {why}"
         return UserError(what, fix=fix)
 
 
 @lru_cache(maxsize=8)
-def _offers(group: str, built_in: tuple[tuple[str, str], ...], _path: tuple[str, ...]) -> tuple[Offer, ...]:
+def _offers(
+    group: str, built_in: tuple[tuple[str, str], ...], _path: tuple[str, ...]
+) -> tuple[Offer, ...]:
     """Return tofpod's own offers and the group's. Cached, since reading every installed package takes 7 ms."""
     from harness import __version__
 
     found = [Offer(name, target, OWN, __version__) for name, target in built_in]
     found += [
-        Offer(entry.name, entry.value, *((entry.dist.name, entry.dist.version) if entry.dist else (entry.module, "")))
+        Offer(
+            entry.name,
+            entry.value,
+            *((entry.dist.name, entry.dist.version) if entry.dist else (entry.module, "")),
+        )
         for entry in entry_points(group=group)
     ]
-    return tuple(sorted(dict.fromkeys(found), key=lambda offer: (offer.name, not offer.built_in, offer.package)))
+    return tuple(
+        sorted(
+            dict.fromkeys(found), key=lambda offer: (offer.name, not offer.built_in, offer.package)
+        )
+    )

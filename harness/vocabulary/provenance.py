@@ -18,7 +18,17 @@ from typing import Any
 
 from harness.vocabulary.errors import UserError
 
-PACKAGES = ("mitsuba", "drjit", "trimesh", "numpy", "scipy", "numba", "pandas", "open3d-cpu", "opencv-python-headless")
+PACKAGES = (
+    "mitsuba",
+    "drjit",
+    "trimesh",
+    "numpy",
+    "scipy",
+    "numba",
+    "pandas",
+    "open3d-cpu",
+    "opencv-python-headless",
+)
 
 
 def commit_and_dirty() -> tuple[str | None, bool | None]:
@@ -28,7 +38,9 @@ def commit_and_dirty() -> tuple[str | None, bool | None]:
     def git(*arguments: str) -> str | None:
         command = ["git", "-C", str(root), *arguments]
         try:
-            return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+            return subprocess.run(
+                command, capture_output=True, text=True, timeout=10, check=True
+            ).stdout.strip()
         except (OSError, subprocess.SubprocessError):
             return None
 
@@ -53,24 +65,46 @@ def versions() -> dict[str, str]:
 def record(command: str) -> dict[str, Any]:
     """Return the origin for a stored result: command, commit, dirty flag, versions and machine, without any names."""
     commit, dirty = commit_and_dirty()
-    machine = {"system": platform.system(), "machine": platform.machine(), "processors": os.cpu_count()}
-    return {"command": command, "commit": commit, "dirty": dirty, "versions": versions(), "machine": machine}
+    machine = {
+        "system": platform.system(),
+        "machine": platform.machine(),
+        "processors": os.cpu_count(),
+    }
+    return {
+        "command": command,
+        "commit": commit,
+        "dirty": dirty,
+        "versions": versions(),
+        "machine": machine,
+    }
 
 
-RESULTS_VERSION = 1  # version of files that have none of their own; increased when the tables' meaning changes
+RESULTS_VERSION = (
+    1  # version of files that have none of their own; increased when the tables' meaning changes
+)
 GENERATOR = f"tofpod results {RESULTS_VERSION}"  # written into pages
 STAMP = re.compile(r"#\s*tofpod (\w+)(.*)")
 
 
 def check_version(
-    found: object, known: int, path: Path, what: str, *, oldest: int | None = None, again: str | None = None
+    found: object,
+    known: int,
+    path: Path,
+    what: str,
+    *,
+    oldest: int | None = None,
+    again: str | None = None,
 ) -> int:
     """Return a file's version if it lies between ``oldest`` (default: ``known``) and ``known``; else raise UserError.
     ``what`` names the kind of file, such as "a record"; ``again`` says how to make an outdated file again."""
     first = known if oldest is None else oldest
     legal, fix = f"version {known}" if first == known else f"versions {first} to {known}", again
     if isinstance(found, bool) or not isinstance(found, int) or found < 0:
-        fault = "states no version" if found is None else f"states the invalid version {str(found)[:40]!r}"
+        fault = (
+            "states no version"
+            if found is None
+            else f"states the invalid version {str(found)[:40]!r}"
+        )
         message = f"is {what} that {fault}"
     elif found > known:
         message = f"was written by a newer tofpod: it is {what} of version {found}"
@@ -98,7 +132,8 @@ def stamp_of(text: str, kind: str) -> object:
 ROOT = Path(__file__).resolve().parents[2]
 OWN = ("detectors", "harness", "scenes")  # The project's packages
 IMPORT = re.compile(
-    r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n#]+)|import[ \t]+([^\n#]+))", re.MULTILINE
+    r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n#]+)|import[ \t]+([^\n#]+))",
+    re.MULTILINE,
 )
 """Matches import statements, a hundred times faster than a parser; a false match in a text only adds a file."""
 
@@ -147,14 +182,18 @@ def _content(path: Path) -> bytes:
 def _source_of(name: str) -> Path | None:
     """Return the file of a module of the project, or None if there is no such module."""
     place = ROOT.joinpath(*name.split("."))
-    files = (place / "__init__.py", place.with_suffix(".py")) if name.partition(".")[0] in OWN else ()
+    files = (
+        (place / "__init__.py", place.with_suffix(".py")) if name.partition(".")[0] in OWN else ()
+    )
     return next((path for path in files if path.is_file()), None)
 
 
 def _imported(text: str) -> Iterator[str]:
     """Yield every dotted name that absolute imports may mean: both ``a`` and ``a.b`` for ``from a import b``."""
     for start, names, plain in IMPORT.findall(text):
-        words = [name.split()[0] for name in (names or plain).strip("()\n ").split(",") if name.strip()]
+        words = [
+            name.split()[0] for name in (names or plain).strip("()\n ").split(",") if name.strip()
+        ]
         yield from ([start, *(f"{start}.{word}" for word in words)] if start else words)
 
 

@@ -31,9 +31,14 @@ MOST_BYTES = 2 << 30  # a sensor of a million pixels at a hundred frequencies ne
 CHECKSUM_BYTES = 16
 ARRAYS = tuple(f.name for f in fields(NoiseFreeView) if f.type == "np.ndarray")
 RENDER_NAME = re.compile(r"[0-9a-f]{16}\.npz")
-LEFTOVER_NAME = re.compile(r"\.[0-9a-f]{16}\.\w+\.part\.npz")  # names of renders being written, by `files`
+LEFTOVER_NAME = re.compile(
+    r"\.[0-9a-f]{16}\.\w+\.part\.npz"
+)  # names of renders being written, by `files`
 LEFTOVER_AFTER_S = 86_400.0  # writing a render takes less than a second
-RENDERING, LOCK = ".rendering", ".lock"  # each render locks a byte of the first; a running sweep holds the second
+RENDERING, LOCK = (
+    ".rendering",
+    ".lock",
+)  # each render locks a byte of the first; a running sweep holds the second
 
 
 def render_key(target: TargetConfig, optics: Optics, config: RenderConfig) -> str:
@@ -42,7 +47,9 @@ def render_key(target: TargetConfig, optics: Optics, config: RenderConfig) -> st
     return digest({"code": source_digest(CODE, PACKAGES), **content})
 
 
-def cached_view(target: TargetConfig, optics: Optics, config: RenderConfig, folder: Path) -> tuple[NoiseFreeView, bool]:
+def cached_view(
+    target: TargetConfig, optics: Optics, config: RenderConfig, folder: Path
+) -> tuple[NoiseFreeView, bool]:
     """Return the view of a declared target, and whether it came from the cache. If another process renders it, wait for
     that. Raises UserError as `build_target` and `render_view` do, and if the folder cannot be written."""
     key = render_key(target, optics, config)
@@ -69,11 +76,16 @@ def write_view(path: Path, view: NoiseFreeView) -> None:
     facts = json.dumps({**kept, "version": VIEW_VERSION, "region": asdict(view.region)})
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
-        for name, array in {"facts": np.array(facts), **{name: getattr(view, name) for name in ARRAYS}}.items():
+        for name, array in {
+            "facts": np.array(facts),
+            **{name: getattr(view, name) for name in ARRAYS},
+        }.items():
             with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w") as part:
                 np.lib.format.write_array(part, np.asanyarray(array, order="C"), allow_pickle=False)
     content = buffer.getvalue()
-    write_bytes(path, content + hashlib.blake2b(content, digest_size=CHECKSUM_BYTES).digest(), durable=False)
+    write_bytes(
+        path, content + hashlib.blake2b(content, digest_size=CHECKSUM_BYTES).digest(), durable=False
+    )
 
 
 def read_view(path: Path) -> NoiseFreeView | None:
@@ -119,7 +131,9 @@ def stored_renders(folder: Path) -> list[StoredFile]:
 def leftovers(folder: Path, older_than_s: float = LEFTOVER_AFTER_S) -> list[StoredFile]:
     """Return the temporary files of renders that were never finished, if untouched for ``older_than_s``."""
     before_s = time.time() - older_than_s
-    return sorted((f for f in _files(folder, LEFTOVER_NAME) if f.used_s < before_s), key=lambda f: f.path)
+    return sorted(
+        (f for f in _files(folder, LEFTOVER_NAME) if f.used_s < before_s), key=lambda f: f.path
+    )
 
 
 def removed(files: Iterable[StoredFile]) -> list[StoredFile]:
@@ -132,9 +146,14 @@ def removed(files: Iterable[StoredFile]) -> list[StoredFile]:
     return gone
 
 
-def longest_unused(renders: Iterable[StoredFile], limit_bytes: int, keep: Collection[Path]) -> list[StoredFile]:
+def longest_unused(
+    renders: Iterable[StoredFile], limit_bytes: int, keep: Collection[Path]
+) -> list[StoredFile]:
     """Return the longest unused renders to remove so that the rest fits ``limit_bytes``; none of ``keep`` (names)."""
-    kept, renders = {path.name for path in keep}, sorted(renders, key=lambda file: (file.used_s, file.path.name))
+    kept, renders = (
+        {path.name for path in keep},
+        sorted(renders, key=lambda file: (file.used_s, file.path.name)),
+    )
     excess, going = sum(file.size_bytes for file in renders) - limit_bytes, []
     for file in renders:
         if excess > 0 and file.path.name not in kept:
@@ -168,7 +187,9 @@ def alone(folder: Path) -> Iterator[None]:
         try:
             file = held.enter_context(opened_lock(folder / LOCK))
         except OSError as error:
-            raise UserError(f"{folder}: cannot be written ({error.strerror})", fix="ask its owner") from error
+            raise UserError(
+                f"{folder}: cannot be written ({error.strerror})", fix="ask its owner"
+            ) from error
         if lock(file, shared=False, wait=False) == "busy":
             fix = "wait until it has ended; nothing was removed"
             raise UserError(f"{folder}: a sweep that is running uses these renders", fix=fix)

@@ -20,7 +20,11 @@ KINK_M, BENT_M = 2e-5, 2e-6
 a strip of tape. Up to the second, its light follows from that plane without casting sub-rays."""
 UNSURE_M = 1e-4  # pixels whose direct light may be wrong by more are sampled once more, finely
 UNEVEN = 0.2  # relative spread of direct light in a footprint that indicates the edge of a shadow
-FAST: Any = {"cache": True, "fastmath": {"contract", "reassoc", "nsz"}, "nogil": True}  # options for compilation
+FAST: Any = {
+    "cache": True,
+    "fastmath": {"contract", "reassoc", "nsz"},
+    "nogil": True,
+}  # options for compilation
 COMB_TOLERANCE = 1e-9  # largest deviation from even spacing, relative to the highest frequency, for the recurrence
 Frequencies = tuple[float, ...]
 
@@ -80,7 +84,12 @@ class OffFace(NamedTuple):
 
     def chosen(self, here: np.ndarray) -> OffFace:
         """Return those of the pixels selected by a mask (p,)."""
-        return OffFace(self.pixel[here], self.counts[here], self.share[here], self.slopes[np.repeat(here, self.counts)])
+        return OffFace(
+            self.pixel[here],
+            self.counts[here],
+            self.share[here],
+            self.slopes[np.repeat(here, self.counts)],
+        )
 
 
 class DirectLight(NamedTuple):
@@ -116,75 +125,128 @@ def cast(lit: LitScene, slopes: np.ndarray) -> Hits:
     dr.eval(*found)
     # one by one: to interleave them, Dr.Jit would compile a kernel for each number of rays
     far, path, light, own, which, u, v, face, nx, ny, nz = (each.numpy() for each in found)
-    return Hits(far, path, light, own, which, np.column_stack([u, v]), face, np.column_stack([nx, ny, nz]))
+    return Hits(
+        far, path, light, own, which, np.column_stack([u, v]), face, np.column_stack([nx, ny, nz])
+    )
 
 
 class _Sums:
     """Sums of direct light of a region's pixels, flat; fields as in `DirectLight`."""
 
-    def __init__(self, lit: LitScene, slopes: np.ndarray, footprint: Quadrilaterals, f: Frequencies) -> None:
+    def __init__(
+        self, lit: LitScene, slopes: np.ndarray, footprint: Quadrilaterals, f: Frequencies
+    ) -> None:
         self.lit, self.footprint, self.frequencies_hz = lit, footprint, f
         self.slopes, (h, w), lines = slopes.reshape(-1, 2), slopes.shape[:2], len(f)
         self.rows, self.cols = np.divmod(np.arange(h * w), w)
         self.central = cast(lit, self.slopes)
-        self.phasor, self.face = np.zeros((lines, h * w), complex), np.zeros((lines + 1, h * w), complex)
-        self.intensity, self.coverage, self.face_range_m = np.zeros(h * w), np.ones(h * w), np.zeros(h * w)
+        self.phasor, self.face = (
+            np.zeros((lines, h * w), complex),
+            np.zeros((lines + 1, h * w), complex),
+        )
+        self.intensity, self.coverage, self.face_range_m = (
+            np.zeros(h * w),
+            np.ones(h * w),
+            np.zeros(h * w),
+        )
         none = np.zeros(0, int)
         self.off_face = [OffFace(none, none, np.zeros(0), np.zeros((0, 2), np.float32))]
 
-    def add_all(self, wanted: np.ndarray, weights: np.ndarray, again: Any = None, plane: bool = False) -> np.ndarray:
+    def add_all(
+        self, wanted: np.ndarray, weights: np.ndarray, again: Any = None, plane: bool = False
+    ) -> np.ndarray:
         """Call `add` for the pixels ``wanted`` (h w,), so many at once as memory allows; return a mask as well."""
         here, unsure = np.flatnonzero(wanted), np.zeros(len(wanted), bool)
-        at_once = max(FLOATS_AT_ONCE * A_LANE // weights.shape[1] // (4 * len(self.frequencies_hz) + 24), 1)
+        at_once = max(
+            FLOATS_AT_ONCE * A_LANE // weights.shape[1] // (4 * len(self.frequencies_hz) + 24), 1
+        )
         for begin in range(0, len(here), at_once):
             unsure[self.add(here[begin : begin + at_once], weights, again, plane)] = True
         return unsure
 
-    def add(self, here: np.ndarray, weights: np.ndarray, again: Any = None, plane: bool = False) -> np.ndarray:
+    def add(
+        self, here: np.ndarray, weights: np.ndarray, again: Any = None, plane: bool = False
+    ) -> np.ndarray:
         """Add the light of the footprints' sub-rays axes (n, 3, k) @ ``weights`` (k, m) in pixels; no rays are cast if
         each pixel sees only the ``plane`` at its centre. Return those of ``again`` (h w,) that need finer sampling."""
         mi, dr, central, f = self.lit.mi, self.lit.dr, self.central, self.frequencies_hz
-        axes, m, lines = self.footprint.axes(self.rows[here], self.cols[here]), weights.shape[1], len(f)
+        axes, m, lines = (
+            self.footprint.axes(self.rows[here], self.cols[here]),
+            weights.shape[1],
+            len(f),
+        )
         (n, _, k), parts = axes.shape, m // A_LANE
         pixel, part = np.divmod(np.arange(n * parts), parts)
         axis = [on_device(mi.Float, each[pixel]) for each in axes.reshape(n, -1).T]
-        table, begin = [on_device(mi.Float, each) for each in weights], on_device(mi.UInt32, part * A_LANE)
-        middle, own = (on_device(mi.Float, each[here][pixel]) for each in (central.path_m, central.surface))
+        table, begin = (
+            [on_device(mi.Float, each) for each in weights],
+            on_device(mi.UInt32, part * A_LANE),
+        )
+        middle, own = (
+            on_device(mi.Float, each[here][pixel]) for each in (central.path_m, central.surface)
+        )
         if plane:
             ray = np.column_stack([self.slopes[here], np.ones(n)])
             ray *= (central.range_m[here] / np.linalg.norm(ray, axis=1))[:, None]
             height = on_device(mi.Float, (central.normal[here] * ray).sum(axis=1))
             normal = mi.Normal3f(*(on_device(mi.Float, each) for each in central.normal[here].T))
-            is_face, clear = (on_device(mi.UInt32, e[here]) > 0 for e in (central.on_face, central.amplitude > 0))
+            is_face, clear = (
+                on_device(mi.UInt32, e[here]) > 0 for e in (central.on_face, central.amplitude > 0)
+            )
 
         def meet(ray: Any) -> tuple[Met, Any, Any, Any]:
             if plane:
                 far, there = height / dr.dot(normal, ray), mi.Bool(True)
-                met = Met(there, far, mi.Point3f(far * ray), normal, mi.UInt32(own), mi.UInt32(0), -ray)
+                met = Met(
+                    there, far, mi.Point3f(far * ray), normal, mi.UInt32(own), mi.UInt32(0), -ray
+                )
                 return met, *self.lit.arriving(met, clear=clear), is_face
             met = self.lit.meet(mi.Point3f(0.0), ray, coherent=True)
             on_face = dr.gather(mi.Bool, self.lit.on_face, met.triangle, met.valid)
             return met, *self.lit.arriving(met, coherent=True), on_face
 
-        def step(j: Any, off: Any, light: list[Any], face: list[Any], others: list[Any]) -> tuple[Any, ...]:
+        def step(
+            j: Any, off: Any, light: list[Any], face: list[Any], others: list[Any]
+        ) -> tuple[Any, ...]:
             weight = [dr.gather(mi.Float, row, begin + j) for row in table]
-            ray = mi.Vector3f(*(sum(axis[c * k + i] * weight[i] for i in range(k)) for c in range(3)))
+            ray = mi.Vector3f(
+                *(sum(axis[c * k + i] * weight[i] for i in range(k)) for c in range(3))
+            )
             met, arriving, leg, on_face = meet(dr.normalize(ray))
             albedo, (count, same, far, first, second, most) = self.lit.albedo(met), others
-            amplitude, longer = albedo * arriving, dr.select(met.valid, met.distance + leg - middle, 0)
+            amplitude, longer = (
+                albedo * arriving,
+                dr.select(met.valid, met.distance + leg - middle, 0),
+            )
             light = added(light, amplitude, longer + middle, f)
             face = added(face, dr.select(on_face, albedo, 0), met.distance, f)
-            same = same + dr.select(dr.select(met.valid, mi.Float(met.surface), -1) == own, 1.0, 0.0)
-            far, count = far + dr.select(on_face, met.distance, 0), count + dr.select(on_face, 1.0, 0.0)
+            same = same + dr.select(
+                dr.select(met.valid, mi.Float(met.surface), -1) == own, 1.0, 0.0
+            )
+            far, count = (
+                far + dr.select(on_face, met.distance, 0),
+                count + dr.select(on_face, 1.0, 0.0),
+            )
             first, second = first + amplitude * longer, second + amplitude * dr.square(longer)
             off = off | dr.select(met.valid & ~on_face, mi.UInt32(1) << j, 0)
-            return j + 1, off, light, face, [count, same, far, first, second, dr.maximum(most, amplitude)]
+            return (
+                j + 1,
+                off,
+                light,
+                face,
+                [count, same, far, first, second, dr.maximum(most, amplitude)],
+            )
 
-        zeros = [[dr.zeros(mi.Float, n * parts) for _ in range(size)] for size in (2 * lines + 1, 2 * lines + 1, 6)]
+        zeros = [
+            [dr.zeros(mi.Float, n * parts) for _ in range(size)]
+            for size in (2 * lines + 1, 2 * lines + 1, 6)
+        ]
         state = (*(dr.zeros(mi.UInt32, n * parts) for _ in range(2)), *zeros)
         _, off, *found = dr.while_loop(state, lambda j, *_: j < A_LANE, step, label="footprints")
         dr.eval(off, *found)
-        light, face, others = (np.stack([e.numpy() for e in each]).reshape(-1, n, parts) for each in found)
+        light, face, others = (
+            np.stack([e.numpy() for e in each]).reshape(-1, n, parts) for each in found
+        )
         strongest = np.maximum(others[5].max(axis=1), 1e-30)
         light, face, others = (each.sum(axis=2, dtype=float) / m for each in (light, face, others))
         count, same, far, first, second, _ = others
@@ -241,14 +303,18 @@ def direct_light(
     central = sums.central
     bend_m, edge = _corners(lit, footprint.corner, slopes, central)
     if closely is not None:
-        edge |= (closely > 1) | ((closely > 0) & ndimage.binary_dilation(edge, np.ones((3, 3), bool)))
+        edge |= (closely > 1) | (
+            (closely > 0) & ndimage.binary_dilation(edge, np.ones((3, 3), bool))
+        )
     reach = 2 * footprint.reach_px + 1
     edge = ndimage.binary_dilation(edge, np.ones((reach, reach), bool))
     fine = edge if roughly is None else edge & ~roughly
     rest, bent = ~fine.ravel(), ((bend_m > BENT_M) | edge).ravel()
     sums.add_all(rest & ~bent & (central.surface >= 0), footprint.grid(), plane=True)
     sums.add_all(rest & bent, footprint.grid())
-    unsure = sums.add_all(fine.ravel(), footprint.lattice(), None if closely is None else closely.ravel() > 0)
+    unsure = sums.add_all(
+        fine.ravel(), footprint.lattice(), None if closely is None else closely.ravel() > 0
+    )
     sums.add_all(unsure, footprint.lattice(FINEST))
     return DirectLight(
         phasor=sums.phasor.reshape(-1, *shape),
@@ -264,7 +330,9 @@ def direct_light(
     )
 
 
-def _corners(lit: LitScene, corner: np.ndarray, slopes: np.ndarray, central: Hits) -> tuple[np.ndarray, np.ndarray]:
+def _corners(
+    lit: LitScene, corner: np.ndarray, slopes: np.ndarray, central: Hits
+) -> tuple[np.ndarray, np.ndarray]:
     """Return, (h, w) each, how far rays through a pixel's corners (slopes ``corner``, (h + 1, w + 1, 2)) hit off the
     plane at its centre, and whether they show an edge or the edge of a shadow in the pixel."""
     (h, w), hits = slopes.shape[:2], cast(lit, corner.reshape(-1, 2))
@@ -272,15 +340,33 @@ def _corners(lit: LitScene, corner: np.ndarray, slopes: np.ndarray, central: Hit
     normal = central.normal.reshape(h, w, 3).astype(float)
     middle_m, surface = central.range_m.reshape(h, w).astype(float), central.surface.reshape(h, w)
     height_m = middle_m * (normal * rays).sum(axis=-1) / np.linalg.norm(rays, axis=-1)
-    bare = np.divide(hits.amplitude, hits.albedo, out=np.zeros(len(hits.albedo)), where=hits.albedo > 0)
-    middle = np.divide(central.amplitude, central.albedo, out=np.zeros(h * w), where=central.albedo > 0).reshape(h, w)
-    most, least, bend_m, edge = middle.copy(), middle.copy(), np.zeros((h, w)), np.zeros((h, w), bool)
-    for at in ((down, across) for down in (slice(h), slice(1, None)) for across in (slice(w), slice(1, None))):
-        range_m, light, other = (each.reshape(h + 1, w + 1)[at] for each in (hits.range_m, bare, hits.surface))
+    bare = np.divide(
+        hits.amplitude, hits.albedo, out=np.zeros(len(hits.albedo)), where=hits.albedo > 0
+    )
+    middle = np.divide(
+        central.amplitude, central.albedo, out=np.zeros(h * w), where=central.albedo > 0
+    ).reshape(h, w)
+    most, least, bend_m, edge = (
+        middle.copy(),
+        middle.copy(),
+        np.zeros((h, w)),
+        np.zeros((h, w), bool),
+    )
+    for at in (
+        (down, across)
+        for down in (slice(h), slice(1, None))
+        for across in (slice(w), slice(1, None))
+    ):
+        range_m, light, other = (
+            each.reshape(h + 1, w + 1)[at] for each in (hits.range_m, bare, hits.surface)
+        )
         x, y = corner[at][..., 0], corner[at][..., 1]
         length = np.sqrt(1 + x * x + y * y)
         with np.errstate(invalid="ignore", divide="ignore"):
-            off_m = np.abs(range_m - height_m * length / (normal[..., 0] * x + normal[..., 1] * y + normal[..., 2]))
+            off_m = np.abs(
+                range_m
+                - height_m * length / (normal[..., 0] * x + normal[..., 1] * y + normal[..., 2])
+            )
         bend_m = np.fmax(bend_m, off_m)
         edge |= other != surface
         most, least = np.maximum(most, light), np.minimum(least, light)

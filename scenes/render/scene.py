@@ -37,7 +37,11 @@ def load_mitsuba() -> Any:
         message = "Mitsuba cannot run: Open3D was imported before it, and Open3D's C++ library replaces LLVM's"
         fix = "call scenes.render.scene.load_mitsuba() before importing open3d, or render in a process of its own"
         raise UserError(message, fix=fix)
-    raise UserError("Mitsuba cannot run: no NVIDIA GPU answers and no usable LLVM was found", legal=LEGAL, fix=FIX)
+    raise UserError(
+        "Mitsuba cannot run: no NVIDIA GPU answers and no usable LLVM was found",
+        legal=LEGAL,
+        fix=FIX,
+    )
 
 
 def _works(mi: Any, name: str) -> bool:
@@ -49,7 +53,9 @@ def _works(mi: Any, name: str) -> bool:
         try:
             mi.set_variant(name)
             scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle"}})
-            return bool(scene.ray_test(mi.Ray3f(mi.Point3f(0.1, 0.2, 1.0), mi.Vector3f(0.0, 0.0, -1.0)))[0])
+            return bool(
+                scene.ray_test(mi.Ray3f(mi.Point3f(0.1, 0.2, 1.0), mi.Vector3f(0.0, 0.0, -1.0)))[0]
+            )
         except Exception:
             # Dr.Jit reports a missing backend by various exceptions; any of them means that this variant does not work
             return False
@@ -57,7 +63,11 @@ def _works(mi: Any, name: str) -> bool:
 
 def _has_nvidia_driver() -> bool:
     """Return whether there is an NVIDIA driver. Without it, Dr.Jit prints warnings that look like errors to a user."""
-    return Path("/proc/driver/nvidia/version").exists() or Path("/dev/nvidiactl").exists() or sys.platform == "win32"
+    return (
+        Path("/proc/driver/nvidia/version").exists()
+        or Path("/dev/nvidiactl").exists()
+        or sys.platform == "win32"
+    )
 
 
 def _point_to_llvm() -> UserError | None:
@@ -65,8 +75,15 @@ def _point_to_llvm() -> UserError | None:
     choose one that aborts the process. Return the UserError to raise if no LLVM can be used."""
     named = os.environ.get("DRJIT_LIBLLVM_PATH")
     if named:
-        message, legal = f"DRJIT_LIBLLVM_PATH names {named}, which does not exist", "the path of LLVM 17 or newer"
-        return None if Path(named).exists() else UserError(message, legal=legal, fix="set or unset DRJIT_LIBLLVM_PATH")
+        message, legal = (
+            f"DRJIT_LIBLLVM_PATH names {named}, which does not exist",
+            "the path of LLVM 17 or newer",
+        )
+        return (
+            None
+            if Path(named).exists()
+            else UserError(message, legal=legal, fix="set or unset DRJIT_LIBLLVM_PATH")
+        )
     for folder in (Path(sys.prefix) / "lib", Path(sys.base_prefix) / "lib"):
         found = sorted(folder.glob("libLLVM.so.*"), key=lambda p: (len(p.name), p.name))
         if found:
@@ -80,7 +97,9 @@ ALIGNED_BYTES = 64  # of inputs: Dr.Jit uses memory of NumPy as it is, and compi
 
 def on_device(kind: Any, values: np.ndarray) -> Any:
     """Return values (n,) as a Dr.Jit array of ``kind``, aligned, so that kernels are compiled once for all boards."""
-    room = np.empty(values.size + ALIGNED_BYTES // 4, np.uint32 if kind.__name__ == "UInt" else np.float32)
+    room = np.empty(
+        values.size + ALIGNED_BYTES // 4, np.uint32 if kind.__name__ == "UInt" else np.float32
+    )
     placed = room[-room.ctypes.data % ALIGNED_BYTES // 4 :][: values.size]
     placed[:] = values
     return kind(placed)
@@ -192,7 +211,10 @@ class LitScene:
 
 
 def lit_scene(
-    mi: Any, parts: Sequence[TargetPart], optics: Optics, on_face: Sequence[np.ndarray] | None = None
+    mi: Any,
+    parts: Sequence[TargetPart],
+    optics: Optics,
+    on_face: Sequence[np.ndarray] | None = None,
 ) -> LitScene:
     """Build the scene from a target's parts, each with its albedo at 850 nm and its gloss; at most one has a texture.
     ``on_face``: for each part, which of its triangles (n,) lie on the undamaged face; None means none."""
@@ -217,7 +239,10 @@ def lit_scene(
         places = np.column_stack([part.mesh.vertices, np.ones(len(part.mesh.vertices))])
         uv_of = np.linalg.lstsq(places, part.uv, rcond=None)[0].T
     flags = np.zeros(len(faces), bool) if on_face is None else np.concatenate(list(on_face))
-    full, cutoff = (float(np.cos(np.deg2rad(a))) for a in (optics.full_half_angle_deg, optics.cutoff_half_angle_deg))
+    full, cutoff = (
+        float(np.cos(np.deg2rad(a)))
+        for a in (optics.full_half_angle_deg, optics.cutoff_half_angle_deg)
+    )
     shares, exponents = (mi.Float([part.gloss[k] for part in parts]) for k in (0, 1))
     return LitScene(
         mi=mi,

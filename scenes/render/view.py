@@ -14,7 +14,14 @@ import numpy as np
 from scipy import ndimage
 from scipy.stats import qmc
 
-from harness.vocabulary.geometry import MM, SPEED_OF_LIGHT_AIR, Region, invert, rotate_vectors, transform_points
+from harness.vocabulary.geometry import (
+    MM,
+    SPEED_OF_LIGHT_AIR,
+    Region,
+    invert,
+    rotate_vectors,
+    transform_points,
+)
 from scenes.optics import NoiseFreeView, Optics, RenderConfig, footprint_of
 from scenes.perspectives import seen_region
 from scenes.render.direct import FAST, DirectLight, OffFace, added, direct_light
@@ -31,7 +38,9 @@ CELLS, PROBES, OFTEN = 16, 2, 0.9
 """Cells along each side of the square of first directions from the face, probes along each side of a cell, and the
 share of paths that begin in cells where a probe met something; the others begin anywhere."""
 FLOATS_AT_ONCE = 1 << 26  # results held on the device at once: 0.25 GB
-FACE_WITHIN_M = 0.001 * MM  # vertices this close to the undamaged face lie on it: Booleans place them within 1 nm
+FACE_WITHIN_M = (
+    0.001 * MM
+)  # vertices this close to the undamaged face lie on it: Booleans place them within 1 nm
 MESH_WITHIN_M = 0.05 * MM  # the same for a part from a mesh, whose heights lie on a grid
 ABOVE_FACE_M = 1 * MM  # height of the nodes above the face, so that tape does not cover them
 
@@ -45,7 +54,12 @@ class PathWork(NamedTuple):
 
 
 def gather_at_points(
-    lit: LitScene, points_m: np.ndarray, normals: np.ndarray, work: PathWork, samples: int, bright: Any = None
+    lit: LitScene,
+    points_m: np.ndarray,
+    normals: np.ndarray,
+    work: PathWork,
+    samples: int,
+    bright: Any = None,
 ) -> np.ndarray:
     """Gather the indirect light that arrives at surface points (n, 3) with normals (n, 3), cosine-weighted, per unit
     albedo, weighted by what a glossy board there sends to the lens. All points share their low-discrepancy numbers, so
@@ -59,7 +73,9 @@ def gather_at_points(
     def drawn(place: Any, u1: Any, u2: Any) -> tuple[Any, Any, Any, Any]:
         x, y, z, nx, ny, nz = (dr.gather(mi.Float, column, place) for column in columns)
         point, normal = mi.Point3f(x, y, z), mi.Normal3f(nx, ny, nz)
-        direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2)))
+        direction = mi.Frame3f(normal).to_world(
+            mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2))
+        )
         seen = lit.lobe(mi.UInt32(board), normal, -dr.normalize(mi.Vector3f(point)), direction)
         return point, normal, direction, seen
 
@@ -78,17 +94,23 @@ def gather_at_points(
 
     def start(place: Any, u1: Any, u2: Any, _: Any) -> tuple[Any, ...]:
         often = u1 < OFTEN
-        number = dr.select(often, u1 * mi.Float(count) / OFTEN, (u1 - OFTEN) * (cells / (1 - OFTEN)))
+        number = dr.select(
+            often, u1 * mi.Float(count) / OFTEN, (u1 - OFTEN) * (cells / (1 - OFTEN))
+        )
         whole = dr.minimum(mi.UInt32(number), dr.select(often, count - 1, mi.UInt32(cells - 1)))
         cell = dr.select(often, dr.gather(mi.UInt32, table, whole, often), whole)
         u1 = (mi.Float(cell % CELLS) + dr.minimum(number - mi.Float(whole), 1.0)) / CELLS
         u2 = (mi.Float(cell // CELLS) + u2) / CELLS
         return *drawn(place, u1, u2), 1 / dr.gather(mi.Float, density, cell), mi.Float(0.0)
 
-    return _gather(lit, start, work, np.full(len(points_m), samples), np.zeros(len(points_m)), bright)
+    return _gather(
+        lit, start, work, np.full(len(points_m), samples), np.zeros(len(points_m)), bright
+    )
 
 
-def gather_in_pixels(lit: LitScene, rays: OffFace, work: PathWork, samples: Any, after: int = 0) -> np.ndarray:
+def gather_in_pixels(
+    lit: LitScene, rays: OffFace, work: PathWork, samples: Any, after: int = 0
+) -> np.ndarray:
     """Gather indirect light, the mean over the listed sub-rays of each pixel, with ``samples`` paths, (p,) or one, that
     follow the first ``after``. All begin where a sub-ray ends, which is found once."""
     mi, dr = lit.mi, lit.dr
@@ -96,23 +118,37 @@ def gather_in_pixels(lit: LitScene, rays: OffFace, work: PathWork, samples: Any,
     hit = lit.meet(mi.Point3f(0.0), ray, coherent=True)
     ends = (*hit.place, *hit.normal, hit.distance, lit.albedo(hit))
     dr.eval(ends, hit.surface)
-    firsts, counts = (on_device(mi.UInt32, each) for each in (np.cumsum(rays.counts) - rays.counts, rays.counts))
+    firsts, counts = (
+        on_device(mi.UInt32, each) for each in (np.cumsum(rays.counts) - rays.counts, rays.counts)
+    )
 
     def start(place: Any, u1: Any, u2: Any, u3: Any) -> tuple[Any, ...]:
         first, count = (dr.gather(mi.UInt32, a, place) for a in (firsts, counts))
         which = first + dr.minimum(mi.UInt32(u3 * mi.Float(count)), count - 1)
         x, y, z, nx, ny, nz, distance, albedo = (dr.gather(mi.Float, each, which) for each in ends)
         point, normal = mi.Point3f(x, y, z), mi.Normal3f(nx, ny, nz)
-        direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2)))
+        direction = mi.Frame3f(normal).to_world(
+            mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2))
+        )
         surface = dr.gather(mi.UInt32, hit.surface, which)
         seen = lit.lobe(surface, normal, -mi.Vector3f(point) / distance, direction)
         return point, normal, direction, seen, albedo, distance
 
     work = work._replace(bounces=work.bounces - 1)
-    return _gather(lit, start, work, np.broadcast_to(np.asarray(samples), rays.pixel.shape), rays.pixel, None, after)
+    return _gather(
+        lit,
+        start,
+        work,
+        np.broadcast_to(np.asarray(samples), rays.pixel.shape),
+        rays.pixel,
+        None,
+        after,
+    )
 
 
-def range_noise_m(batches: np.ndarray, total: np.ndarray, frequencies_hz: tuple[float, ...]) -> np.ndarray:
+def range_noise_m(
+    batches: np.ndarray, total: np.ndarray, frequencies_hz: tuple[float, ...]
+) -> np.ndarray:
     """Return the standard deviation of range (n,) from phasors (B, l, n) of B independent batches at the frequencies of
     `noise_lines`, added to light ``total`` (f, n). The mean over B batches has that deviation over sqrt(B)."""
     few = noise_lines(frequencies_hz)
@@ -121,11 +157,15 @@ def range_noise_m(batches: np.ndarray, total: np.ndarray, frequencies_hz: tuple[
     return np.asarray(per_batch.std(axis=0, ddof=1) / np.sqrt(len(batches)))
 
 
-def range_change_m(change: np.ndarray, total: np.ndarray, frequencies_hz: tuple[float, ...]) -> np.ndarray:
+def range_change_m(
+    change: np.ndarray, total: np.ndarray, frequencies_hz: tuple[float, ...]
+) -> np.ndarray:
     """Return the change of range (..., n) by a small change (..., f, n) of phasors ``total`` (f, n); 0 without light.
     Phases turn by Im(dH / H) and are combined with the `range_weights`."""
     weights = range_weights(frequencies_hz)[:, None]
-    by_light = np.divide(weights, total, out=np.zeros(total.shape, complex), where=np.abs(total) > 0)
+    by_light = np.divide(
+        weights, total, out=np.zeros(total.shape, complex), where=np.abs(total) > 0
+    )
     return np.asarray((change.real * by_light.imag + change.imag * by_light.real).sum(axis=-2))
 
 
@@ -150,7 +190,13 @@ def _sobol(dimensions: int, longest: int, seed: int) -> np.ndarray:
 
 
 def _towards(
-    lit: LitScene, bright: tuple[Any, Any, Any], place: Any, normal: Any, turned: Any, u1: Any, u2: Any
+    lit: LitScene,
+    bright: tuple[Any, Any, Any],
+    place: Any,
+    normal: Any,
+    turned: Any,
+    u1: Any,
+    u2: Any,
 ) -> Any:
     """Return a direction from a surface and its weight. It is drawn by its cosine (``turned``) or, in front of the
     rectangle ``bright``, with a probability of a half towards a uniform point of it: a mixture of both densities (Veach
@@ -168,7 +214,11 @@ def _towards(
     falling = -dr.dot(direction, out)
     way = dr.dot(from_middle, out) / falling
     at = from_middle + way * direction
-    met = (falling > 0) & (dr.abs(dr.dot(at, axis_x)) <= half[0] ** 2) & (dr.abs(dr.dot(at, axis_y)) <= half[1] ** 2)
+    met = (
+        (falling > 0)
+        & (dr.abs(dr.dot(at, axis_x)) <= half[0] ** 2)
+        & (dr.abs(dr.dot(at, axis_y)) <= half[1] ** 2)
+    )
     cosine = dr.dot(normal, direction)
     area = 4 * half[0] * half[1]
     ratio = dr.select(met, dr.pi * dr.square(way) / (area * falling * dr.maximum(cosine, 1e-9)), 0)
@@ -181,29 +231,52 @@ class _Walk:
     same number share one rotation of the low-discrepancy points (modulo 1). ``longest``: most points in a batch. What
     differs between boards is data, not constants."""
 
-    def __init__(self, lit: LitScene, start: Any, work: PathWork, turns: np.ndarray, bright: Any, longest: int) -> None:
+    def __init__(
+        self,
+        lit: LitScene,
+        start: Any,
+        work: PathWork,
+        turns: np.ndarray,
+        bright: Any,
+        longest: int,
+    ) -> None:
         self.lit, self.start, self.work = lit, start, work
         mi, dr = lit.mi, lit.dr
-        self.turns, self.stream = on_device(mi.UInt32, turns), dr.opaque(mi.UInt32, work.seed * 1024)
+        self.turns, self.stream = (
+            on_device(mi.UInt32, turns),
+            dr.opaque(mi.UInt32, work.seed * 1024),
+        )
         self.dimensions = START_DIMENSIONS + PER_VERTEX * (work.bounces + 1)
         self.table = mi.Float(_sobol(self.dimensions, longest, work.seed))
         self.batch_points, self.aim = dr.opaque(mi.UInt32, longest), None
         if bright is not None:
-            self.aim = tuple(mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in bright[:3, k])) for k in (0, 1, 3))
+            self.aim = tuple(
+                mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in bright[:3, k]))
+                for k in (0, 1, 3)
+            )
 
     def sums(self, lanes: np.ndarray) -> np.ndarray:
         """Return sums over the paths of lanes: (f + 1, n) complex64, intensity last. ``lanes`` (4, n): each
         follows ``count`` paths of a place and batch, starting at number ``first``."""
         mi, dr, lines = self.lit.mi, self.lit.dr, len(self.work.frequencies_hz)
-        self.place, self.batch, self.first, self.count = (on_device(mi.UInt32, each) for each in lanes)
-        n, kinds = lanes.shape[1], (mi.UInt32, mi.UInt32, mi.Point3f, mi.Normal3f, mi.Vector3f, mi.Float)
+        self.place, self.batch, self.first, self.count = (
+            on_device(mi.UInt32, each) for each in lanes
+        )
+        n, kinds = (
+            lanes.shape[1],
+            (mi.UInt32, mi.UInt32, mi.Point3f, mi.Normal3f, mi.Vector3f, mi.Float),
+        )
         zeros = [dr.zeros(mi.Float, n) for _ in range(2 * lines + 1)]
         state = (*(dr.zeros(kind, n) for kind in kinds), dr.ones(mi.Float, n), zeros)
 
-        totals = dr.while_loop(state, lambda sample, *_: sample < self.count, self._vertex, label="walk")[-1]
+        totals = dr.while_loop(
+            state, lambda sample, *_: sample < self.count, self._vertex, label="walk"
+        )[-1]
         dr.eval(totals)
         values = [total.numpy() for total in totals]
-        return np.stack([*(values[2 * k] + 1j * values[2 * k + 1] for k in range(lines)), values[-1]])
+        return np.stack(
+            [*(values[2 * k] + 1j * values[2 * k + 1] for k in range(lines)), values[-1]]
+        )
 
     def _vertex(
         self,
@@ -220,9 +293,15 @@ class _Walk:
         lit, mi, dr, fresh = self.lit, self.lit.mi, self.lit.dr, vertex == 0
         which = *self._uniform(sample, 0), self._uniform(sample, 2)[0]
         point, normal, first, seen, weight, way = self.start(self.place, *which)
-        before, before_normal = dr.select(fresh, point, before), dr.select(fresh, normal, before_normal)
+        before, before_normal = (
+            dr.select(fresh, point, before),
+            dr.select(fresh, normal, before_normal),
+        )
         direction = dr.select(fresh, first, direction)
-        length, throughput = dr.select(fresh, way, length), dr.select(fresh, seen * weight, throughput)
+        length, throughput = (
+            dr.select(fresh, way, length),
+            dr.select(fresh, seen * weight, throughput),
+        )
 
         hit = lit.meet(before + LIFT_M * before_normal, direction)
         met = hit.valid
@@ -234,11 +313,15 @@ class _Walk:
 
         more = met & (vertex < self.work.bounces) & (throughput > 0)
         u1, u2 = self._uniform(sample, START_DIMENSIONS + PER_VERTEX * vertex)
-        direction = mi.Frame3f(hit.normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2)))
+        direction = mi.Frame3f(hit.normal).to_world(
+            mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2))
+        )
         if self.aim is not None:
             # the half of the square left by the other choice is a square too
             wide = dr.select(u1 < 0.5, 2 * u1, 2 * u1 - 1)
-            spread = mi.Frame3f(hit.normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(wide, u2)))
+            spread = mi.Frame3f(hit.normal).to_world(
+                mi.warp.square_to_cosine_hemisphere(mi.Point2f(wide, u2))
+            )
             aimed, weight = _towards(lit, self.aim, hit.place, hit.normal, spread, u1, u2)
             direction = dr.select(fresh, aimed, direction)
             throughput = throughput * dr.select(fresh, weight, 1)
@@ -250,15 +333,26 @@ class _Walk:
     def _uniform(self, sample: Any, dimension: Any) -> tuple[Any, Any]:
         """Return two co-ordinates of the low-discrepancy point of each lane's path, shifted by its place's rotation."""
         mi, dr = self.lit.mi, self.lit.dr
-        number = (self.batch * self.batch_points + self.first + sample) * self.dimensions + dimension
+        number = (
+            self.batch * self.batch_points + self.first + sample
+        ) * self.dimensions + dimension
         rotation = self.batch + BATCHES * dr.gather(mi.UInt32, self.turns, self.place)
         shifts = mi.sample_tea_32(rotation, dimension + self.stream, 4)
-        u = [dr.gather(mi.Float, self.table, number + k) + mi.Float(shifts[k] >> 8) * 2**-24 for k in (0, 1)]
+        u = [
+            dr.gather(mi.Float, self.table, number + k) + mi.Float(shifts[k] >> 8) * 2**-24
+            for k in (0, 1)
+        ]
         return u[0] - dr.floor(u[0]), u[1] - dr.floor(u[1])
 
 
 def _gather(
-    lit: LitScene, start: Any, work: PathWork, samples: np.ndarray, turns: np.ndarray, bright: Any, after: int = 0
+    lit: LitScene,
+    start: Any,
+    work: PathWork,
+    samples: np.ndarray,
+    turns: np.ndarray,
+    bright: Any,
+    after: int = 0,
 ) -> np.ndarray:
     """Follow ``samples`` (n,) paths from each place, after the first ``after`` (other arguments: `_Walk`). Return the
     light (BATCHES, f + 1, n) complex64 of each batch, frequency 0 (intensity) last. Units as in `NoiseFreeView`, but
@@ -273,11 +367,16 @@ def _gather(
     pair = np.repeat(np.arange(len(per_pair)), per_pair)
     place, batch = np.divmod(pair, BATCHES)
     first = (np.arange(len(pair)) - begins[pair]) * PATHS_A_LANE
-    lanes = np.stack([place, batch, earlier + first, np.minimum(per_batch[place] - first, PATHS_A_LANE)])
+    lanes = np.stack(
+        [place, batch, earlier + first, np.minimum(per_batch[place] - first, PATHS_A_LANE)]
+    )
     at_once = max(FLOATS_AT_ONCE // (2 * lines + 1), 1)
     chunks = (lanes[:, begin : begin + at_once] for begin in range(0, lanes.shape[1], at_once))
     sums = np.concatenate([walked.sums(chunk) for chunk in chunks], axis=1)
-    by_batch = np.add.reduceat(sums, begins, axis=1).reshape(lines + 1, len(samples), BATCHES) / per_batch[:, None]
+    by_batch = (
+        np.add.reduceat(sums, begins, axis=1).reshape(lines + 1, len(samples), BATCHES)
+        / per_batch[:, None]
+    )
     return np.ascontiguousarray(np.moveaxis(by_batch, 2, 0), np.complex64)
 
 
@@ -286,13 +385,23 @@ def face_triangles(target: Target) -> list[np.ndarray]:
     mesh = target.parts[0].mesh
     board = transform_points(invert(target.T_camera_board), mesh.vertices)
     within_m = MESH_WITHIN_M if target.config.board.shape.kind == "mesh" else FACE_WITHIN_M
-    near = np.abs(board[:, 2] - face_of(target.config.board).height_m(board[:, 0], board[:, 1])) < within_m
-    others = (np.full(len(part.mesh.faces), part.name.startswith("tape")) for part in target.parts[1:])
+    near = (
+        np.abs(board[:, 2] - face_of(target.config.board).height_m(board[:, 0], board[:, 1]))
+        < within_m
+    )
+    others = (
+        np.full(len(part.mesh.faces), part.name.startswith("tape")) for part in target.parts[1:]
+    )
     return [np.asarray(near[mesh.faces].all(axis=1)), *others]
 
 
 def face_light(
-    lit: LitScene, target: Target, direct: DirectLight, slopes: np.ndarray, work: PathWork, config: RenderConfig
+    lit: LitScene,
+    target: Target,
+    direct: DirectLight,
+    slopes: np.ndarray,
+    work: PathWork,
+    config: RenderConfig,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the indirect light (f + 1, n) by way of the face (without its holes) in the pixels that see any of it, in
     the order of `numpy.nonzero` of ``direct.face[-1]``, and its noise of range (n,) in metres."""
@@ -300,22 +409,36 @@ def face_light(
     rays = np.concatenate([slopes[seen], np.ones((int(seen.sum()), 1))], axis=-1)
     rays *= (direct.face_range_m[seen] / np.linalg.norm(rays, axis=-1))[..., None]
     x_seen, y_seen, _ = transform_points(invert(target.T_camera_board), rays).T
-    ends, spacing_m = ((each.min(), each.max()) for each in (x_seen, y_seen)), config.face_spacing_mm * MM
-    xs, ys = (np.linspace(low, high, max(int(np.ceil((high - low) / spacing_m)) + 1, 3)) for low, high in ends)
+    ends, spacing_m = (
+        ((each.min(), each.max()) for each in (x_seen, y_seen)),
+        config.face_spacing_mm * MM,
+    )
+    xs, ys = (
+        np.linspace(low, high, max(int(np.ceil((high - low) / spacing_m)) + 1, 3))
+        for low, high in ends
+    )
     # points above the face and their unit normals, in the camera's frame
     face, T_camera_board = face_of(target.config.board), target.T_camera_board
     x, y = (each.ravel() for each in np.meshgrid(xs, ys))
     normal = face.normal(x, y)
     point = face.point(x, y) + ABOVE_FACE_M * normal
-    position, normals = transform_points(T_camera_board, point), rotate_vectors(T_camera_board, normal)
+    position, normals = (
+        transform_points(T_camera_board, point),
+        rotate_vectors(T_camera_board, normal),
+    )
     # the face's bounds, as a source of light for the surfaces before it
     bright, outline = T_camera_board.copy(), target.outline_board_m[:, :2]
     low, high = outline.min(axis=0), outline.max(axis=0)
     bright[:3, 3] = transform_points(T_camera_board, np.append((low + high) / 2, 0.0))
     bright[:3, :2] *= (high - low) / 2
     light = gather_at_points(lit, position, normals, work, config.face_samples, bright)
-    few, mean = noise_lines(work.frequencies_hz), np.ascontiguousarray(light.mean(axis=0, dtype=complex).T)
-    off = np.ascontiguousarray(np.moveaxis(light[:, few] - light[:, few].mean(axis=0), 2, 0), complex)
+    few, mean = (
+        noise_lines(work.frequencies_hz),
+        np.ascontiguousarray(light.mean(axis=0, dtype=complex).T),
+    )
+    off = np.ascontiguousarray(
+        np.moveaxis(light[:, few] - light[:, few].mean(axis=0), 2, 0), complex
+    )
     place = np.stack([(x_seen - xs[0]) / (xs[1] - xs[0]), (y_seen - ys[0]) / (ys[1] - ys[0])])
     weights = range_weights(tuple(work.frequencies_hz[k] for k in few))
     around = place, (len(xs), len(ys)), mean, off, np.array(few), weights
@@ -329,11 +452,23 @@ def _between_nodes(place, size, mean, off, few, weights, share, total):  # type:
     times ``share`` (f + 1, n), and its noise of range when added to ``total`` (f, n). The error is (s/D)^2/8 for a
     spacing s and a distance D of the light source: 2e-3 at 80 mm and 0.7 m."""
     batches, lines = off.shape[1:]
-    found, noise_m, turn = np.empty_like(share), np.empty(place.shape[1]), np.zeros(lines, np.complex128)
+    found, noise_m, turn = (
+        np.empty_like(share),
+        np.empty(place.shape[1]),
+        np.zeros(lines, np.complex128),
+    )
     for i in range(place.shape[1]):
-        c, r = min(max(int(place[0, i]), 0), size[0] - 2), min(max(int(place[1, i]), 0), size[1] - 2)
+        c, r = (
+            min(max(int(place[0, i]), 0), size[0] - 2),
+            min(max(int(place[1, i]), 0), size[1] - 2),
+        )
         p, q = place[0, i] - c, place[1, i] - r
-        index = (r * size[0] + c, r * size[0] + c + 1, (r + 1) * size[0] + c, (r + 1) * size[0] + c + 1)
+        index = (
+            r * size[0] + c,
+            r * size[0] + c + 1,
+            (r + 1) * size[0] + c,
+            (r + 1) * size[0] + c + 1,
+        )
         weight = ((1 - q) * (1 - p), (1 - q) * p, q * (1 - p), q * p)
         for k in range(mean.shape[1]):
             value = 0j
@@ -357,12 +492,22 @@ def _between_nodes(place, size, mean, off, few, weights, share, total):  # type:
     return found, noise_m
 
 
-RIM_PX = 3  # rendered surroundings of the board's outline, so that its rim looks as on the whole sensor
+RIM_PX = (
+    3  # rendered surroundings of the board's outline, so that its rim looks as on the whole sensor
+)
 NEAR_PX = 3  # beyond the outline, edges behind the board are finely sampled: the camera's filter mixes these pixels in
 HOLE_RIM_PX = 1
-NARROW = ("through", "blind", "slot", "gouge", "chip")  # damage that may lie between a pixel's corners and its centre
+NARROW = (
+    "through",
+    "blind",
+    "slot",
+    "gouge",
+    "chip",
+)  # damage that may lie between a pixel's corners and its centre
 FIRST_SAMPLES = 32  # paths of each pixel inside the outline before it is known how many are needed
-AROUND = 1.0 - np.eye(25)[12].reshape(5, 5)  # pixels whose first paths show how many: 768 seldom miss bright ones
+AROUND = 1.0 - np.eye(25)[12].reshape(
+    5, 5
+)  # pixels whose first paths show how many: 768 seldom miss bright ones
 
 
 def target_region(target: Target, optics: Optics) -> Region:
@@ -443,12 +588,20 @@ def indirect_light(
         mean = share * light.mean(axis=0, dtype=complex)
         indirect[:, here] += mean
         total[:, here] += mean[:-1]
-        variance[here] += range_noise_m(share * light[:, noise_lines(frequencies)], total[:, here], frequencies) ** 2
+        variance[here] += (
+            range_noise_m(share * light[:, noise_lines(frequencies)], total[:, here], frequencies)
+            ** 2
+        )
     return indirect.reshape(-1, *shape), np.sqrt(variance).reshape(shape)
 
 
 def _light_in_pixels(
-    lit: LitScene, direct: DirectLight, total: np.ndarray, within: np.ndarray, work: PathWork, config: RenderConfig
+    lit: LitScene,
+    direct: DirectLight,
+    total: np.ndarray,
+    within: np.ndarray,
+    work: PathWork,
+    config: RenderConfig,
 ) -> np.ndarray:
     """Return the light (B, f + 1, p) of paths; ``total`` (f, p): all other light. In the pixels ``within`` (p,), the
     first paths of the pixels around show how many reduce the noise of range to ``hole_noise_mm``. A pixel's own do not
@@ -460,13 +613,19 @@ def _light_in_pixels(
     noise_m = range_noise_m(share * light[:, noise_lines(f)], total + share * mean[:-1], f)
     spread = (noise_m * np.abs(total[0] / share + mean[0])) ** 2
     around = np.zeros((*shape, 4))
-    around.reshape(-1, 4)[rays.pixel[within]] = np.stack([within, spread, mean[0].real, mean[0].imag], -1)[within]
-    summed = cv2.filter2D(around, -1, AROUND, borderType=cv2.BORDER_CONSTANT).reshape(-1, 4)[rays.pixel]
+    around.reshape(-1, 4)[rays.pixel[within]] = np.stack(
+        [within, spread, mean[0].real, mean[0].imag], -1
+    )[within]
+    summed = cv2.filter2D(around, -1, AROUND, borderType=cv2.BORDER_CONSTANT).reshape(-1, 4)[
+        rays.pixel
+    ]
     count, spread, re, im = (summed / np.maximum(summed[:, :1], 1)).T
     expected_m = np.sqrt(spread) / np.maximum(np.abs(total[0] / share + re + 1j * im), 1e-30)
     wanted = (np.where(count > 0, expected_m, noise_m) / (config.hole_noise_mm * MM)) ** 2
     doublings = np.ceil(np.log2(np.clip(wanted, 1, config.hole_samples)) - 0.5)
-    many = np.where(within, np.clip(first * 2**doublings, first, config.hole_samples), 0).astype(np.int64)
+    many = np.where(within, np.clip(first * 2**doublings, first, config.hole_samples), 0).astype(
+        np.int64
+    )
     if (more := many > first).any():
         further = gather_in_pixels(lit, rays.chosen(more), work, (many - first)[more], after=first)
         light[..., more] += (1 - first / many[more]) * (further - light[..., more])

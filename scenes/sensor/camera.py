@@ -13,7 +13,13 @@ from pydantic import Field
 
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration.diagnose import read_as, settings_of, with_value_at
-from harness.vocabulary.declaration.yaml_source import DeclarationError, KeyPath, Problem, Source, read_yaml
+from harness.vocabulary.declaration.yaml_source import (
+    DeclarationError,
+    KeyPath,
+    Problem,
+    Source,
+    read_yaml,
+)
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Lens, OtherLens
 from harness.vocabulary.plug_ins import PlugIns
@@ -43,13 +49,22 @@ class EffectsConfig(Config):
 
     noise: bool = Field(True, description="shot and read noise of the samples")
     multipath: bool = Field(True, description="light that was reflected by more than one surface")
-    wiggling: bool = Field(True, description="error that harmonics of the modulation leave after factory calibration")
+    wiggling: bool = Field(
+        True, description="error that harmonics of the modulation leave after factory calibration"
+    )
     fixed_pattern: bool = Field(True, description="the unit's own range error of each pixel")
     unit_offset: bool = Field(True, description="the unit's own constant range error")
     warm_up_drift: bool = Field(True, description="range error that decays after power-on")
-    ambient: bool = Field(True, description="noise and full-scale range that ambient light (`ambient_uw_cm2_nm`) takes")
-    saturation: bool = Field(True, description="pixels beyond their own or the converter's full scale are invalid")
-    frame_jumps: bool = Field(True, description="displacement of whole frames: rare jumps and a small jitter")
+    ambient: bool = Field(
+        True,
+        description="noise and full-scale range that ambient light (`ambient_uw_cm2_nm`) takes",
+    )
+    saturation: bool = Field(
+        True, description="pixels beyond their own or the converter's full scale are invalid"
+    )
+    frame_jumps: bool = Field(
+        True, description="displacement of whole frames: rare jumps and a small jitter"
+    )
 
 
 NO_EFFECTS = EffectsConfig(**dict.fromkeys(EffectsConfig.model_fields, False))  # every effect off
@@ -59,19 +74,30 @@ class CameraConfig(Config):
     """The camera of an experiment: its name, the unit, the effects that are on, and the ambient light."""
 
     name: str = Field(
-        "azure_kinect_nfov", description="a camera of tofpod or of an installed package, or the path of a .yaml file"
+        "azure_kinect_nfov",
+        description="a camera of tofpod or of an installed package, or the path of a .yaml file",
     )
-    unit_seed: int = Field(1, ge=0, description="draws the unit's fixed pattern: another seed is another unit")
+    unit_seed: int = Field(
+        1, ge=0, description="draws the unit's fixed pattern: another seed is another unit"
+    )
     effects: EffectsConfig = EffectsConfig()
-    fixed_pattern_scale: float = Field(1.0, ge=0, le=100, description="multiplies the file's fixed pattern; 0: off")
-    edge_gate: bool = Field(True, description="whether pixels at edges are invalid, by a rule inferred from data")
+    fixed_pattern_scale: float = Field(
+        1.0, ge=0, le=100, description="multiplies the file's fixed pattern; 0: off"
+    )
+    edge_gate: bool = Field(
+        True, description="whether pixels at edges are invalid, by a rule inferred from data"
+    )
     ambient_uw_cm2_nm: Annotated[float, Field(ge=0, le=200)] = Field(
         0.04,
         description="irradiance of ambient light at the camera's wavelength, in microwatts per square centimetre and "
         "nanometre: 0.04 in a room with 50 lux of daylight, 0.4 at a window (500 lux of sunlight), 80 in full sun",
     )
-    minutes_since_power_on: float = Field(60.0, ge=0, le=1e5, description="time for which the unit has warmed up")
-    numbers: dict[str, Any] = Field({}, description="replaces numbers of the camera file, such as lens.fx_px: 505.1")
+    minutes_since_power_on: float = Field(
+        60.0, ge=0, le=1e5, description="time for which the unit has warmed up"
+    )
+    numbers: dict[str, Any] = Field(
+        {}, description="replaces numbers of the camera file, such as lens.fx_px: 505.1"
+    )
 
     def __hash__(self) -> int:
         # a mapping has no hash, and workers keep what they derived from a camera by its declaration
@@ -92,10 +118,15 @@ def camera_file(name: str) -> Path:
         return Path(offer.target)
     offered = CAMERAS.load(offer)
     if not isinstance(offered, str | Path):
-        raise CAMERAS.broken(offer, f"it must be the path of a YAML file, not {type(offered).__name__}")
+        raise CAMERAS.broken(
+            offer, f"it must be the path of a YAML file, not {type(offered).__name__}"
+        )
     path = Path(offered)
     if path.stem != name or not path.is_file():
-        raise CAMERAS.broken(offer, f"the camera {name} needs a file called {name}.yaml; there is no such file {path}")
+        raise CAMERAS.broken(
+            offer,
+            f"the camera {name} needs a file called {name}.yaml; there is no such file {path}",
+        )
     return path
 
 
@@ -124,18 +155,27 @@ def lens_named(name: str) -> OtherLens:
     lenses = {}
     for mode in (camera_name, *load_camera(camera_name).modes):
         camera, note = load_camera(mode), f"the lens is the nominal one of {mode}"
-        lenses[mode] = OtherLens(**vars(camera.nominal_lens), note=note, mode=mode, unit_m=camera.z_step_m)
+        lenses[mode] = OtherLens(
+            **vars(camera.nominal_lens), note=note, mode=mode, unit_m=camera.z_step_m
+        )
     return replace(lenses[name], others=tuple(lenses.values()))
 
 
 def camera_of(config: CameraConfig) -> AnyCamera:
     """Return the camera that an experiment declares. Raises UserError if a replaced number is impossible."""
-    return _with_numbers(config.name, canonical_json(config.numbers)) if config.numbers else load_camera(config.name)
+    return (
+        _with_numbers(config.name, canonical_json(config.numbers))
+        if config.numbers
+        else load_camera(config.name)
+    )
 
 
 def guessed_precision(camera: AnyCamera) -> str:
     """Return a warning for a camera whose precision is not published (shot noise by its gain); empty for others."""
-    if isinstance(camera, EmpiricalCamera) or (gain := camera.photons.signal_electrons).range is None:
+    if (
+        isinstance(camera, EmpiricalCamera)
+        or (gain := camera.photons.signal_electrons).range is None
+    ):
         return ""
     low, high = (float(np.sqrt(gain.value / end)) for end in reversed(gain.range))
     what = f"the precision of {camera.title} is not published: its noise is a guess"
@@ -159,9 +199,15 @@ def _with_numbers(name: str, numbers_json: str) -> AnyCamera:
             near = difflib.get_close_matches(path, number_paths(data), n=1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
             legal = f"a number of {camera_file(name)}, such as lens.fx_px"
-            raise UserError(f"source.camera.numbers: {name} has no number {path!r}{hint}", legal=legal)
+            raise UserError(
+                f"source.camera.numbers: {name} has no number {path!r}{hint}", legal=legal
+            )
         at.update(value=value, tag="U", source="set by the experiment")
-    return settings_of(KINDS[data["kind"]], data, f"source.camera.numbers and {name} together do not describe a camera")
+    return settings_of(
+        KINDS[data["kind"]],
+        data,
+        f"source.camera.numbers and {name} together do not describe a camera",
+    )
 
 
 def number_paths(data: Mapping[str, Any], prefix: str = "") -> list[str]:
@@ -179,7 +225,9 @@ def read_camera(path: Path) -> AnyCamera:
     camera = read_as(KINDS, "kind", source)
     if camera.name != path.stem:
         message = f"`name` is {camera.name}, but the file is {path.name}"
-        raise DeclarationError(str(path), [Problem(message, source.place_of(("name",)), fix=f"write {path.stem}")])
+        raise DeclarationError(
+            str(path), [Problem(message, source.place_of(("name",)), fix=f"write {path.stem}")]
+        )
     return camera
 
 
@@ -190,13 +238,25 @@ def _completed(source: Source, depth: int = 0) -> Source:
     if name is None:
         return source
     if not isinstance(name, str) or depth == DEEPEST:
-        message = "`like` is not the name of a camera" if depth < DEEPEST else f"`like` chains {DEEPEST} files"
-        problem = Problem(message, source.place_of(("like",)), legal=f"one of {', '.join(camera_names())}")
+        message = (
+            "`like` is not the name of a camera"
+            if depth < DEEPEST
+            else f"`like` chains {DEEPEST} files"
+        )
+        problem = Problem(
+            message, source.place_of(("like",)), legal=f"one of {', '.join(camera_names())}"
+        )
         raise DeclarationError(source.origin, [problem])
     beside = Path(source.origin).parent / name
-    base = _completed(read_yaml(beside), depth + 1) if is_camera_path(name) else _named(name, depth + 1)
+    base = (
+        _completed(read_yaml(beside), depth + 1)
+        if is_camera_path(name)
+        else _named(name, depth + 1)
+    )
     found = replace(source, data={key: value for key, value in base.data.items() if key != "modes"})
-    found = replace(found, values={**base.values, **source.values}, keys={**base.keys, **source.keys})
+    found = replace(
+        found, values={**base.values, **source.values}, keys={**base.keys, **source.keys}
+    )
     for path, value in _stated({key: value for key, value in source.data.items() if key != "like"}):
         found = found.with_value(path, with_value_at(found.data, path, value), source, path)
     return found

@@ -11,7 +11,10 @@ from numba.extending import intrinsic
 FAST: Any = {"cache": True, "fastmath": {"nsz"}, "error_model": "numpy", "nogil": True}
 """Compiler options of all camera kernels: operations are neither reordered nor fused, so that every processor gives the
 same bits. Values may be infinite: an unlit pixel may divide by zero and is gated out later."""
-EXACT_SUMS: Any = {**FAST, "fastmath": {"nsz", "reassoc"}}  # of whole numbers that float32 holds: exact in any order
+EXACT_SUMS: Any = {
+    **FAST,
+    "fastmath": {"nsz", "reassoc"},
+}  # of whole numbers that float32 holds: exact in any order
 IN_DOUBLE: Any = {**FAST, "fastmath": {"contract", "reassoc", "arcp", "nsz"}}
 """The same for float64 sums that are rounded to float32 afterwards; their order changes a range by 1e-13 m."""
 TWO_PI = np.float32(2.0 * math.pi)
@@ -51,7 +54,9 @@ def _log(u):  # type: ignore[no-untyped-def]
     exponent = exponent + np.int32(1) if big else exponent
     q = (mantissa - np.float32(1)) / (mantissa + np.float32(1))
     s = q * q
-    series = np.float32(2 / 3) + s * (np.float32(2 / 5) + s * (np.float32(2 / 7) + s * np.float32(2 / 9)))
+    series = np.float32(2 / 3) + s * (
+        np.float32(2 / 5) + s * (np.float32(2 / 7) + s * np.float32(2 / 9))
+    )
     return np.float32(exponent) * np.float32(0.69314718) + q * (np.float32(2) + s * series)
 
 
@@ -61,7 +66,10 @@ def _sincos_turns(v):  # type: ignore[no-untyped-def]
     quarter = np.floor(v * np.float32(4) + np.float32(0.5))
     x = (v - quarter * np.float32(0.25)) * TWO_PI
     x2 = x * x
-    sine = x * (np.float32(1) + x2 * (np.float32(-1 / 6) + x2 * (np.float32(1 / 120) + x2 * np.float32(-1 / 5040))))
+    sine = x * (
+        np.float32(1)
+        + x2 * (np.float32(-1 / 6) + x2 * (np.float32(1 / 120) + x2 * np.float32(-1 / 5040)))
+    )
     series = np.float32(1 / 24) + x2 * (np.float32(-1 / 720) + x2 * np.float32(1 / 40320))
     cosine = np.float32(1) + x2 * (np.float32(-0.5) + x2 * series)
     k = np.int32(quarter)
@@ -77,7 +85,9 @@ def _bits(of: Any, into: Any) -> Any:
     """Return a compiled function that reinterprets the bits of a number of one type as another type."""
 
     def cast(context, value):  # type: ignore[no-untyped-def]
-        return into(of), lambda inner, builder, _, args: builder.bitcast(args[0], inner.get_value_type(into))
+        return into(of), lambda inner, builder, _, args: builder.bitcast(
+            args[0], inner.get_value_type(into)
+        )
 
     return intrinsic(cast)
 

@@ -32,7 +32,11 @@ class SimulatedUnit:
     @cached_property
     def model(self) -> AmcwImager | LidarScanner | EmpiricalImager:
         """The model of the camera's kind on the view's region; it has `expose` and `frame`."""
-        kinds = {"amcw_imager": AmcwImager, "scanned_lidar": LidarScanner, "empirical": EmpiricalImager}
+        kinds = {
+            "amcw_imager": AmcwImager,
+            "scanned_lidar": LidarScanner,
+            "empirical": EmpiricalImager,
+        }
         return kinds[self.camera.kind](self.camera, self.config, self.view.region, self.view.slopes)
 
     @cached_property
@@ -97,14 +101,19 @@ class SimulatedCapture:
         """Displacements (n_frames,) of each frame as a whole, metres of half path."""
         camera, config = self.unit.camera, self.unit.config
         stream = random_stream(self.seed, "frame errors", *self.labels)
-        errors_m = frame_errors_m(camera.unit, config.effects, config.minutes_since_power_on, stream)
+        errors_m = frame_errors_m(
+            camera.unit, config.effects, config.minutes_since_power_on, stream
+        )
         return np.array(list(islice(errors_m, self.n_frames)))
 
     def totals(self, parts: Sequence[np.ndarray]) -> list[FrameTotals] | None:
         """Return the sums over the frames of the first of ``parts``, of the first two, and so on, drawn at once: their
         distribution is that of `frames`. Each part has numbers of frames (t,). None if frames must be drawn."""
         summer, errors_m = self.unit.at_once, self.errors_m
-        if summer is None or np.abs(errors_m[np.concatenate(parts)]).max(initial=0.0) > summer.farthest_error_m:
+        if (
+            summer is None
+            or np.abs(errors_m[np.concatenate(parts)]).max(initial=0.0) > summer.farthest_error_m
+        ):
             return None
 
         def stream(block: int) -> np.random.Generator:

@@ -65,11 +65,15 @@ def smooth_field(white: np.ndarray, length_px: float) -> np.ndarray:
     """Smooth white noise (h, w) to unit variance and autocorrelation exp(-k^2 / 2 length^2), periodic."""
     responses = []
     for size in white.shape:
-        response = ndimage.gaussian_filter1d(np.eye(1, size)[0], length_px / np.sqrt(2), mode="wrap")
+        response = ndimage.gaussian_filter1d(
+            np.eye(1, size)[0], length_px / np.sqrt(2), mode="wrap"
+        )
         responses.append(scipy.fft.fft(response / np.linalg.norm(response)).astype(np.complex64))
     down, across = responses
     spectrum = scipy.fft.rfft2(white)
-    return np.asarray(scipy.fft.irfft2(spectrum * down[:, None] * across[: spectrum.shape[1]], white.shape), float)
+    return np.asarray(
+        scipy.fft.irfft2(spectrum * down[:, None] * across[: spectrum.shape[1]], white.shape), float
+    )
 
 
 SPECTRUM, LEAST_POWER, FAINT = 256, 1e-3, 0.05
@@ -87,7 +91,9 @@ def taps_of(correlation: np.ndarray) -> np.ndarray:
     cepstrum[1 : SPECTRUM // 2] *= 2.0
     cepstrum[SPECTRUM // 2 + 1 :] = 0.0
     taps = np.fft.ifft(np.exp(np.fft.fft(cepstrum))).real
-    taps = taps[: 1 + int(np.flatnonzero(np.abs(taps[: SPECTRUM // 2]) > FAINT * np.abs(taps).max()).max())]
+    taps = taps[
+        : 1 + int(np.flatnonzero(np.abs(taps[: SPECTRUM // 2]) > FAINT * np.abs(taps).max()).max())
+    ]
     return np.asarray(taps / np.sqrt((taps**2).sum()), np.float32)
 
 
@@ -106,7 +112,9 @@ _patterns_mm: dict[tuple[Any, ...], np.ndarray] = {}
 class UnitModel(ABC, Generic[Camera]):
     """A unit of a camera on a region of its sensor whose central rays have ``slopes`` (h, w, 2)."""
 
-    def __init__(self, camera: Camera, config: CameraConfig, region: Region, slopes: np.ndarray) -> None:
+    def __init__(
+        self, camera: Camera, config: CameraConfig, region: Region, slopes: np.ndarray
+    ) -> None:
         self.camera, self.config, self.region, self.slopes = camera, config, region, slopes
 
     @abstractmethod
@@ -117,9 +125,13 @@ class UnitModel(ABC, Generic[Camera]):
     def static_error_m(self) -> np.ndarray:
         """All range errors (h, w) that the frames of this unit share, if they are switched on."""
         camera, config, lens = self.camera, self.config, self.camera.nominal_lens
-        error = _drift_m(camera.unit, config.effects, config.minutes_since_power_on, self.slopes[..., 0])
+        error = _drift_m(
+            camera.unit, config.effects, config.minutes_since_power_on, self.slopes[..., 0]
+        )
         if config.effects.unit_offset:
-            deviation = float(random_stream(config.unit_seed, "unit offset", camera.name).standard_normal())
+            deviation = float(
+                random_stream(config.unit_seed, "unit offset", camera.name).standard_normal()
+            )
             error = error + deviation * camera.unit.offset_mm.value * MM
         if not config.effects.fixed_pattern:
             return error
@@ -134,7 +146,9 @@ class UnitModel(ABC, Generic[Camera]):
         return np.asarray(error + drawn_mm * MM * config.fixed_pattern_scale)
 
 
-def _drift_m(facts: UnitFacts, effects: EffectsConfig, minutes: float, slope_x: np.ndarray) -> np.ndarray:
+def _drift_m(
+    facts: UnitFacts, effects: EffectsConfig, minutes: float, slope_x: np.ndarray
+) -> np.ndarray:
     """Return the error of range ``minutes`` after power-on; zeros where off."""
     if not effects.warm_up_drift:
         return np.zeros(slope_x.shape)

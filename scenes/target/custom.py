@@ -25,7 +25,9 @@ Albedo = Annotated[float, Field(ge=0.0, le=1.0)]
 Rgb = tuple[Albedo, Albedo, Albedo]
 Length = Annotated[float, Field(ge=1.0, le=1e4)]
 SizeMm = tuple[Length, Length]
-Chamfer = Annotated[float, Field(ge=0.0, le=100.0, description="leg of the 45 degree chamfer at the mouth; 0: none")]
+Chamfer = Annotated[
+    float, Field(ge=0.0, le=100.0, description="leg of the 45 degree chamfer at the mouth; 0: none")
+]
 
 
 class FlatConfig(Config):
@@ -36,7 +38,9 @@ class FlatConfig(Config):
 
 class _CurvedConfig(Config):
     radius_mm: Annotated[float, Field(ge=10.0, le=1e6)]
-    bulge: Literal["towards", "away"] = Field("towards", description="bulges towards the camera or away from it")
+    bulge: Literal["towards", "away"] = Field(
+        "towards", description="bulges towards the camera or away from it"
+    )
 
 
 class CylinderConfig(_CurvedConfig):
@@ -78,7 +82,9 @@ class CorrugatedConfig(Config):
 
     kind: Literal["corrugated"]
     period_mm: Annotated[float, Field(ge=5.0, le=1e3)] = 76.0
-    depth_mm: Annotated[float, Field(gt=0.0, le=200.0)] = Field(18.0, description="height from valley to crest")
+    depth_mm: Annotated[float, Field(gt=0.0, le=200.0)] = Field(
+        18.0, description="height from valley to crest"
+    )
     straight_along: Literal["x", "y"] = "y"
 
 
@@ -101,16 +107,22 @@ class RoughConfig(Config):
     pores, gravel."""
 
     kind: Literal["rough"]
-    deviation_mm: Annotated[float, Field(gt=0.0, le=20.0)] = Field(0.3, description="standard deviation of the heights")
+    deviation_mm: Annotated[float, Field(gt=0.0, le=20.0)] = Field(
+        0.3, description="standard deviation of the heights"
+    )
     outer_mm: Annotated[float, Field(ge=2.0, le=1e3)] = 60.0
     inner_mm: Annotated[float, Field(ge=1.0, le=100.0)] = 6.0
     hurst: Annotated[float, Field(gt=0.0, le=1.0)] = Field(0.8, description="H, the Hurst exponent")
-    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = Field(1, description="a family of boards draws it for each board")
+    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = Field(
+        1, description="a family of boards draws it for each board"
+    )
 
 
 class _FileConfig(Config):
     file: Annotated[str, Field(min_length=1, max_length=1000)]
-    content: str = Field("", max_length=32, description="the file's digest, filled in when the file is read")
+    content: str = Field(
+        "", max_length=32, description="the file's digest, filled in when the file is read"
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -177,7 +189,9 @@ class DrillConfig(Config):
 
     diameter_mm: Annotated[float, Field(ge=0.2, le=1e3)]
     kind: Literal["through", "blind"] = "through"
-    depth_mm: Annotated[float, Field(gt=0.0, le=500.0)] | None = Field(default=None, description="of blind holes only")
+    depth_mm: Annotated[float, Field(gt=0.0, le=500.0)] | None = Field(
+        default=None, description="of blind holes only"
+    )
     chamfer_mm: Chamfer = 0.0
 
 
@@ -225,7 +239,9 @@ class GlossConfig(Config):
     is reciprocal and never reflects more than the albedo. It lacks the growth at grazing angles (Fresnel)."""
 
     share: Albedo
-    exponent: float = Field(ge=1.0, le=500.0, description="width of the lobe at half height: 7: 50, 180: 10 degrees")
+    exponent: float = Field(
+        ge=1.0, le=500.0, description="width of the lobe at half height: 7: 50, 180: 10 degrees"
+    )
 
 
 class TextureConfig(_FileConfig):
@@ -238,10 +254,16 @@ class ReflectanceConfig(Config):
     """Reflectance of a board: diffuse, with a grain along x or a ``texture``, which scale 850 nm and all colours alike.
     ``gloss`` acts at the camera's wavelength, on the face and in holes, but not on tape."""
 
-    albedo_850: Albedo = Field(0.6, description="pale wood has 0.5 to 0.7; no published value for plywood was found")
+    albedo_850: Albedo = Field(
+        0.6, description="pale wood has 0.5 to 0.7; no published value for plywood was found"
+    )
     rgb: Rgb = (0.55, 0.42, 0.28)
-    grain_contrast: float = Field(0.05, ge=0.0, le=0.3, description="standard deviation of the albedo over its mean")
-    grain_period_mm: Annotated[float, Field(ge=1.0, le=200.0)] = Field(8.0, description="distance between dark lines")
+    grain_contrast: float = Field(
+        0.05, ge=0.0, le=0.3, description="standard deviation of the albedo over its mean"
+    )
+    grain_period_mm: Annotated[float, Field(ge=1.0, le=200.0)] = Field(
+        8.0, description="distance between dark lines"
+    )
     gloss: GlossConfig | None = None
     texture: TextureConfig | None = None
 
@@ -255,10 +277,14 @@ class MaterialConfig(ReflectanceConfig):
 class BackingConfig(Config):
     """A plane behind the board, parallel to the board frame's x and y."""
 
-    distance_mm: float = Field(ge=0.0, le=5e3, description="distance behind the deepest point of the board's back")
+    distance_mm: float = Field(
+        ge=0.0, le=5e3, description="distance behind the deepest point of the board's back"
+    )
     albedo_850: Albedo = 0.6
     rgb: Rgb = (0.55, 0.55, 0.55)
-    size_mm: SizeMm | None = Field(None, description="null: what the board hides from the lens at zero tilt")
+    size_mm: SizeMm | None = Field(
+        None, description="null: what the board hides from the lens at zero tilt"
+    )
 
 
 class RoomConfig(Config):
@@ -271,7 +297,9 @@ class RoomConfig(Config):
     back_wall_distance_m: Annotated[float, Field(ge=0.1, le=20.0)] | None = None
     back_wall_albedo_850: Albedo = 0.6
     back_wall_rgb: Rgb = (0.6, 0.6, 0.6)
-    width_m: float = Field(4.0, ge=0.5, le=40.0, description="width of floor and wall, centred on the optical axis")
+    width_m: float = Field(
+        4.0, ge=0.5, le=40.0, description="width of floor and wall, centred on the optical axis"
+    )
     height_m: float = Field(2.5, ge=0.5, le=20.0, description="height of the wall above the floor")
 
 
@@ -294,7 +322,9 @@ OtherWavelengths = Annotated[tuple[WavelengthConfig, ...], _OTHER]
 class PoseConfig(Config):
     """Pose of the board: the face's centre in the camera's axes, and rotations about the board's own x, then y, z."""
 
-    distance_m: Annotated[float, Field(ge=0.1, le=10.0)] = Field(0.7, description="depth of the face's centre")
+    distance_m: Annotated[float, Field(ge=0.1, le=10.0)] = Field(
+        0.7, description="depth of the face's centre"
+    )
     offset_x_mm: Coordinate = 0.0
     offset_y_mm: Coordinate = 0.0
     tilt_x_deg: Annotated[float, Field(ge=-70.0, le=70.0)] = 0.0
@@ -317,7 +347,8 @@ class SetUpConfig(Config):
 
     name: str
     flaws: Annotated[
-        tuple[AnyFlawConfig, ...], Field(max_length=500, description="damage of all kinds but holes and dents")
+        tuple[AnyFlawConfig, ...],
+        Field(max_length=500, description="damage of all kinds but holes and dents"),
     ] = ()
     material: MaterialConfig = MaterialConfig()
     backing: BackingConfig | None = None
@@ -331,7 +362,9 @@ class TargetConfig(SetUpConfig):
 
     name: Literal["custom"] = "custom"
     board: BoardConfig
-    drill: DrillConfig | None = Field(None, description="one drill for all holes, so that an axis can vary it")
+    drill: DrillConfig | None = Field(
+        None, description="one drill for all holes, so that an axis can vary it"
+    )
     holes: Annotated[tuple[HoleConfig, ...], Field(max_length=500)] = ()
     dents: Annotated[tuple[DentConfig, ...], Field(max_length=500)] = ()
     tapes: Annotated[tuple[TapeConfig, ...], Field(max_length=100)] = ()
@@ -339,17 +372,24 @@ class TargetConfig(SetUpConfig):
     @model_validator(mode="before")
     @classmethod
     def _one_drill(cls, data: Any) -> Any:
-        drill, holes = (data.get("drill"), data.get("holes")) if isinstance(data, dict) else (None, None)
+        drill, holes = (
+            (data.get("drill"), data.get("holes")) if isinstance(data, dict) else (None, None)
+        )
         if not isinstance(drill, dict) or not isinstance(holes, list | tuple):
             return data
         whole = {"kind": "through", "depth_mm": None, "chamfer_mm": 0.0, **drill}
-        return {**data, "holes": [{**hole, **whole} if isinstance(hole, dict) else hole for hole in holes]}
+        return {
+            **data,
+            "holes": [{**hole, **whole} if isinstance(hole, dict) else hole for hole in holes],
+        }
 
     @model_validator(mode="after")
     def _ids_once(self) -> Self:
         ids = [damage.id for damage in self.damages]
         if twice := sorted({i for i in ids if ids.count(i) > 1}):
-            raise ValueError(f"ids of damage must differ; given more than once: {', '.join(map(str, twice))}")
+            raise ValueError(
+                f"ids of damage must differ; given more than once: {', '.join(map(str, twice))}"
+            )
         return self
 
     @property
@@ -368,9 +408,15 @@ class TargetConfig(SetUpConfig):
     def at_wavelength(self, wavelength_nm: float) -> TargetConfig:
         """Return the declaration with the nearest albedos to that wavelength as its ``albedo_850``, and no others.
         Raises UserError if the declaration has none for it, or lacks the albedo of one of its surfaces."""
-        near = [albedos for albedos in self.other_wavelengths if abs(albedos.wavelength_nm - wavelength_nm) <= NEAR_NM]
+        near = [
+            albedos
+            for albedos in self.other_wavelengths
+            if abs(albedos.wavelength_nm - wavelength_nm) <= NEAR_NM
+        ]
         from_850 = abs(wavelength_nm - 850.0)
-        if from_850 <= NEAR_NM and all(from_850 <= abs(albedos.wavelength_nm - wavelength_nm) for albedos in near):
+        if from_850 <= NEAR_NM and all(
+            from_850 <= abs(albedos.wavelength_nm - wavelength_nm) for albedos in near
+        ):
             return self.model_copy(update={"other_wavelengths": ()})
         if not near:
             known = sorted({850.0, *(albedos.wavelength_nm for albedos in self.other_wavelengths)})
@@ -384,16 +430,26 @@ class TargetConfig(SetUpConfig):
         surfaces: dict[str, Any] = {"tape": self.tapes, "backing": self.backing}
         if room is not None:
             surfaces |= {"floor": room.floor_below_lens_m, "back_wall": room.back_wall_distance_m}
-        lacking = [name for name, surface in surfaces.items() if surface and getattr(albedos, name) is None]
+        lacking = [
+            name for name, surface in surfaces.items() if surface and getattr(albedos, name) is None
+        ]
         if lacking:
             what = f"other_wavelengths: at {albedos.wavelength_nm:g} nm there is no albedo for {', '.join(lacking)}"
             raise UserError(what, legal="an albedo for every surface that the target has")
         board = self.material.albedo_850 if albedos.board == "as_at_850" else albedos.board
-        changed: dict[str, Any] = {"material": self.material.model_copy(update={"albedo_850": board})}
-        changed["tapes"] = tuple(tape.model_copy(update={"albedo_850": albedos.tape}) for tape in self.tapes)
+        changed: dict[str, Any] = {
+            "material": self.material.model_copy(update={"albedo_850": board})
+        }
+        changed["tapes"] = tuple(
+            tape.model_copy(update={"albedo_850": albedos.tape}) for tape in self.tapes
+        )
         if self.backing is not None:
             changed["backing"] = self.backing.model_copy(update={"albedo_850": albedos.backing})
         if room is not None:
-            named = {f"{name}_albedo_850": getattr(albedos, name) for name in ("floor", "back_wall")}
-            changed["room"] = room.model_copy(update={key: value for key, value in named.items() if value is not None})
+            named = {
+                f"{name}_albedo_850": getattr(albedos, name) for name in ("floor", "back_wall")
+            }
+            changed["room"] = room.model_copy(
+                update={key: value for key, value in named.items() if value is not None}
+            )
         return self.model_copy(update={**changed, "other_wavelengths": ()})

@@ -98,7 +98,10 @@ class _LongConfig(_FlawConfig):
         """Return s and t (rows, columns) in metres, and the part of the half-width at which each row lies."""
         part, s = np.linspace(-1.0, 1.0, ACROSS + 1), np.linspace(-0.5, 0.5, ALONG + 1)
         turns, weights = random_stream(self.seed, "centre line").uniform(size=(2, 3))
-        waves = [w * np.sin(2 * np.pi * (k * s + turn)) for k, turn, w in zip((1, 2, 3), turns, weights, strict=True)]
+        waves = [
+            w * np.sin(2 * np.pi * (k * s + turn))
+            for k, turn, w in zip((1, 2, 3), turns, weights, strict=True)
+        ]
         line = np.sum(waves, axis=0)
         line = self.wander_mm * MM * (line - line.mean()) / max(float(line.std()), 1e-12)
         across, along = np.broadcast_arrays(part[:, None], s * self.length_mm * MM)
@@ -115,7 +118,9 @@ class SlotConfig(_LongConfig):
 
     def relief(self) -> Relief:
         s, t, _ = self._grid()
-        return Relief(s, t, np.full(s.shape, np.nan if self.depth_mm is None else self.depth_mm * MM))
+        return Relief(
+            s, t, np.full(s.shape, np.nan if self.depth_mm is None else self.depth_mm * MM)
+        )
 
 
 class GougeConfig(_LongConfig):
@@ -144,7 +149,9 @@ class RoundConfig(_FlawConfig):
 
     kind: Literal["pressed_dent", "pressed_bump", "protrusion"]
     diameter_mm: Extent
-    depth_mm: Annotated[Depth, Field(description="depth; of a protrusion, its height above the face")]
+    depth_mm: Annotated[
+        Depth, Field(description="depth; of a protrusion, its height above the face")
+    ]
 
     @property
     def pressed(self) -> bool:
@@ -154,7 +161,9 @@ class RoundConfig(_FlawConfig):
     def relief(self) -> Relief:
         s, t, ring = _disc(self.diameter_mm * MM / 2)
         height = (1 + np.cos(np.pi * ring)) / 2 if self.pressed else 1 - ring**2
-        return Relief(s, t, (1.0 if self.kind == "pressed_dent" else -1.0) * self.depth_mm * MM * height)
+        return Relief(
+            s, t, (1.0 if self.kind == "pressed_dent" else -1.0) * self.depth_mm * MM * height
+        )
 
 
 class CorrosionConfig(_FlawConfig):
@@ -163,7 +172,9 @@ class CorrosionConfig(_FlawConfig):
     rises to the face over the outer tenth of the radius. ``seed`` draws both."""
 
     kind: Literal["corrosion"]
-    diameter_mm: Annotated[Extent, Field(description="diameter of the circle that has the patch's area")]
+    diameter_mm: Annotated[
+        Extent, Field(description="diameter of the circle that has the patch's area")
+    ]
     depth_mm: Annotated[Depth, Field(description="mean depth")]
     rough_mm: Annotated[float, Field(ge=0.0, le=100.0)] = 0.2
     grain_mm: Annotated[float, Field(ge=0.1, le=200.0)] = 3.0
@@ -175,13 +186,18 @@ class CorrosionConfig(_FlawConfig):
         s, t, ring = _disc(1.0)
         angle, turn = np.arctan2(t, s), np.linspace(0, 2 * np.pi, 721)
         turns, weights = rng.uniform(0, 2 * np.pi, 4), rng.uniform(0.3, 1.0, 4)
-        spread, waves = self.uneven / np.sqrt((weights**2).sum() / 2), [*zip((2, 3, 4, 5), weights, turns, strict=True)]
+        spread, waves = (
+            self.uneven / np.sqrt((weights**2).sum() / 2),
+            [*zip((2, 3, 4, 5), weights, turns, strict=True)],
+        )
 
         def outline(at: np.ndarray) -> np.ndarray:
             return 1 + spread * sum(w * np.cos(k * at + p) for k, w, p in waves)
 
         stretch = radius_m * outline(angle) / np.sqrt(np.mean(outline(turn[:-1]) ** 2))
-        noise = gaussian_filter(rng.standard_normal(s.shape), self.grain_mm / self.diameter_mm * ROUND / np.sqrt(2))
+        noise = gaussian_filter(
+            rng.standard_normal(s.shape), self.grain_mm / self.diameter_mm * ROUND / np.sqrt(2)
+        )
         noise *= self.rough_mm * MM / max(float(noise.std()), 1e-12)
         ramp = np.clip((1 - ring) / 0.1, 0.0, 1.0)
         depth = np.maximum(self.depth_mm * MM + noise, 0.0) * ramp
@@ -201,10 +217,18 @@ class ChipConfig(_FlawConfig):
     angle_deg: Literal[0, 90, 180, -90]
 
     def relief(self) -> Relief:
-        u, v = np.meshgrid(CHIP_ARC * np.sin(np.linspace(-1, 1, ALONG + 1) * np.pi / 2), np.linspace(1, 0, ACROSS + 1))
+        u, v = np.meshgrid(
+            CHIP_ARC * np.sin(np.linspace(-1, 1, ALONG + 1) * np.pi / 2),
+            np.linspace(1, 0, ACROSS + 1),
+        )
         v = np.sin(v * np.pi / 2)
         s, t = u * self.length_mm * MM / 2, -v * np.sqrt(1 - u**2) * self.width_mm * MM
-        return Relief(s, t, self.depth_mm * MM * np.sqrt((1 - u**2) * np.maximum(1 - v**2, 0.0)), open_row=True)
+        return Relief(
+            s,
+            t,
+            self.depth_mm * MM * np.sqrt((1 - u**2) * np.maximum(1 - v**2, 0.0)),
+            open_row=True,
+        )
 
 
 FlawConfig = SlotConfig | GougeConfig | RoundConfig | CorrosionConfig | ChipConfig
@@ -220,7 +244,9 @@ def _disc(radius_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _mean(s: np.ndarray, t: np.ndarray, values: np.ndarray) -> float:
     """Return the mean of a grid's values over its area."""
-    across, down = (np.stack([each[1:, 1:] - each[:-1, :-1], each[1:, :-1] - each[:-1, 1:]]) for each in (s, t))
+    across, down = (
+        np.stack([each[1:, 1:] - each[:-1, :-1], each[1:, :-1] - each[:-1, 1:]]) for each in (s, t)
+    )
     areas = np.abs(across[0] * down[1] - across[1] * down[0])
     middles = (values[1:, 1:] + values[:-1, :-1] + values[1:, :-1] + values[:-1, 1:]) / 4
     return float((areas * middles).sum() / areas.sum())
@@ -228,7 +254,9 @@ def _mean(s: np.ndarray, t: np.ndarray, values: np.ndarray) -> float:
 
 def turned(angle_rad: float) -> np.ndarray:
     """Return the 2x2 matrix that turns from x towards y."""
-    return np.array([[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]])
+    return np.array(
+        [[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]]
+    )
 
 
 def border(grid: np.ndarray) -> np.ndarray:
@@ -241,7 +269,9 @@ def closed_grid(upper: np.ndarray, lower: np.ndarray) -> tuple[np.ndarray, np.nd
     columns running with x and rows with y as seen from above, closed by walls between their borders."""
     rows, columns = upper.shape[:2]
     grid = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = (part.ravel() for part in (grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]))
+    a, b, c, d = (
+        part.ravel() for part in (grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1])
+    )
     top = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
     rim, below = border(grid), grid.size
     following = np.roll(rim, -1)

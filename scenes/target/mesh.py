@@ -24,13 +24,30 @@ from scenes.target.checks import check_target
 from scenes.target.custom import DentConfig, HoleConfig, MaterialConfig, MeshConfig, TargetConfig
 from scenes.target.flaws import FlawConfig, RoundConfig, closed_grid, turned
 from scenes.target.part import part_of
-from scenes.target.truth import Damage, Face, face_of, outline_board_m, planes_of, relief_points, truth_of
+from scenes.target.truth import (
+    Damage,
+    Face,
+    face_of,
+    outline_board_m,
+    planes_of,
+    relief_points,
+    truth_of,
+)
 
-TEXEL_MM = 0.6  # finer than a pixel's footprint (1.4 mm at 0.7 m for the finest camera), made in 40 ms
+TEXEL_MM = (
+    0.6  # finer than a pixel's footprint (1.4 mm at 0.7 m for the finest camera), made in 40 ms
+)
 MAX_TEXELS = 4096  # along a side: a board of metres gets coarser texels instead of gigabytes
 MOST_IMAGE_BYTES = 1 << 28
-LINE_WEIGHT, FIBRE_WEIGHT = 0.8, 0.6  # of growth lines and fibres in the pattern: guesses, as are the lengths below
-WANDER_MM, WANDER_ACROSS_MM, WANDER_ALONG_MM = 6.0, 60.0, 240.0  # of growth lines: deviation, lengths across, along x
+LINE_WEIGHT, FIBRE_WEIGHT = (
+    0.8,
+    0.6,
+)  # of growth lines and fibres in the pattern: guesses, as are the lengths below
+WANDER_MM, WANDER_ACROSS_MM, WANDER_ALONG_MM = (
+    6.0,
+    60.0,
+    240.0,
+)  # of growth lines: deviation, lengths across, along x
 FIBRE_MM = 0.5, 12.0  # correlation lengths of the fibres across and along x
 
 
@@ -40,17 +57,27 @@ def grain(material: MaterialConfig, width_mm: float, height_mm: float) -> np.nda
     shape = tuple(max(2, round(size / texel_mm)) for size in (height_mm, width_mm))
     stream = random_stream(material.grain_seed, "grain")
     # coarse noise through a cubic spline
-    knots = [2 + round(n * texel_mm / s) for n, s in zip(shape, (WANDER_ACROSS_MM, WANDER_ALONG_MM), strict=True)]
-    coarse, finer = stream.standard_normal(knots), [n / k for n, k in zip(shape, knots, strict=True)]
+    knots = [
+        2 + round(n * texel_mm / s)
+        for n, s in zip(shape, (WANDER_ACROSS_MM, WANDER_ALONG_MM), strict=True)
+    ]
+    coarse, finer = (
+        stream.standard_normal(knots),
+        [n / k for n, k in zip(shape, knots, strict=True)],
+    )
     # along each axis in turn, by the spline's weights of the knots: zooming the array itself takes five times as long
-    down, across = (zoom(np.eye(k), (s, 1), order=3, mode="nearest") for k, s in zip(knots, finer, strict=True))
+    down, across = (
+        zoom(np.eye(k), (s, 1), order=3, mode="nearest") for k, s in zip(knots, finer, strict=True)
+    )
     wander = _normalised(down @ coarse @ across.T)
     across_mm = (np.arange(shape[0])[:, None] + 0.5) * texel_mm + WANDER_MM * wander
     turns = across_mm / material.grain_period_mm + stream.uniform()
     # late wood: a thin dark line at the end of each ring, after a slow fall
     rise = turns % 1.0
     lines, noise = _normalised(-rise * rise * rise), stream.standard_normal(shape, dtype=np.float32)
-    across, along = (cv2.getGaussianKernel(2 * int(3 * s + 0.5) + 1, s) for s in np.divide(FIBRE_MM, texel_mm))
+    across, along = (
+        cv2.getGaussianKernel(2 * int(3 * s + 0.5) + 1, s) for s in np.divide(FIBRE_MM, texel_mm)
+    )
     fibres = cv2.sepFilter2D(noise, -1, along, across, borderType=cv2.BORDER_REFLECT)
     return _normalised(LINE_WEIGHT * lines + FIBRE_WEIGHT * _normalised(fibres))
 
@@ -60,14 +87,21 @@ def reflectance(pattern: np.ndarray, mean: float, contrast: float) -> np.ndarray
     clipping would move the mean, the pattern is lifted to bring it back; the contrast then falls short."""
     raw, lift = mean * (1 + contrast * pattern), 0.0
     if raw.min() < 0.0 or raw.max() > 1.0:
-        lift = float(brentq(lambda up: float(np.clip(raw + up, 0.0, 1.0).mean()) - mean, -2.0, 2.0, xtol=1e-9))
+        lift = float(
+            brentq(
+                lambda up: float(np.clip(raw + up, 0.0, 1.0).mean()) - mean, -2.0, 2.0, xtol=1e-9
+            )
+        )
     return np.clip(raw + lift, 0.0, 1.0).astype(np.float32)
 
 
 def image_pattern(file: str) -> np.ndarray:
     """Return an image's brightness in linear light over its mean, less 1: (rows, columns), `MAX_TEXELS` at most."""
     try:
-        image = cv2.imdecode(np.frombuffer(bounded_bytes(Path(file), MOST_IMAGE_BYTES), np.uint8), cv2.IMREAD_ANYDEPTH)
+        image = cv2.imdecode(
+            np.frombuffer(bounded_bytes(Path(file), MOST_IMAGE_BYTES), np.uint8),
+            cv2.IMREAD_ANYDEPTH,
+        )
     except (OSError, cv2.error) as error:
         raise UserError(f"target.material.texture: {file} cannot be read ({error})") from error
     if image is None or image.dtype.kind != "u" or min(image.shape) < 2 or not image.any():
@@ -76,7 +110,11 @@ def image_pattern(file: str) -> np.ndarray:
     encoded = image / (2.0 ** (8 * image.itemsize) - 1)
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
     fewer = min(1.0, MAX_TEXELS / max(linear.shape))
-    linear = cv2.resize(linear, None, fx=fewer, fy=fewer, interpolation=cv2.INTER_AREA) if fewer < 1 else linear
+    linear = (
+        cv2.resize(linear, None, fx=fewer, fy=fewer, interpolation=cv2.INTER_AREA)
+        if fewer < 1
+        else linear
+    )
     return np.asarray(linear / linear.mean() - 1)
 
 
@@ -85,7 +123,10 @@ def look_up(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
     rows, columns = texture.shape[:2]
     places = np.stack([uv[..., 1] * rows - 0.5, uv[..., 0] * columns - 0.5])
     channels = texture.reshape(rows, columns, -1)
-    values = [map_coordinates(channels[..., i], places, order=1, mode="nearest") for i in range(channels.shape[2])]
+    values = [
+        map_coordinates(channels[..., i], places, order=1, mode="nearest")
+        for i in range(channels.shape[2])
+    ]
     return np.stack(values, axis=-1) if texture.ndim == 3 else values[0]
 
 
@@ -94,7 +135,10 @@ def _normalised(values: np.ndarray) -> np.ndarray:
     return centred / max(float(centred.std()), 1e-12)
 
 
-COARSEST_SAGITTA_M, FINEST_SAGITTA_M = 2e-6, 0.1e-6  # of facets on a bent face; under shallow dents depth / 400
+COARSEST_SAGITTA_M, FINEST_SAGITTA_M = (
+    2e-6,
+    0.1e-6,
+)  # of facets on a bent face; under shallow dents depth / 400
 ROUGH_SAGITTA_M = 8e-5  # the same at the sharpest crest of a rough face; elsewhere a tenth of it
 TAPE_SINK_M = 0.1e-3  # depth of a strip's underside in the board, so that no two surfaces coincide
 CORNER_M = 4e-6  # by which corners of a circle's polygon, of the same area, may stand out: 28 for 2 mm, 104 for 1 in
@@ -152,16 +196,25 @@ def build_target(config: TargetConfig) -> Target:
     uv = texture_850 = texture_rgb = None
     if (image := material.texture) is not None or material.grain_contrast != 0:
         uv = np.clip(np.column_stack([0.5 + plan[:, 0], 0.5 - plan[:, 1]]), 0.0, 1.0)
-        pattern = grain(material, board.width_mm, board.height_mm) if image is None else image_pattern(image.file)
+        pattern = (
+            grain(material, board.width_mm, board.height_mm)
+            if image is None
+            else image_pattern(image.file)
+        )
         contrast = material.grain_contrast if image is None else 1.0
         texture_850 = reflectance(pattern, material.albedo_850, contrast)
-        texture_rgb = np.stack([reflectance(pattern, mean, contrast) for mean in material.rgb], axis=-1)
+        texture_rgb = np.stack(
+            [reflectance(pattern, mean, contrast) for mean in material.rgb], axis=-1
+        )
     own = material.albedo_850, np.array(material.rgb), uv, texture_850, texture_rgb
     gloss = (material.gloss.share, material.gloss.exponent) if material.gloss else (0.0, 1.0)
     parts = [TargetPart("board", mesh, *own, gloss)]
     for number, tape in enumerate(config.tapes, start=1):
         (width, height), (x, y), top_m = tape.size_mm, tape.centre_mm, tape.thickness_mm * MM
-        size_m, at = (width * MM, height * MM), ((x * MM, y * MM), float(np.deg2rad(tape.angle_deg)))
+        size_m, at = (
+            (width * MM, height * MM),
+            ((x * MM, y * MM), float(np.deg2rad(tape.angle_deg))),
+        )
         strip = sheet(face_of(board), size_m, top_m, -TAPE_SINK_M, sagitta_m, *at)
         strip.apply_transform(T_camera_board)
         parts.append(TargetPart(f"tape_{number}", strip, tape.albedo_850, np.array(tape.rgb)))
@@ -173,7 +226,10 @@ def build_target(config: TargetConfig) -> Target:
 
 def board_solid(config: TargetConfig, truth: tuple[Damage, ...]) -> trimesh.Trimesh:
     """Return the board without its damage, watertight, board frame."""
-    size_m, thickness_m = (config.board.width_mm * MM, config.board.height_mm * MM), config.board.thickness_mm * MM
+    size_m, thickness_m = (
+        (config.board.width_mm * MM, config.board.height_mm * MM),
+        config.board.thickness_mm * MM,
+    )
     face = face_of(config.board)
     added: list[trimesh.Trimesh] = []
     cutters: list[trimesh.Trimesh] = []
@@ -193,7 +249,9 @@ def board_solid(config: TargetConfig, truth: tuple[Damage, ...]) -> trimesh.Trim
 def _sagitta_m(config: TargetConfig) -> float:
     if face_of(config.board).rough:
         return ROUGH_SAGITTA_M
-    depths_m = [bowl.depth_mm * MM for bowl in (*config.dents, *config.flaws) if bowl.depth_mm is not None]
+    depths_m = [
+        bowl.depth_mm * MM for bowl in (*config.dents, *config.flaws) if bowl.depth_mm is not None
+    ]
     return float(np.clip(min(depths_m, default=np.inf) / 400, FINEST_SAGITTA_M, COARSEST_SAGITTA_M))
 
 
@@ -213,7 +271,10 @@ def sheet(
     turn = turned(angle_rad)
 
     def plan(columns: int, rows: int) -> np.ndarray:
-        steps = (np.linspace(-0.5, 0.5, n + 1) * size for n, size in zip((columns, rows), size_m, strict=True))
+        steps = (
+            np.linspace(-0.5, 0.5, n + 1) * size
+            for n, size in zip((columns, rows), size_m, strict=True)
+        )
         return np.stack(np.meshgrid(*steps), axis=-1) @ turn.T + centre_m
 
     # Linear interpolation on a right triangle of legs a, b errs by (|f_aa| a^2 + 2 |f_ab| ab + |f_bb| b^2) / 8 or less.
@@ -224,19 +285,32 @@ def sheet(
     bends = np.abs(hessian).sum(axis=-1).max(axis=(0, 1))
     # 1e-9 per metre: rounding of a turned straight direction must not cut it into cells.
     lengths = np.where(bends > 1e-9, np.sqrt(4 * sagitta_m / np.maximum(bends, 1e-9)), np.inf)
-    columns, rows = (max(1, int(np.ceil(size / length))) for size, length in zip(size_m, lengths, strict=True))
+    columns, rows = (
+        max(1, int(np.ceil(size / length))) for size, length in zip(size_m, lengths, strict=True)
+    )
     if columns * rows > MAX_CELLS:
         needs = f"{columns} x {rows} cells for an error below {sagitta_m / MM * 1e3:.3g} um"
         fix = "make the board smaller or bend it less"
-        raise UserError(f"board: its face needs {needs}", legal=f"at most {MAX_CELLS} cells", fix=fix)
+        raise UserError(
+            f"board: its face needs {needs}", legal=f"at most {MAX_CELLS} cells", fix=fix
+        )
     places = plan(columns, rows)
-    points, normals = face.point(places[..., 0], places[..., 1]), face.normal(places[..., 0], places[..., 1])
-    lower = np.dstack([places, np.full(places.shape[:2], bottom_m)]) if flat_back else points + bottom_m * normals
+    points, normals = (
+        face.point(places[..., 0], places[..., 1]),
+        face.normal(places[..., 0], places[..., 1]),
+    )
+    lower = (
+        np.dstack([places, np.full(places.shape[:2], bottom_m)])
+        if flat_back
+        else points + bottom_m * normals
+    )
     vertices, faces = closed_grid(points + top_m * normals, lower)
     return trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
 
 
-def solids_of(item: FlawConfig, face: Face, thickness_m: float) -> tuple[list[trimesh.Trimesh], list[trimesh.Trimesh]]:
+def solids_of(
+    item: FlawConfig, face: Face, thickness_m: float
+) -> tuple[list[trimesh.Trimesh], list[trimesh.Trimesh]]:
     """Return the solids that a flaw adds to the board and those that it takes away, in this order, board frame. A
     pressed sheet moves its back too: the volume that one side loses, the other side gains."""
     points, depth_m, axis, across = relief_points(item, face, thickness_m)
@@ -247,14 +321,20 @@ def solids_of(item: FlawConfig, face: Face, thickness_m: float) -> tuple[list[tr
 
     def between(upper_m: np.ndarray | float, lower_m: np.ndarray | float) -> trimesh.Trimesh:
         """Return the solid between two heights over the face, along the axis."""
-        heights = (np.broadcast_to(height, depth_m.shape)[..., None] for height in (upper_m, lower_m))
-        return trimesh.Trimesh(*closed_grid(*(points + height * axis for height in heights)), process=False)
+        heights = (
+            np.broadcast_to(height, depth_m.shape)[..., None] for height in (upper_m, lower_m)
+        )
+        return trimesh.Trimesh(
+            *closed_grid(*(points + height * axis for height in heights)), process=False
+        )
 
     out = bool(depth_m.min() < 0)
     if not (isinstance(item, RoundConfig) and item.pressed):
         if out:
             return [between(-depth_m, -min(spare_m, thickness_m / 2))], []
-        return [], [between(spare_m, -depth_m - (spare_m if np.isnan(relief.depth_m).any() else 0.0))]
+        return [], [
+            between(spare_m, -depth_m - (spare_m if np.isnan(relief.depth_m).any() else 0.0))
+        ]
     # the back is the face moved by the thickness along its own normals
     normals = face.normal(points[..., 0], points[..., 1])
     back, middle = points - thickness_m * normals, points + -thickness_m / 2 * normals
@@ -285,9 +365,14 @@ def cutter(damage: Damage, declared: HoleConfig | DentConfig) -> trimesh.Trimesh
             profile = np.vstack([profile, (profile[-1, 0], spare_m)])
         profile = np.vstack([profile, (0.0, spare_m)])
     else:
-        bottom_m, mouth_m = -depth_m - (spare_m if damage.kind == "through" else 0.0), declared.mouth_m
+        bottom_m, mouth_m = (
+            -depth_m - (spare_m if damage.kind == "through" else 0.0),
+            declared.mouth_m,
+        )
         edge = [(radius_m, radius_m - mouth_m), (mouth_m, 0.0)] if mouth_m > radius_m else []
-        profile = np.array([(0.0, bottom_m), (radius_m, bottom_m), *edge, (mouth_m, spare_m), (0.0, spare_m)])
+        profile = np.array(
+            [(0.0, bottom_m), (radius_m, bottom_m), *edge, (mouth_m, spare_m), (0.0, spare_m)]
+        )
     sides = 4 * int(np.ceil(np.pi / 2 * np.sqrt(radius_m / (12 * CORNER_M))))
     angle = 2 * np.pi / sides
     equal_area = np.sqrt(angle / np.sin(angle))
@@ -296,7 +381,9 @@ def cutter(damage: Damage, declared: HoleConfig | DentConfig) -> trimesh.Trimesh
     across = np.cross([0.0, 1.0, 0.0], damage.axis_board)
     across /= np.linalg.norm(across)
     pose = np.eye(4)
-    pose[:3, :3] = MM * np.column_stack([across, np.cross(damage.axis_board, across), damage.axis_board])
+    pose[:3, :3] = MM * np.column_stack(
+        [across, np.cross(damage.axis_board, across), damage.axis_board]
+    )
     pose[:3, 3] = damage.centre_board_m
     return solid.apply_transform(pose)
 
@@ -312,8 +399,14 @@ def subtract(
     for mesh in (body, *added, *cutters):
         vertices, faces = np.array(mesh.vertices, float), np.array(mesh.faces, np.uint64)
         if mesh is body:
-            fine = manifold3d.Manifold(manifold3d.Mesh64(vertices, faces)).refine_to_length(longest_m).to_mesh64()
-            vertices, faces = (np.array(each, order="C") for each in (fine.vert_properties[:, :3], fine.tri_verts))
+            fine = (
+                manifold3d.Manifold(manifold3d.Mesh64(vertices, faces))
+                .refine_to_length(longest_m)
+                .to_mesh64()
+            )
+            vertices, faces = (
+                np.array(each, order="C") for each in (fine.vert_properties[:, :3], fine.tri_verts)
+            )
         # edges between faces of different numbers stay; others within a plane are dissolved
         numbers = np.arange(len(faces), dtype=np.uint64)
         solids.append(manifold3d.Manifold(manifold3d.Mesh64(vertices, faces, face_id=numbers)))
@@ -323,7 +416,9 @@ def subtract(
     whole = manifold3d.Manifold.batch_boolean(solids[: 1 + len(added)], manifold3d.OpType.Add)
     left = [whole, *solids[1 + len(added) :]]
     result = manifold3d.Manifold.batch_boolean(left, manifold3d.OpType.Subtract).to_mesh64()
-    return trimesh.Trimesh(result.vert_properties[:, :3], result.tri_verts.astype(np.int64), process=False)
+    return trimesh.Trimesh(
+        result.vert_properties[:, :3], result.tri_verts.astype(np.int64), process=False
+    )
 
 
 MESH_SUFFIXES = (".glb", ".ply")
@@ -335,22 +430,34 @@ def write_mesh(target: Target, path: Path) -> None:
     a texture, in glTF's frame (y up, the camera at the origin looks along -z). Raises UserError for another suffix."""
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
-        raise UserError(f"{path}: no mesh format is called {suffix or 'nothing'!r}", legal=" or ".join(MESH_SUFFIXES))
+        raise UserError(
+            f"{path}: no mesh format is called {suffix or 'nothing'!r}",
+            legal=" or ".join(MESH_SUFFIXES),
+        )
     write_bytes(path, _ply(target) if suffix == ".ply" else _glb(target))
 
 
 def write_truth(target: Target, path: Path) -> None:
     """Write as JSON: version, declaration, ``T_camera_board`` (metres) and one row in millimetres per damage."""
     data = {"results_version": RESULTS_VERSION, "target": target.config.to_data()}
-    data |= {"T_camera_board": target.T_camera_board.tolist(), "damages": [each.to_row() for each in target.truth]}
+    data |= {
+        "T_camera_board": target.T_camera_board.tolist(),
+        "damages": [each.to_row() for each in target.truth],
+    }
     write_json(path, data)
 
 
 def _ply(target: Target) -> bytes:
     coloured = []
     for part in target.parts:
-        colours = np.tile(np.append(_srgb_bytes(part.rgb), np.uint8(255)), (len(part.mesh.vertices), 1))
-        coloured.append(trimesh.Trimesh(part.mesh.vertices, part.mesh.faces, vertex_colors=colours, process=False))
+        colours = np.tile(
+            np.append(_srgb_bytes(part.rgb), np.uint8(255)), (len(part.mesh.vertices), 1)
+        )
+        coloured.append(
+            trimesh.Trimesh(
+                part.mesh.vertices, part.mesh.faces, vertex_colors=colours, process=False
+            )
+        )
     return trimesh.util.concatenate(coloured).export(None, file_type="ply")
 
 
@@ -377,5 +484,9 @@ def _glb(target: Target) -> bytes:
 def _srgb_bytes(linear: np.ndarray) -> np.ndarray:
     """Return linear reflectance in 0..1 as 8-bit sRGB (IEC 61966-2-1)."""
     linear = np.asarray(linear, dtype=float)
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
+    encoded = np.where(
+        linear <= 0.0031308,
+        12.92 * linear,
+        1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055,
+    )
     return np.round(255 * encoded).astype(np.uint8)

@@ -34,7 +34,9 @@ class Face:
     height: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
 
     def _derived(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, ...]:
-        return self.derivatives(*np.broadcast_arrays(np.asarray(x_m, float), np.asarray(y_m, float)))
+        return self.derivatives(
+            *np.broadcast_arrays(np.asarray(x_m, float), np.asarray(y_m, float))
+        )
 
     def height_m(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
         """Return z of the face; NaN where the shape does not reach."""
@@ -86,7 +88,11 @@ def face_of(board: custom.BoardConfig) -> Face:
     if isinstance(shape, custom.MeshConfig):
         return Face(partial(front_derivatives, shape))
     if isinstance(shape, custom.CorrugatedConfig):
-        bent_along, wave, high_m = shape.straight_along, 2 * np.pi / (shape.period_mm * MM), shape.depth_mm * MM / 2
+        bent_along, wave, high_m = (
+            shape.straight_along,
+            2 * np.pi / (shape.period_mm * MM),
+            shape.depth_mm * MM / 2,
+        )
 
         def corrugated(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
             across, none = (x if bent_along == "y" else y) * wave, np.zeros(x.shape)
@@ -98,14 +104,27 @@ def face_of(board: custom.BoardConfig) -> Face:
         return Face(corrugated)
     if isinstance(shape, custom.PanelConfig):
         bends = -1 / (shape.radius_x_mm * MM), -1 / (shape.radius_y_mm * MM)
-        high_m, y0, wide_m = shape.swage_mm * MM / 2, shape.swage_y_mm * MM, shape.swage_width_mm * MM
+        high_m, y0, wide_m = (
+            shape.swage_mm * MM / 2,
+            shape.swage_y_mm * MM,
+            shape.swage_width_mm * MM,
+        )
 
         def panel(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
             step = np.tanh((y - y0) / wide_m)
-            height = (bends[0] * x**2 + bends[1] * y**2) / 2 + high_m * (step + np.tanh(y0 / wide_m))
+            height = (bends[0] * x**2 + bends[1] * y**2) / 2 + high_m * (
+                step + np.tanh(y0 / wide_m)
+            )
             slope_y = bends[1] * y + high_m / wide_m * (1 - step**2)
             bend_y = bends[1] - 2 * high_m / wide_m**2 * step * (1 - step**2)
-            return height, bends[0] * x, slope_y, np.full(x.shape, bends[0]), np.zeros(x.shape), bend_y
+            return (
+                height,
+                bends[0] * x,
+                slope_y,
+                np.full(x.shape, bends[0]),
+                np.zeros(x.shape),
+                bend_y,
+            )
 
         return Face(panel)
     if isinstance(shape, custom.CylinderConfig | custom.SphereConfig):
@@ -138,13 +157,19 @@ def face_of(board: custom.BoardConfig) -> Face:
         if not coefficients.any():
             return tuple(np.zeros(x.shape) for _ in ORDERS)
         derived = (np.polynomial.polynomial.polyder(coefficients, dx, axis=0) for dx, _ in ORDERS)
-        along = (np.polynomial.polynomial.polyder(c, dy, axis=1) for c, (_, dy) in zip(derived, ORDERS, strict=True))
+        along = (
+            np.polynomial.polynomial.polyder(c, dy, axis=1)
+            for c, (_, dy) in zip(derived, ORDERS, strict=True)
+        )
         return tuple(np.asarray(np.polynomial.polynomial.polyval2d(x, y, c)) for c in along)
 
     return Face(polynomial)
 
 
-ROUGH_MARGIN_M, ROUGH_STEPS = 0.02, 4  # beyond the board; knots of the spline to the shortest wavelength
+ROUGH_MARGIN_M, ROUGH_STEPS = (
+    0.02,
+    4,
+)  # beyond the board; knots of the spline to the shortest wavelength
 
 
 def _rough_face(shape: custom.RoughConfig, size_m: tuple[float, float]) -> Face:
@@ -153,7 +178,9 @@ def _rough_face(shape: custom.RoughConfig, size_m: tuple[float, float]) -> Face:
 
     step_m = shape.inner_mm * MM / ROUGH_STEPS
     counts = [2 * math.ceil((side / 2 + ROUGH_MARGIN_M) / step_m) + 1 for side in size_m]
-    k = np.hypot(*np.meshgrid(*(2 * np.pi * np.fft.fftfreq(n, step_m) for n in counts), indexing="ij"))
+    k = np.hypot(
+        *np.meshgrid(*(2 * np.pi * np.fft.fftfreq(n, step_m) for n in counts), indexing="ij")
+    )
     outer, inner = 2 * np.pi / (shape.outer_mm * MM), 2 * np.pi / (shape.inner_mm * MM)
     amplitude = np.where((k > 0) & (k <= inner), (k**2 + outer**2) ** (-(1 + shape.hurst) / 2), 0.0)
     noise = random_stream(shape.seed, "rough face").standard_normal(counts)
@@ -188,11 +215,15 @@ def face_grid_m(board: custom.BoardConfig, depth_m: float = 0.0, steps: int = 32
     x, y = np.meshgrid(places * board.width_mm * MM, places * board.height_mm * MM)
     points = face.point(x, y) - depth_m * face.normal(x, y) if depth_m else face.point(x, y)
     if isinstance(board.shape, custom.MeshConfig):  # where its front is not, its bounds count
-        points = np.where(np.isnan(points[..., 2:]), np.dstack([x, y, np.full(x.shape, -depth_m)]), points)
+        points = np.where(
+            np.isnan(points[..., 2:]), np.dstack([x, y, np.full(x.shape, -depth_m)]), points
+        )
     return points
 
 
-def backing_corners_board_m(config: custom.TargetConfig, backing: custom.BackingConfig) -> np.ndarray:
+def backing_corners_board_m(
+    config: custom.TargetConfig, backing: custom.BackingConfig
+) -> np.ndarray:
     """Return the backing's corners in the board's frame; it faces the board."""
     deepest_m = -float(face_grid_m(config.board, config.board.thickness_mm * MM)[..., 2].min())
     z_m = deepest_m + backing.distance_mm * MM
@@ -205,13 +236,24 @@ def backing_corners_board_m(config: custom.TargetConfig, backing: custom.Backing
 def planes_of(config: custom.TargetConfig) -> Iterator[tuple[str, np.ndarray, float, custom.Rgb]]:
     """Yield backing, floor and back wall, as declared: name, corners (4, 3) in the camera's frame, albedo at 850 nm and
     rgb. The floor reaches to the back wall, which stands on it or, without a floor, is centred on the axis."""
-    backing, room, across, up = config.backing, config.room, _UNIT_CORNERS[:, 0], _UNIT_CORNERS[:, 1] + 0.5
+    backing, room, across, up = (
+        config.backing,
+        config.room,
+        _UNIT_CORNERS[:, 0],
+        _UNIT_CORNERS[:, 1] + 0.5,
+    )
     if backing is not None:
-        corners = transform_points(config.pose.T_camera_board, backing_corners_board_m(config, backing))
+        corners = transform_points(
+            config.pose.T_camera_board, backing_corners_board_m(config, backing)
+        )
         yield "backing", corners, backing.albedo_850, backing.rgb
     if room is None:
         return
-    floor_m, wall_m, across_m = room.floor_below_lens_m, room.back_wall_distance_m, room.width_m * across
+    floor_m, wall_m, across_m = (
+        room.floor_below_lens_m,
+        room.back_wall_distance_m,
+        room.width_m * across,
+    )
     if floor_m is not None:
         corners = np.column_stack([across_m, np.full(4, floor_m), (wall_m or OPEN_FLOOR_M) * up])
         yield "floor", corners, room.floor_albedo_850, room.floor_rgb
@@ -272,14 +314,28 @@ class Damage:
 
     def to_row(self) -> dict[str, Any]:
         """Return plain data in millimetres, one flat row for JSON or a table."""
-        row: dict[str, Any] = {"id": self.id, "kind": self.kind, "diameter_mm": self.diameter_m / MM}
+        row: dict[str, Any] = {
+            "id": self.id,
+            "kind": self.kind,
+            "diameter_mm": self.diameter_m / MM,
+        }
         row |= {"depth_mm": self.depth_m / MM, "volume_mm3": self.volume_m3 / MM**3}
         if self.outline_board_m is not None:
-            row |= {"length_mm": self.length_m / MM, "width_mm": self.width_m / MM, "raised": self.raised}
+            row |= {
+                "length_mm": self.length_m / MM,
+                "width_mm": self.width_m / MM,
+                "raised": self.raised,
+            }
             row |= {"angle_deg": math.degrees(self.angle_rad), "size_of": self.size_of}
-        places = {"board": (self.centre_board_m, self.axis_board), "camera": (self.centre_camera_m, self.axis_camera)}
+        places = {
+            "board": (self.centre_board_m, self.axis_board),
+            "camera": (self.centre_camera_m, self.axis_camera),
+        }
         for frame, (centre_m, axis) in places.items():
-            row |= {f"{a}_{frame}_mm": float(value) / MM for a, value in zip("xyz", centre_m, strict=True)}
+            row |= {
+                f"{a}_{frame}_mm": float(value) / MM
+                for a, value in zip("xyz", centre_m, strict=True)
+            }
             row |= {f"axis_{a}_{frame}": float(value) for a, value in zip("xyz", axis, strict=True)}
         return row
 
@@ -288,7 +344,9 @@ def truth_of(config: custom.TargetConfig, T_camera_board: np.ndarray) -> tuple[D
     """Return the truth of a declaration: holes, dents, then other kinds, in the order of their declaration."""
     face, truth = face_of(config.board), []
     for item in config.damages:
-        centre, axis, bends = (function(*item.centre_m) for function in (face.point, face.axis, face.curvatures))
+        centre, axis, bends = (
+            function(*item.centre_m) for function in (face.point, face.axis, face.curvatures)
+        )
         in_camera = transform_points(T_camera_board, centre), rotate_vectors(T_camera_board, axis)
         if isinstance(item, FlawConfig):
             sizes, outline = _flaw_truth(item, face, config.board.thickness_mm * MM)
@@ -306,9 +364,13 @@ def truth_of(config: custom.TargetConfig, T_camera_board: np.ndarray) -> tuple[D
             # on average than at the centre. The back of a through-hole is a parallel surface, curvatures k / (1 - t k).
             back = float((bends / (1 - depth_m * bends)).sum()) if item.kind == "through" else 0.0
             leg_m = item.mouth_m - radius_m
-            volume_m3 = math.pi * radius_m**2 * (depth_m + radius_m**2 / 8 * (back - float(bends.sum())))
+            volume_m3 = (
+                math.pi * radius_m**2 * (depth_m + radius_m**2 / 8 * (back - float(bends.sum())))
+            )
             volume_m3 += math.pi * leg_m**2 * (radius_m + leg_m / 3)
-        truth.append(Damage(item.id, item.kind, 2 * radius_m, depth_m, volume_m3, centre, axis, *in_camera))
+        truth.append(
+            Damage(item.id, item.kind, 2 * radius_m, depth_m, volume_m3, centre, axis, *in_camera)
+        )
     return tuple(truth)
 
 
@@ -327,15 +389,26 @@ def relief_points(
     return face.point(plan[..., 0], plan[..., 1]), depth_m, axis, across
 
 
-def _flaw_truth(item: FlawConfig, face: Face, thickness_m: float) -> tuple[tuple[float, float, float], dict[str, Any]]:
+def _flaw_truth(
+    item: FlawConfig, face: Face, thickness_m: float
+) -> tuple[tuple[float, float, float], dict[str, Any]]:
     """Return size, depth and volume of a flaw, and the fields that kinds with an outline of their own have."""
     points, depth_m, axis, _ = relief_points(item, face, thickness_m)
-    plan, moved, raised = points[..., :2], points - depth_m[..., None] * axis, bool(depth_m.min() < 0)
+    plan, moved, raised = (
+        points[..., :2],
+        points - depth_m[..., None] * axis,
+        bool(depth_m.min() < 0),
+    )
     length_mm, width_mm = item.sides_mm
     deepest_m = thickness_m if item.depth_mm is None else item.depth_mm * MM
     removed_m3 = volume_m3(*(closed_grid(moved, points) if raised else closed_grid(points, moved)))
     line_board_m = plan[len(plan) // 2, ::LINE_STEP] if item.size_of != "diameter" else None
-    outline = {"size_of": item.size_of, "raised": raised, "outline_board_m": border(plan), "line_board_m": line_board_m}
+    outline = {
+        "size_of": item.size_of,
+        "raised": raised,
+        "outline_board_m": border(plan),
+        "line_board_m": line_board_m,
+    }
     outline |= {"length_m": length_mm * MM, "width_m": width_mm * MM, "angle_rad": item.turn_rad}
     return (item.size_mm * MM, deepest_m, removed_m3), outline
 
@@ -346,7 +419,9 @@ def _lens(dent: custom.DentConfig, bend: float) -> tuple[float, float]:
     half_square = dent.radius_m**2 / (2 * (1 + bend * (dent.ball_m - depth_m)))
     sphere_cap_m = bend * half_square
     rim_square = 2 * half_square - sphere_cap_m**2
-    caps = [math.pi * h * (3 * rim_square + h**2) / 6 for h in (depth_m - sphere_cap_m, sphere_cap_m)]
+    caps = [
+        math.pi * h * (3 * rim_square + h**2) / 6 for h in (depth_m - sphere_cap_m, sphere_cap_m)
+    ]
     return math.sqrt(rim_square), sum(caps)
 
 

@@ -24,25 +24,41 @@ sys.path[:0] = [str(ROOT)]
 
 import numpy as np  # noqa: E402
 
-VARIANTS = {"cuda": ("cuda_ad_mono", None), "llvm": ("llvm_ad_mono", None), "llvm-1": ("llvm_ad_mono", 1)}
+VARIANTS = {
+    "cuda": ("cuda_ad_mono", None),
+    "llvm": ("llvm_ad_mono", None),
+    "llvm-1": ("llvm_ad_mono", 1),
+}
 """Mitsuba's variants and the number of threads; None means all."""
 WORKS: dict[str, dict[str, float]] = {
     "study": {},
-    "reference": {"hole_noise_mm": 0.03, "hole_samples": 65536, "face_samples": 65536, "rest_samples": 64},
+    "reference": {
+        "hole_noise_mm": 0.03,
+        "hole_samples": 65536,
+        "face_samples": 65536,
+        "rest_samples": 64,
+    },
 }
 """Settings of the render that replace the study's; a reference is rendered of one board of each kind."""
-OVERRIDES = ("study.hole_free_boards=1", "threshold={k: 5.0}", "detector.name=thesis", "capture.frames=1")
+OVERRIDES = (
+    "study.hole_free_boards=1",
+    "threshold={k: 5.0}",
+    "detector.name=thesis",
+    "capture.frames=1",
+)
 
 
 def boards_of(count: int) -> list[Any]:
     """Return jobs of ``count`` boards of each kind of damage and of one without."""
-    from harness.engine.plan import plan_of
     from harness.experiment.load import load_experiment
+    from harness.runs.plan import plan_of
 
     damage = '"source.target.damage": [{kind: through, per_board: 8, diameter_mm: [2.0, 8.0]}, {kind: blind, '
     damage += "per_board: 8, diameter_mm: [4.0, 20.0], depth_mm: [1.0, 12.0]}]"
     said = [f"sweep={{{damage}}}", f"study.boards={count}", *OVERRIDES]
-    plan = plan_of(load_experiment(ROOT / "experiments" / "detection_limit.yaml", said), Path("unused"))
+    plan = plan_of(
+        load_experiment(ROOT / "experiments" / "detection_limit.yaml", said), Path("unused")
+    )
     jobs = [job for group in plan.groups for batch in group.batches for job in batch.renders]
     return list({job.target: job for job in jobs}.values())
 
@@ -92,10 +108,16 @@ def apart(first: Path, second: Path) -> np.ndarray:
 
 def main() -> int:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--boards", type=int, default=4, help="of each kind of damage")
     parser.add_argument(
-        "--variants", nargs="+", choices=VARIANTS, default=["cuda", "llvm"], help="the last is compared"
+        "--variants",
+        nargs="+",
+        choices=VARIANTS,
+        default=["cuda", "llvm"],
+        help="the last is compared",
     )
     parser.add_argument("--render", nargs=2, metavar=("VARIANT", "FOLDER"), help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -106,7 +128,15 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         spent: dict[str, dict[str, list[float]]] = {}
         for name in options.variants:
-            command = [sys.executable, __file__, "--boards", str(options.boards), "--render", name, folder]
+            command = [
+                sys.executable,
+                __file__,
+                "--boards",
+                str(options.boards),
+                "--render",
+                name,
+                folder,
+            ]
             done = subprocess.run(command, capture_output=True, text=True)
             if done.returncode:
                 print(f"{name}: {done.stderr}", file=sys.stderr)
@@ -123,7 +153,8 @@ def main() -> int:
                 )
             for name in others:
                 pairs = [
-                    (Path(folder) / f"{v}_{work}_{n}.npz" for v in (name, last)) for n in range(len(spent[last][work]))
+                    (Path(folder) / f"{v}_{work}_{n}.npz" for v in (name, last))
+                    for n in range(len(spent[last][work]))
                 ]
                 moved_mm, noise_mm = np.concatenate([apart(*pair) for pair in pairs], axis=1)
                 beyond = float((np.abs(moved_mm) > 4 * noise_mm).mean())

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import scipy.io
 
-from strangers.world import Camera, Damage, Surface, View, cast
+from tests.strangers.world import Camera, Damage, Surface, View, cast
 
 CLEAR_D = 3 * 5.5
 """A damage is clearly visible from three times the d' that an ideal observer needs (90 % found at about one false
@@ -86,7 +86,9 @@ class Stranger:
     model: str = ""
 
 
-def recorded(stranger: Stranger, rng: np.random.Generator) -> tuple[np.ndarray, View, tuple[Truth, ...]]:
+def recorded(
+    stranger: Stranger, rng: np.random.Generator
+) -> tuple[np.ndarray, View, tuple[Truth, ...]]:
     """(frames (n, h, w) in metres with NaN for no return, the noise-free view, the truth)."""
     view = cast(stranger.surfaces, stranger.camera)
     if stranger.model:
@@ -125,7 +127,9 @@ def _simulated(stranger: Stranger, unit: int, finer: int = 3) -> np.ndarray:
     def pixels(fine: np.ndarray) -> np.ndarray:
         return fine.reshape(h, finer, w, finer).mean(axis=(1, 3))
 
-    phasor = np.stack([pixels(light * np.exp(turn * f)) for f in model.frequencies_hz]).astype(np.complex64)
+    phasor = np.stack([pixels(light * np.exp(turn * f)) for f in model.frequencies_hz]).astype(
+        np.complex64
+    )
     middle = range_m[finer // 2 :: finer, finer // 2 :: finer]
     view = NoiseFreeView(
         region=Region(0, h, 0, w),
@@ -147,14 +151,18 @@ def _simulated(stranger: Stranger, unit: int, finer: int = 3) -> np.ndarray:
     return np.stack([frame.z_m for frame in unit_of.capture(stranger.frames, unit).frames()])
 
 
-def _field(rng: np.random.Generator, shape: tuple[int, ...], blur_px: float, tail: bool = False) -> np.ndarray:
+def _field(
+    rng: np.random.Generator, shape: tuple[int, ...], blur_px: float, tail: bool = False
+) -> np.ndarray:
     """A random field of deviation 1."""
     drawn = rng.standard_t(3, shape) / np.sqrt(3) if tail else rng.normal(size=shape)
     if not blur_px:
         return drawn
     size = 2 * int(np.ceil(2.5 * blur_px)) + 1
     kernel = cv2.getGaussianKernel(size, blur_px)
-    return cv2.sepFilter2D(drawn, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT) / float((kernel**2).sum())
+    return cv2.sepFilter2D(drawn, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT) / float(
+        (kernel**2).sum()
+    )
 
 
 def _gain(blur_px: float) -> float:
@@ -177,7 +185,13 @@ def _clusters(rng: np.random.Generator, shape: tuple[int, ...], count: int) -> n
     """Ragged patches of 2 to 6 pixels' radius from which nothing returns: a frame's bad spots, not holes."""
     seeds = np.zeros(shape)
     for _ in range(count):
-        cv2.circle(seeds, (int(rng.integers(shape[1])), int(rng.integers(shape[0]))), int(rng.integers(2, 7)), 1.0, -1)
+        cv2.circle(
+            seeds,
+            (int(rng.integers(shape[1])), int(rng.integers(shape[0]))),
+            int(rng.integers(2, 7)),
+            1.0,
+            -1,
+        )
     return (seeds > 0) & (rng.random(shape) < 0.6)
 
 
@@ -205,12 +219,16 @@ def _truths(stranger: Stranger, view: View) -> tuple[Truth, ...]:
             known = signal[~lost]
             absent = lost.sum() > 0.5 * max(pixels.size, 1)
             if absent:
-                seen = lost.sum() >= CLEAR_PIXELS and lost.sum() * np.log(1 / rate) >= CLEAR_LOG_ODDS
+                seen = (
+                    lost.sum() >= CLEAR_PIXELS and lost.sum() * np.log(1 / rate) >= CLEAR_LOG_ODDS
+                )
             else:
                 d = np.sqrt(np.sum(known**2)) / broad / loud if known.size else 0.0
                 peak = float(np.percentile(np.abs(known), 90)) / pixel / loud if known.size else 0.0
                 seen = d >= CLEAR_D and peak >= CLEAR_PEAK and known.size >= CLEAR_PIXELS
-            truths.append(_truth(surface, damage, known, absent, bool(whole and seen), half, pixel * loud))
+            truths.append(
+                _truth(surface, damage, known, absent, bool(whole and seen), half, pixel * loud)
+            )
     return tuple(truths)
 
 
@@ -220,7 +238,13 @@ def _seen_half_m(surface: Surface, camera: Camera) -> float:
 
 
 def _truth(
-    surface: Surface, damage: Damage, known: np.ndarray, absent: bool, seen: bool, half_m: float, noise_m: float
+    surface: Surface,
+    damage: Damage,
+    known: np.ndarray,
+    absent: bool,
+    seen: bool,
+    half_m: float,
+    noise_m: float,
 ) -> Truth:
     extent = damage.radius_m + damage.length_m / 2
     along_z = float(np.percentile(np.abs(known), 90)) if known.size else abs(damage.depth_m)
@@ -237,7 +261,12 @@ def _truth(
         kind=kind,
         depth_m=(depths[0], depths[1]),
         diameter_m=(inner, 2 * extent),
-        clear=seen and (absent or damage.profile in ("flat", "through", "slot") or extent <= CLEAR_SHARE * 2 * half_m),
+        clear=seen
+        and (
+            absent
+            or damage.profile in ("flat", "through", "slot")
+            or extent <= CLEAR_SHARE * 2 * half_m
+        ),
         noise_m=noise_m,
     )
 
@@ -249,7 +278,12 @@ def written(stranger: Stranger, stack: np.ndarray, folder: Path) -> Path:
     """Write the frames as the stranger keeps them; returns the path that `harness.detect` is given."""
     folder.mkdir(parents=True, exist_ok=True)
     camera, form = stranger.camera, stranger.format
-    lens: dict[str, object] = {"fx": camera.f_px, "fy": camera.f_px, "cx": camera.cx_px, "cy": camera.cy_px}
+    lens: dict[str, object] = {
+        "fx": camera.f_px,
+        "fy": camera.f_px,
+        "cx": camera.cx_px,
+        "cy": camera.cy_px,
+    }
     lens |= {"width": camera.width, "height": camera.height}
     if any(camera.distortion):
         lens["distortion"] = list(camera.distortion)
@@ -258,7 +292,10 @@ def written(stranger: Stranger, stack: np.ndarray, folder: Path) -> Path:
     stored = np.where(np.isfinite(stack), stack / form.unit_m, form.invalid)
     if form.kind == "png":
         for k, image in enumerate(stored):
-            cv2.imwrite(str(folder / f"depth_{k:03d}.png"), np.clip(np.round(image), 0, 65535).astype(np.uint16))
+            cv2.imwrite(
+                str(folder / f"depth_{k:03d}.png"),
+                np.clip(np.round(image), 0, 65535).astype(np.uint16),
+            )
         return folder
     path = folder / f"depth.{form.kind}"
     stored = stored.astype(np.float32)
@@ -291,7 +328,9 @@ def _clouds(stranger: Stranger, stored: np.ndarray, folder: Path) -> Path:
                 "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
                 f"WIDTH {w}\nHEIGHT {h}\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {w * h}\nDATA binary\n"
             )
-            path.write_bytes(head.encode() + struct.pack(f"<{points.size}f", *points.ravel().tolist()))
+            path.write_bytes(
+                head.encode() + struct.pack(f"<{points.size}f", *points.ravel().tolist())
+            )
         else:
             np.savetxt(path, points, fmt="%.5f")
             return path

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from harness import detect
-from strangers.recording import Stranger, Truth
-from strangers.world import View
+from tests.strangers.recording import Stranger, Truth
+from tests.strangers.world import View
 
 NEAR_MM = 12.0
 FALSE_CALLS = 1
@@ -44,7 +44,9 @@ class Score:
         return self.verdict == "right" and bool(self.warnings)
 
 
-def answered(path: Path, out: Path, arguments: tuple[str, ...] = ()) -> tuple[int, str, list[dict[str, str]]]:
+def answered(
+    path: Path, out: Path, arguments: tuple[str, ...] = ()
+) -> tuple[int, str, list[dict[str, str]]]:
     """(exit code, all that was printed, rows of findings.csv) of the default command; a traceback is code 1."""
     said = io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
@@ -61,7 +63,12 @@ def answered(path: Path, out: Path, arguments: tuple[str, ...] = ()) -> tuple[in
 
 
 def scored(
-    stranger: Stranger, view: View, truths: tuple[Truth, ...], code: int, said: str, rows: list[dict[str, str]]
+    stranger: Stranger,
+    view: View,
+    truths: tuple[Truth, ...],
+    code: int,
+    said: str,
+    rows: list[dict[str, str]],
 ) -> Score:
     """Compare an answer with the truth."""
     lines = [line for line in said.splitlines() if line.strip()]
@@ -80,7 +87,9 @@ def scored(
     if missed:
         shown = ", ".join(_shown(truth) for truth in missed[:3])
         why.append(f"{len(missed)} of {len(clear)} missed ({shown})")
-    elsewhere, false = _unmatched(stranger, view, [r for r, truth in zip(rows, matched, strict=True) if truth is None])
+    elsewhere, false = _unmatched(
+        stranger, view, [r for r, truth in zip(rows, matched, strict=True) if truth is None]
+    )
     if elsewhere:
         why.append(f"{elsewhere} on another surface")
     if false > FALSE_CALLS:
@@ -91,7 +100,15 @@ def scored(
     verdict = "warned" if warnings and (why or stranger.doubtful) else "wrong" if why else "right"
     if stranger.doubtful and warnings and code == 0:
         verdict = "warned"
-    return Score(verdict, tuple(why), tuple(warnings), said, len(clear), len(clear) - len(missed), false + elsewhere)
+    return Score(
+        verdict,
+        tuple(why),
+        tuple(warnings),
+        said,
+        len(clear),
+        len(clear) - len(missed),
+        false + elsewhere,
+    )
 
 
 def _place(row: dict[str, str]) -> np.ndarray:
@@ -107,7 +124,11 @@ def _match(row: dict[str, str], truths: tuple[Truth, ...]) -> Truth | None:
         # an error of the camera's range moves a place along its line of sight
         apart = float(np.hypot(*(place[:2] * centre[2] / place[2] - centre[:2])))
         deep = 0.0 if not math.isfinite(truth.depth_m[1]) else 1e3 * truth.depth_m[1]
-        if apart < max(NEAR_MM, 1e3 * truth.radius_m) and abs(place[2] - centre[2]) < 50 + deep and apart < least:
+        if (
+            apart < max(NEAR_MM, 1e3 * truth.radius_m)
+            and abs(place[2] - centre[2]) < 50 + deep
+            and apart < least
+        ):
             best, least = truth, apart
     return best
 
@@ -135,7 +156,9 @@ def _unmatched(stranger: Stranger, view: View, rows: list[dict[str, str]]) -> tu
     return elsewhere, false
 
 
-def _misjudged(stranger: Stranger, rows: list[dict[str, str]], matched: list[Truth | None]) -> list[str]:
+def _misjudged(
+    stranger: Stranger, rows: list[dict[str, str]], matched: list[Truth | None]
+) -> list[str]:
     """Wrong signs and sizes of the clearly visible damages, each by the strongest finding at its place."""
     why, done = [], set()
     for row, truth in zip(rows, matched, strict=True):
@@ -154,7 +177,9 @@ def _misjudged(stranger: Stranger, rows: list[dict[str, str]], matched: list[Tru
         depth = abs(float(row["depth_mm"] or "nan"))
         low, high = (1e3 * d for d in truth.depth_m)
         slack = 1e3 * SIGMAS * truth.noise_m
-        judged = "no return" not in (row["kind"], truth.kind) and 2e3 * truth.radius_m >= 5 * pitch_mm
+        judged = (
+            "no return" not in (row["kind"], truth.kind) and 2e3 * truth.radius_m >= 5 * pitch_mm
+        )
         if judged and (depth < low / FACTOR - slack or depth > high * FACTOR + slack):
             why.append(f"depth {depth:.1f} mm of {low:.1f}..{high:.1f}")
     return why

@@ -35,10 +35,14 @@ class Camera:
         seen = np.dstack([(u - self.cx_px) / self.f_px, (v - self.cy_px) / self.f_px])
         k1, k2, p1, p2, k3 = self.distortion
         rays = seen
-        for _ in range(50):  # OpenCV's own way: divide what is seen by the distortion of the last guess
+        for _ in range(
+            50
+        ):  # OpenCV's own way: divide what is seen by the distortion of the last guess
             x, y = rays[..., 0], rays[..., 1]
             r2 = x * x + y * y
-            aside = np.dstack([2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y])
+            aside = np.dstack(
+                [2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y]
+            )
             rays = (seen - aside) / (1 + r2 * (k1 + r2 * (k2 + r2 * k3)))[..., None]
         return rays
 
@@ -176,7 +180,11 @@ def cast(surfaces: list[Surface], camera: Camera, finer: int = 1) -> View:
     feet, hidden = [], []
     seen = np.isfinite(depth)
     for i, surface in enumerate(surfaces):
-        behind = np.delete(z, i, axis=0).min(axis=0) if len(surfaces) > 1 else np.full(depth.shape, np.inf)
+        behind = (
+            np.delete(z, i, axis=0).min(axis=0)
+            if len(surfaces) > 1
+            else np.full(depth.shape, np.inf)
+        )
         for damage in surface.damages:
             mine, signal = _signal(surface, hits[i], damage, behind)
             visible = mine & (nearest == i)
@@ -189,7 +197,9 @@ def cast(surfaces: list[Surface], camera: Camera, finer: int = 1) -> View:
     return View(depth, target, objects, tuple(feet), tuple(hidden))
 
 
-def _signal(surface: Surface, hit: Hit, damage: Damage, behind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _signal(
+    surface: Surface, hit: Hit, damage: Damage, behind: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """(pixels whose ray enters the damage, the change of camera z there; inf: no return)."""
     with np.errstate(invalid="ignore"):
         qx, qy = hit.x_m - damage.x_m, hit.y_m - damage.y_m
@@ -205,7 +215,9 @@ def _signal(surface: Surface, hit: Hit, damage: Damage, behind: np.ndarray) -> t
         inside = np.isfinite(hit.z_m) & (rho < damage.radius_m)
         into = sum(n * hit.rays[..., i] for i, n in enumerate(normal))
     s = np.where(inside, rho / damage.radius_m, 0.0)
-    height = {"bowl": 1 - s * s, "cosine": 0.5 + 0.5 * np.cos(np.pi * s), "cone": 1 - s}.get(damage.profile)
+    height = {"bowl": 1 - s * s, "cosine": 0.5 + 0.5 * np.cos(np.pi * s), "cone": 1 - s}.get(
+        damage.profile
+    )
     if height is not None:
         return inside, damage.depth_m * height / into
     if damage.profile == "absent":

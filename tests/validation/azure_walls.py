@@ -21,7 +21,7 @@ import numpy as np
 from scipy import ndimage, optimize
 
 from detectors.recordings import open_capture
-from harness.scorecard.bench import (
+from harness.stills.statistics import (
     LAGS,
     FixedPattern,
     correlation,
@@ -136,7 +136,9 @@ def read_walls(folder: Path, camera: AmcwCamera) -> list[Wall]:
     capture = open_capture([folder], lens=lens)
     mask = cv2.imread(str(folder / "wall_mask.png"), cv2.IMREAD_GRAYSCALE)
     if mask is None or mask.shape != (lens.height, lens.width):
-        raise UserError(f"{folder / 'wall_mask.png'}: no mask of {lens.width} x {lens.height} pixels")
+        raise UserError(
+            f"{folder / 'wall_mask.png'}: no mask of {lens.width} x {lens.height} pixels"
+        )
     z_m = np.stack([frame.z_m for frame in capture.frames()]).astype(float)
     labels, _ = ndimage.label((mask > 0) & np.isfinite(z_m).all(axis=0), np.ones((3, 3)))
     if labels.max() == 0:
@@ -150,8 +152,12 @@ def read_walls(folder: Path, camera: AmcwCamera) -> list[Wall]:
         if far.sum() >= LEAST_PIXELS:
             walls.append(Wall("", region, far, slopes[rows, columns], z_m[:, rows, columns]))
     walls.sort(key=lambda wall: wall.region.col0)
-    names = ("left", "right") if len(walls) == 2 else [f"wall {i}" for i in range(1, len(walls) + 1)]
-    return [Wall(name, w.region, w.mask, w.slopes, w.z_m) for name, w in zip(names, walls, strict=True)]
+    names = (
+        ("left", "right") if len(walls) == 2 else [f"wall {i}" for i in range(1, len(walls) + 1)]
+    )
+    return [
+        Wall(name, w.region, w.mask, w.slopes, w.z_m) for name, w in zip(names, walls, strict=True)
+    ]
 
 
 def simulate(wall: Wall, camera: AmcwCamera, albedo: float, config: CameraConfig) -> np.ndarray:
@@ -159,7 +165,9 @@ def simulate(wall: Wall, camera: AmcwCamera, albedo: float, config: CameraConfig
     lens = camera.nominal_lens
     distance_m, slope_x, slope_y = wall.plane
     outer = wall.region.grown(camera.optics.margin_px, lens.height, lens.width)
-    unit = SimulatedUnit(camera, config, plane_view(camera, outer, distance_m, albedo, slope_x, slope_y))
+    unit = SimulatedUnit(
+        camera, config, plane_view(camera, outer, distance_m, albedo, slope_x, slope_y)
+    )
     cut = wall.region.within(unit.region)
     frames = unit.capture(len(wall.z_m), 1, "walls", wall.name, config.unit_seed).frames()
     return np.stack([frame.z_m[cut] for frame in frames]).astype(float)
@@ -202,7 +210,8 @@ def check(wall: Wall, camera: AmcwCamera) -> WallCheck:
     average = wall.z_m.mean(axis=0)
     outside = AmcwImager(camera, CameraConfig(), wall.region, wall.slopes).outside_mask
     patterned = (
-        simulate(wall, everywhere, albedo, CameraConfig(unit_seed=seed, effects=PATTERNED)) for seed in UNIT_SEEDS
+        simulate(wall, everywhere, albedo, CameraConfig(unit_seed=seed, effects=PATTERNED))
+        for seed in UNIT_SEEDS
     )
     return WallCheck(
         wall,
@@ -214,7 +223,10 @@ def check(wall: Wall, camera: AmcwCamera) -> WallCheck:
             for who, z in (("measured", wall.z_m), ("simulated", z_m))
             for jitter in (True, False)
         },
-        (float(wall.z_m[:, wall.mask].mean(1).std(ddof=1)), float(z_m[:, wall.mask].mean(1).std(ddof=1))),
+        (
+            float(wall.z_m[:, wall.mask].mean(1).std(ddof=1)),
+            float(z_m[:, wall.mask].mean(1).std(ddof=1)),
+        ),
         needed_albedo(wall, everywhere, albedo),
         fixed_pattern(wall.z_m, wall.mask, wall.slopes),
         [fixed_pattern(z, wall.mask, wall.slopes) for z in patterned],
@@ -238,9 +250,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The program: print the table, write the figure and the page."""
     from azure_walls_page import figure, page, table
 
-    parser = argparse.ArgumentParser(description="Compare the simulated Azure Kinect with frames of real walls.")
+    parser = argparse.ArgumentParser(
+        description="Compare the simulated Azure Kinect with frames of real walls."
+    )
     parser.add_argument("folder", type=Path, help="frames (16-bit PNG, mm) and wall_mask.png")
-    parser.add_argument("--out", type=Path, default=Path("docs"), help="where the page and figure go (docs)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("docs"), help="where the page and figure go (docs)"
+    )
     given = parser.parse_args(arguments)
 
     def body() -> int:

@@ -18,18 +18,22 @@ from dataclasses import dataclass
 from pathlib import Path
 
 if __name__ == "__main__":
-    sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).resolve().parents[1])]
+    sys.path[:0] = [
+        str(Path(__file__).resolve().parents[2]),
+        str(Path(__file__).resolve().parents[1]),
+    ]
 
 import psutil
-from cluster_processes import Processes, processes, square, until
 
-from harness.engine.cluster import ClusterEngine
-from harness.engine.journal import Journal
-from harness.engine.plan import SweepPlan, plan_of
-from harness.engine.run import run_plan
-from harness.engine.tables import tables_of
-from harness.engine.work import Ended, Job, Limits, Outcome, code_of
 from harness.experiment.load import load_experiment
+from harness.programs.cluster.engine import ClusterEngine
+from harness.runs.engines import code_of
+from harness.runs.jobs import Ended, Job, Limits, Outcome
+from harness.runs.journal import Journal
+from harness.runs.plan import SweepPlan, plan_of
+from harness.runs.run import run_plan
+from harness.runs.tables import tables_of
+from tests.support.cluster_processes import Processes, processes, square, until
 
 CHEAP = """\
 name: cheap
@@ -48,7 +52,9 @@ repeats: TRIALS
 
 def main() -> int:
     """The program."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--trials", type=int, default=20_000)
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()
@@ -59,11 +65,16 @@ def main() -> int:
     print(json.dumps(said, indent=2))
     print("\nA million trials, hours, by what bounds them (one render for a thousand trials):")
     for cores in (1, 64, 1024):
-        print(f"{cores:5} cores: " + ", ".join(f"{what} {hours:.2f}" for what, hours in scaled(said, cores).items()))
+        print(
+            f"{cores:5} cores: "
+            + ", ".join(f"{what} {hours:.2f}" for what, hours in scaled(said, cores).items())
+        )
     return 0
 
 
-def scaled(said: dict[str, float], cores: int, trials: float = 1e6, per_render: float = 1000.0) -> dict[str, float]:
+def scaled(
+    said: dict[str, float], cores: int, trials: float = 1e6, per_render: float = 1000.0
+) -> dict[str, float]:
     """Hours of each part of a large run: what workers share, and what one driver and one scheduler do alone."""
     hours = {
         "renders": trials / per_render * said["render_s"] / cores,
@@ -82,7 +93,9 @@ def measured(home: Path, cluster: Processes, trials: int, workers: int) -> dict[
     experiment = load_experiment(home / "cheap.yaml")
     plan = plan_of(experiment, home / "cache")
     journal = Journal(home / "journal")
-    with ClusterEngine(cluster.address, Limits(60.0, 2000), workers, code_of(["blind"]), home) as engine:
+    with ClusterEngine(
+        cluster.address, Limits(60.0, 2000), workers, code_of(["blind"]), home
+    ) as engine:
         until(lambda: engine.room("renders") > workers)
         bare = bare_rate(engine)
         scheduler = psutil.Process(cluster.scheduler.pid)
@@ -91,12 +104,19 @@ def measured(home: Path, cluster: Processes, trials: int, workers: int) -> dict[
         def look(now: Outcome) -> None:
             if now.trials.done:
                 mine, theirs = processor_s(psutil.Process()), processor_s(scheduler)
-                steady[1:] = [Look(time.monotonic(), now.trials.done, now.trials.seconds, mine, theirs)]
+                steady[1:] = [
+                    Look(time.monotonic(), now.trials.done, now.trials.seconds, mine, theirs)
+                ]
 
         outcome = run_plan(plan, journal, engine, look)
-    assert len(outcome.finished) == trials and not outcome.failures, (len(outcome.finished), outcome.failures[:2])
+    assert len(outcome.finished) == trials and not outcome.failures, (
+        len(outcome.finished),
+        outcome.failures[:2],
+    )
     first, last = steady
-    wall, count, work = (getattr(last, name) - getattr(first, name) for name in ("at_s", "trials", "work_s"))
+    wall, count, work = (
+        getattr(last, name) - getattr(first, name) for name in ("at_s", "trials", "work_s")
+    )
     return {
         "trials": trials,
         "workers": workers,
@@ -151,8 +171,12 @@ def sizes(plan: SweepPlan, journal: Journal, outcome: Outcome) -> dict[str, floa
     return {
         "bytes_of_a_task": len(pickle.dumps(tasks[0])),
         "bytes_of_a_task_in_a_bundle": round(len(pickle.dumps(tasks)) / len(tasks)),
-        "bytes_of_a_record_sent": round(sum(len(pickle.dumps(record)) for record in records) / len(records)),
-        "bytes_of_a_journal_entry": round(sum(map(journal.size, outcome.finished)) / len(outcome.finished)),
+        "bytes_of_a_record_sent": round(
+            sum(len(pickle.dumps(record)) for record in records) / len(records)
+        ),
+        "bytes_of_a_journal_entry": round(
+            sum(map(journal.size, outcome.finished)) / len(outcome.finished)
+        ),
         "files_of_the_journal": len(list(journal.folder.iterdir())),
         "bytes_of_a_view": max(job.path.stat().st_size for job in plan.renders),
     }

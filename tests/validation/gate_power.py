@@ -22,8 +22,14 @@ if __name__ == "__main__":
     sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
 
 from harness.evaluation.intervals import threshold_for_rate
-from harness.evaluation.study.record import Calibrated, Inspected, SetUpRecord, StudyRecord, Unflawed
-from harness.evaluation.study.verdict import compare_studies
+from harness.evaluation.study.record import (
+    Calibrated,
+    Inspected,
+    SetUpRecord,
+    StudyRecord,
+    Unflawed,
+)
+from harness.programs.gate.verdict import compare_studies
 
 AREA_M2 = 0.054
 NORMAL_90 = 1.2816
@@ -85,15 +91,22 @@ class Change:
 
 def study(size: Size, boards_seed: int, noise_seed: int, change: Change = Change()) -> StudyRecord:
     """A study of the detector as it is, or as it became by ``change``."""
-    set_ups = tuple(_set_up(size, boards_seed, noise_seed, place, change) for place in range(size.set_ups))
+    set_ups = tuple(
+        _set_up(size, boards_seed, noise_seed, place, change) for place in range(size.set_ups)
+    )
     return StudyRecord("model", "", 15.0, RATE_PER_M2, {}, set_ups)
 
 
-def _set_up(size: Size, boards_seed: int, noise_seed: int, number: int, change: Change) -> SetUpRecord:
+def _set_up(
+    size: Size, boards_seed: int, noise_seed: int, number: int, change: Change
+) -> SetUpRecord:
     model = MODELS[number % len(MODELS)]
     # ln(a90 / a50) is the 90th percentile of the luck's logarithm over the power with which scores grow.
     place = model.place + model.power * np.log(change.flatter) / NORMAL_90
-    of_boards, noise = (np.random.default_rng(key) for key in ((boards_seed, 1), (boards_seed, noise_seed, number, 2)))
+    of_boards, noise = (
+        np.random.default_rng(key)
+        for key in ((boards_seed, 1), (boards_seed, noise_seed, number, 2))
+    )
     n = size.boards * size.holes
     board = np.repeat(np.arange(size.boards), size.holes)
     size_mm = of_boards.uniform(*model.sizes_mm, n)
@@ -121,14 +134,18 @@ def _set_up(size: Size, boards_seed: int, noise_seed: int, number: int, change: 
         failed=0,
         targets_digest=str(boards_seed),
         frames_digest=f"{boards_seed} {noise_seed}",
-        inspected=Inspected(board, names, repeat, *sizes, zero, zero, signal > change.bias * threshold, signal),
+        inspected=Inspected(
+            board, names, repeat, *sizes, zero, zero, signal > change.bias * threshold, signal
+        ),
         unflawed=Unflawed(
             np.arange(size.hole_free_boards),
             np.zeros(size.hole_free_boards, int),
             (judged > change.bias * threshold).astype(int),
             np.full(size.hole_free_boards, AREA_M2),
         ),
-        calibrated=Calibrated(*np.zeros((2, len(calibration)), int), calibration, *np.zeros((2, len(calibration)))),
+        calibrated=Calibrated(
+            *np.zeros((2, len(calibration)), int), calibration, *np.zeros((2, len(calibration)))
+        ),
     )
 
 
@@ -137,7 +154,9 @@ def fails(baseline: StudyRecord, found: StudyRecord) -> bool:
     return any(row.is_worse for row in compare_studies(baseline, found).rows)
 
 
-def share(size: Size, times: int, change: Change = Change(), *, other_boards: bool = False) -> float:
+def share(
+    size: Size, times: int, change: Change = Change(), *, other_boards: bool = False
+) -> float:
     """Share of ``times`` checks that fail, each with boards and noise of its own."""
     failing = 0
     for draw in range(times):
@@ -147,22 +166,34 @@ def share(size: Size, times: int, change: Change = Change(), *, other_boards: bo
 
 
 def main() -> None:
-    """Print what stands in the documentation of `harness.check`."""
+    """Print what stands in the documentation of `harness.programs.gate.check`."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quiet", type=int, default=500, help="checks in which nothing changes but the noise")
-    parser.add_argument("--changed", type=int, default=60, help="checks for each change, and on other boards")
+    parser.add_argument(
+        "--quiet", type=int, default=500, help="checks in which nothing changes but the noise"
+    )
+    parser.add_argument(
+        "--changed", type=int, default=60, help="checks for each change, and on other boards"
+    )
     options = parser.parse_args()
     began, size = time.perf_counter(), Size()
     print(size)
     changes = {
         **{f"the camera's noise times {noise:.2f}": Change(noise=noise) for noise in NOISES},
-        **{f"a90 grows by {growth:.2f}, a50 does not": Change(flatter=growth) for growth in FLATTER},
+        **{
+            f"a90 grows by {growth:.2f}, a50 does not": Change(flatter=growth) for growth in FLATTER
+        },
         **{f"finds at {shift:.2f} of its threshold": Change(bias=shift) for shift in SHIFTS},
     }
     for what, change in changes.items():
-        print(f"{what}: {share(size, options.changed, change):.2f} of {options.changed} checks fail", flush=True)
+        print(
+            f"{what}: {share(size, options.changed, change):.2f} of {options.changed} checks fail",
+            flush=True,
+        )
     print(f"another noise: {share(size, options.quiet):.4f} of {options.quiet}", flush=True)
-    print(f"other boards: {share(size, options.changed, other_boards=True):.3f} of {options.changed}", flush=True)
+    print(
+        f"other boards: {share(size, options.changed, other_boards=True):.3f} of {options.changed}",
+        flush=True,
+    )
     print(f"{time.perf_counter() - began:.0f} s")
 
 

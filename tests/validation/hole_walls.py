@@ -14,7 +14,12 @@ import numpy as np
 DIAMETER_MM, DEPTH_MM, SHARE = 4.9, 12.7, 0.5
 FACE, RAYS, MOST_MIRRORED = 0.5, 40_000, 60
 ANGLES_DEG = 10.0, 28.0, 47.0
-WALLS = {"as the face": (0.5, 0.0), "dark": (0.1, 0.0), "glossy paint": (0.4, 0.3), "bare metal": (0.15, 0.7)}
+WALLS = {
+    "as the face": (0.5, 0.0),
+    "dark": (0.1, 0.0),
+    "glossy paint": (0.4, 0.3),
+    "bare metal": (0.15, 0.7),
+}
 """Diffuse and mirrored share of the light that meets a wall."""
 
 
@@ -30,7 +35,10 @@ def seen(angle_deg: float, diffuse: float, mirrored: float) -> tuple[float, floa
     for _ in range(MOST_MIRRORED):
         across, onward = place[:, :2], along[:, :2]
         square, cross = (onward**2).sum(axis=1), (across * onward).sum(axis=1)
-        step = (-cross + np.sqrt(np.maximum(cross**2 + square * (radius**2 - (across**2).sum(axis=1)), 0.0))) / square
+        step = (
+            -cross
+            + np.sqrt(np.maximum(cross**2 + square * (radius**2 - (across**2).sum(axis=1)), 0.0))
+        ) / square
         to_bottom = (DEPTH_MM - place[:, 2]) / along[:, 2]
         ends = step > to_bottom
         back = light[ends] * FACE * along[ends, 2]
@@ -51,6 +59,12 @@ def seen(angle_deg: float, diffuse: float, mirrored: float) -> tuple[float, floa
 
 
 if __name__ == "__main__":
-    print("walls          depth and peak / mm at " + ", ".join(f"{angle:g}" for angle in ANGLES_DEG) + " degrees")
+    print(
+        "walls          depth and peak / mm at "
+        + ", ".join(f"{angle:g}" for angle in ANGLES_DEG)
+        + " degrees"
+    )
     for name, shares in WALLS.items():
-        print(f"{name:14}", *("{:6.2f} {:5.2f}".format(*seen(angle, *shares)) for angle in ANGLES_DEG))
+        print(
+            f"{name:14}", *("{:6.2f} {:5.2f}".format(*seen(angle, *shares)) for angle in ANGLES_DEG)
+        )

@@ -25,10 +25,10 @@ if __name__ == "__main__":
 
 from harness.evaluation.intervals import clopper_pearson
 from harness.evaluation.pod.curve import PodCurve
-from harness.evaluation.pod.design import curve_through, even_sizes
 from harness.evaluation.pod.inspections import Inspections
 from harness.evaluation.pod.statement import PodStatement, state_hits
-from harness.evaluation.pod.transfer import LIMIT_AT, Transfer
+from harness.programs.inspections.design_statistics import curve_through, even_sizes
+from harness.programs.inspections.mapod import LIMIT_AT, Transfer
 from harness.vocabulary.errors import UserError
 
 DRILLS_MM = 2.0, 12.0
@@ -63,16 +63,22 @@ def wrong_by(curve: PodCurve, k: float, w: float) -> PodCurve:
 
 def of_hits(size: np.ndarray, hit: np.ndarray) -> Inspections:
     """Inspections as a file would give them."""
-    return Inspections(Path("drawn"), "size", "hit", size, hit.astype(float), None, np.arange(len(size)))
+    return Inspections(
+        Path("drawn"), "size", "hit", size, hit.astype(float), None, np.arange(len(size))
+    )
 
 
-def drawn_studies(curve: PodCurve, number: int, targets: int, random: np.random.Generator) -> list[PodStatement]:
+def drawn_studies(
+    curve: PodCurve, number: int, targets: int, random: np.random.Generator
+) -> list[PodStatement]:
     """Statements of studies of ``targets`` simulated holes; those without a rising curve are drawn again."""
     studies: list[PodStatement] = []
     while len(studies) < number:
         size = random.uniform(*DRILLS_MM, targets)
         try:
-            studies.append(state_hits(of_hits(size, random.random(targets) < curve.pod(size)), tested=False))
+            studies.append(
+                state_hits(of_hits(size, random.random(targets) < curve.pod(size)), tested=False)
+            )
         except UserError:
             continue
     return studies
@@ -91,12 +97,22 @@ def combined_limits(study: PodStatement, size: np.ndarray, hits: np.ndarray) -> 
             weights = np.exp(value - value.max(axis=1, keepdims=True))[:, order]
             below = np.cumsum(weights, axis=1)
             shares = zip(below, weights, strict=True)
-            limits.append([np.interp(LIMIT_AT * sums[-1], sums - own / 2, sizes[order]) for sums, own in shares])
+            limits.append(
+                [
+                    np.interp(LIMIT_AT * sums[-1], sums - own / 2, sizes[order])
+                    for sums, own in shares
+                ]
+            )
     return np.max(limits, axis=0)
 
 
 def coverage(
-    curve: PodCurve, cases: Sequence[tuple[float, float]], holes: int, *, campaigns: int, targets: int = 64
+    curve: PodCurve,
+    cases: Sequence[tuple[float, float]],
+    holes: int,
+    *,
+    campaigns: int,
+    targets: int = 64,
 ) -> list[Coverage]:
     """Coverage of each case (k, w) with so many real ``holes``; each campaign corrects another study of ``targets``."""
     random = np.random.default_rng(1823)
@@ -104,13 +120,19 @@ def coverage(
     chances = np.array([truth.pod(size) for truth in truths])
     hits = random.random((campaigns, len(cases), holes)) < chances
     studies = drawn_studies(curve, campaigns, targets, random)
-    limits = np.stack([combined_limits(study, size, some) for study, some in zip(studies, hits, strict=True)])
+    limits = np.stack(
+        [combined_limits(study, size, some) for study, some in zip(studies, hits, strict=True)]
+    )
     rows = []
     for number, (case, truth) in enumerate(zip(cases, truths, strict=True)):
         true_mm = truth.size_at(0.9)
         alone = [measured_limit(size, hit) for hit in hits[:MEASURED, number]]
         scaled = limits[:, number] / true_mm
-        sizes = float(np.median(scaled)), float(np.quantile(scaled, 0.9)), float(np.median(alone)) / true_mm
+        sizes = (
+            float(np.median(scaled)),
+            float(np.quantile(scaled, 0.9)),
+            float(np.median(alone)) / true_mm,
+        )
         rows.append(Coverage(*case, holes, campaigns, float((scaled >= 1).mean()), *sizes))
     return rows
 
@@ -128,7 +150,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--holes", type=int, nargs="+", default=[24, 60])
     parser.add_argument("--targets", type=int, default=64, help="simulated holes of each study")
-    parser.add_argument("--campaigns", type=int, default=300, help="of each case, each with a study of its own")
+    parser.add_argument(
+        "--campaigns", type=int, default=300, help="of each case, each with a study of its own"
+    )
     parser.add_argument("--link", default="logit")
     parser.add_argument("--log", action=argparse.BooleanOptionalAction, default=True)
     given = parser.parse_args()

@@ -19,7 +19,13 @@ if __name__ == "__main__":
     sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
 
 from harness.evaluation.pod.curve import PodCurve
-from harness.evaluation.pod.hit_miss import METHOD, choose_model, fit_hit_miss, largest_bound, near_models
+from harness.evaluation.pod.hit_miss import (
+    METHOD,
+    choose_model,
+    fit_hit_miss,
+    largest_bound,
+    near_models,
+)
 from harness.vocabulary.errors import UserError
 
 UNKNOWN = np.zeros((2, 2))

@@ -97,11 +97,15 @@ def coverage(boards: int, shift_mm: float, studies: int, seed: int) -> Coverage:
 
 def main(arguments: list[str] | None = None) -> int:
     """Print one line a setting."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--studies", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args(arguments)
-    print("boards  shift/mm  a90/mm  covered: ratio  with effect  percentile  median/mm: ratio  with effect  effect")
+    print(
+        "boards  shift/mm  a90/mm  covered: ratio  with effect  percentile  median/mm: ratio  with effect  effect"
+    )
     for boards in (20, 60):
         for shift_mm in (0.0, 1.0, 2.0):
             one = coverage(boards, shift_mm, options.studies, options.seed)

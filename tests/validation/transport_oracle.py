@@ -72,7 +72,11 @@ class Oracle:
 
 
 def oracle(
-    lit: LitScene, optics: Optics, frequencies_hz: tuple[float, ...], *, histogram_from_m: float | None = None
+    lit: LitScene,
+    optics: Optics,
+    frequencies_hz: tuple[float, ...],
+    *,
+    histogram_from_m: float | None = None,
 ) -> Oracle:
     """An oracle for a scene that stands in Mitsuba already, by its phasor film or by a histogram of path lengths.
 
@@ -112,7 +116,9 @@ def oracle(
         "sampler": {"type": "independent"},
     }
     shapes = {f"shape_{k}": _mesh(mi, part) for k, part in enumerate(lit.parts)}
-    scene = mi.load_dict({"type": "scene", "sensor": sensor, "emitter": _emitter(mi, optics), **shapes})
+    scene = mi.load_dict(
+        {"type": "scene", "sensor": sensor, "emitter": _emitter(mi, optics), **shapes}
+    )
     return Oracle(mi, optics, scene, frequencies_hz, histogram_from_m)
 
 
@@ -125,8 +131,13 @@ def _mesh(mi: Any, part: TargetPart) -> Any:
     properties, textured = mi.Properties(), part.uv is not None
     material = {"type": "diffuse", "reflectance": reflectance}
     properties["material"] = mi.load_dict({"type": "twosided", "material": material})
-    vertices, faces = np.asarray(part.mesh.vertices, np.float32), np.asarray(part.mesh.faces, np.uint32)
-    mesh = mi.Mesh(part.name, len(vertices), len(faces), has_vertex_texcoords=textured, props=properties)
+    vertices, faces = (
+        np.asarray(part.mesh.vertices, np.float32),
+        np.asarray(part.mesh.faces, np.uint32),
+    )
+    mesh = mi.Mesh(
+        part.name, len(vertices), len(faces), has_vertex_texcoords=textured, props=properties
+    )
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"], parameters["faces"] = vertices.ravel(), faces.ravel()
     if part.uv is not None:

@@ -28,7 +28,9 @@ A50_MM, WIDTH, OF_HOLE = 4.0, 0.116, 0.82
 SIZES_MM, HOLES = (2.0, 8.0), 8
 
 
-def coverage(units: int, boards: int, spread: float, studies: int, seed: int) -> tuple[float, float, float, float]:
+def coverage(
+    units: int, boards: int, spread: float, studies: int, seed: int
+) -> tuple[float, float, float, float]:
     """Return the coverage of the limit over units and of that of one unit, and the medians of both in mm."""
     rng = np.random.default_rng([seed, units, boards, round(1e4 * spread)])
     ln_a90 = np.log(A50_MM) + norm.ppf(0.9) * WIDTH
@@ -39,7 +41,10 @@ def coverage(units: int, boards: int, spread: float, studies: int, seed: int) ->
         unit = np.repeat(np.arange(units), boards * HOLES)
         ln_a50 = (np.log(A50_MM) + spread * rng.standard_normal(units))[unit]
         noise = WIDTH * np.sqrt(1 - OF_HOLE) * rng.standard_normal(len(unit))
-        hit, target = np.log(size_mm) + own + noise > ln_a50, np.tile(np.arange(boards * HOLES), units)
+        hit, target = (
+            np.log(size_mm) + own + noise > ln_a50,
+            np.tile(np.arange(boards * HOLES), units),
+        )
         fit = fit_hit_miss(size_mm, hit, link="probit", log_size=True, inspections=target)
         limits = over_units(size_mm, hit, target, unit, fit.curve, bound(fit))
         found.append((limits.new_unit.value, limits.a90_95_mm[0]))
@@ -52,7 +57,9 @@ def coverage(units: int, boards: int, spread: float, studies: int, seed: int) ->
 
 def main(arguments: list[str] | None = None) -> int:
     """Print one line a setting."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--studies", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args(arguments)

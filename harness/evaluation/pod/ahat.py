@@ -23,7 +23,9 @@ SAME = 1e-9
 """Relative difference to the largest signal that is only rounding. A scatter below this share of the signals' largest
 deviation is a line drawn by rounding, which has no likelihood."""
 LEVEL = 0.05  # a diagnostic with a smaller p-value rejects its assumption
-LEAST = 8  # fewest signals between the limits for which Anderson and Darling's approximation of p holds
+LEAST = (
+    8  # fewest signals between the limits for which Anderson and Darling's approximation of p holds
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +75,9 @@ def fit_ahat(
     n = len(sizes)
     names = np.arange(n) if inspections is None else np.asarray(inspections).astype(str)
     if not n == len(signals) == len(names):
-        raise UserError(f"{n} sizes, {len(signals)} signals and {len(names)} targets: each row needs one of each")
+        raise UserError(
+            f"{n} sizes, {len(signals)} signals and {len(names)} targets: each row needs one of each"
+        )
     rows_each = rows_of_target(sizes, names)
     targets = round(float((1 / rows_each).sum()))
     low, high = -np.inf if left is None else left, np.inf if right is None else right
@@ -81,12 +85,17 @@ def fit_ahat(
         raise UserError(f"noise floor {low:g} is not below saturation {high:g}")
     if not low <= decision <= high:
         legal = f"between the noise floor {low:g} and saturation {high:g}"
-        raise UserError(f"decision {decision:g} lies outside the signals that can be distinguished", legal=legal)
+        raise UserError(
+            f"decision {decision:g} lies outside the signals that can be distinguished", legal=legal
+        )
     below, above = signals <= low, signals >= high
     between = signals[~(below | above)]
     if len(between) > 1 and np.ptp(between) <= SAME * np.abs(between).max():
         fix = "use hits and misses instead: signals that are all equal say nothing about size"
-        raise UserError(f"the signals do not vary: all {len(between)} between the limits are {between[0]:.6g}", fix=fix)
+        raise UserError(
+            f"the signals do not vary: all {len(between)} between the limits are {between[0]:.6g}",
+            fix=fix,
+        )
     x = _axis("sizes", sizes, log_size)
     y = _axis("signals", np.clip(signals, low, high), log_signal)
     threshold = float(_axis("decision", np.array([decision]), log_signal)[0])
@@ -94,19 +103,36 @@ def fit_ahat(
     b0, b1 = line.coefficients
     if b1 <= 0:
         fix = "check the columns of size and signal, or reverse the sign of the signal"
-        raise UserError(f"the signal does not grow with size (slope {b1:.4g}): there is no detection limit", fix=fix)
-    per_target = float(rows_each.mean())  # the design effect of rows that are equal within a target (Kish)
-    mu, sigma, covariance = float((threshold - b0) / b1), float(line.tau / b1), line.covariance * per_target
+        raise UserError(
+            f"the signal does not grow with size (slope {b1:.4g}): there is no detection limit",
+            fix=fix,
+        )
+    per_target = float(
+        rows_each.mean()
+    )  # the design effect of rows that are equal within a target (Kish)
+    mu, sigma, covariance = (
+        float((threshold - b0) / b1),
+        float(line.tau / b1),
+        line.covariance * per_target,
+    )
     jacobian = np.array([[-1.0, -mu, 0.0], [0.0, -sigma, 1.0]]) / b1
     curve = PodCurve("probit", log_size, mu, sigma, jacobian @ covariance @ jacobian.T)
     notes = []
     if targets < LEAST_TARGETS:
-        notes.append(f"{targets} independent targets; MIL-HDBK-1823A asks for at least {LEAST_TARGETS}")
+        notes.append(
+            f"{targets} independent targets; MIL-HDBK-1823A asks for at least {LEAST_TARGETS}"
+        )
     if per_target > 1:
-        notes.append(f"{per_target:.3g} signals per target multiply the covariance: {targets} targets count")
+        notes.append(
+            f"{per_target:.3g} signals per target multiply the covariance: {targets} targets count"
+        )
     if not sizes.min() <= (a90 := curve.size_at(0.9)) <= sizes.max():
-        notes.append(f"a90 = {a90:.3g} lies outside the sizes inspected ({sizes.min():.4g} to {sizes.max():.4g})")
-    log_likelihood = line.log_likelihood - (float(y[~(below | above)].sum()) if log_signal else 0.0)  # the Jacobian
+        notes.append(
+            f"a90 = {a90:.3g} lies outside the sizes inspected ({sizes.min():.4g} to {sizes.max():.4g})"
+        )
+    log_likelihood = line.log_likelihood - (
+        float(y[~(below | above)].sum()) if log_signal else 0.0
+    )  # the Jacobian
     numbers = (float(b0), float(b1), line.tau, covariance, log_likelihood, -2 * log_likelihood)
     axes = (log_size, log_signal, decision, left, right, tuple(notes))
     return AhatFit(curve, *numbers, x, y, below, above, n, targets, per_target, *axes)
@@ -127,8 +153,13 @@ def choose_axes(
     lowest = signals.min(initial=np.inf) if left is None else left
     log_sizes = (False, True) if np.all(sizes > 0) else (False,)
     log_signals = (False, True) if min(lowest, decision) > 0 else (False,)
-    fit = partial(fit_ahat, sizes, signals, decision=decision, left=left, right=right, inspections=inspections)
-    fits = [fit(log_size=of_size, log_signal=of_signal) for of_size, of_signal in product(log_sizes, log_signals)]
+    fit = partial(
+        fit_ahat, sizes, signals, decision=decision, left=left, right=right, inspections=inspections
+    )
+    fits = [
+        fit(log_size=of_size, log_signal=of_signal)
+        for of_size, of_signal in product(log_sizes, log_signals)
+    ]
     return tuple(sorted(fits, key=lambda each: each.deviance))
 
 
@@ -140,11 +171,17 @@ def ahat_bound(fit: AhatFit, pod: float = 0.9, confidence: float = 0.95) -> Boun
     if curve.sigma**2 <= quantile**2 * v[1, 1]:
         why = "the signal's growth with size is too uncertain at this confidence (the band is open at large sizes)"
         return Bound(pod, confidence, "delta", float("inf"), why)
-    x = curve.mu + z * curve.sigma + quantile * float(np.sqrt(v[0, 0] + 2 * z * v[0, 1] + z**2 * v[1, 1]))
+    x = (
+        curve.mu
+        + z * curve.sigma
+        + quantile * float(np.sqrt(v[0, 0] + 2 * z * v[0, 1] + z**2 * v[1, 1]))
+    )
     return Bound(pod, confidence, "delta", float(np.exp(x)) if curve.log_size else x)
 
 
-def ahat_band(fit: AhatFit, sizes: ArrayLike, confidence: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
+def ahat_band(
+    fit: AhatFit, sizes: ArrayLike, confidence: float = 0.95
+) -> tuple[np.ndarray, np.ndarray]:
     """Return (lower, upper) POD at ``sizes`` (any shape), each one-sided, through the bounds of all sizes a_p: (x - mu
     - z sigma)^2 = z_confidence^2 (V11 + 2 z V12 + z^2 V22), solved for z; 0 and 1 where the band is open."""
     at = np.asarray(sizes, float)
@@ -156,19 +193,25 @@ def ahat_band(fit: AhatFit, sizes: ArrayLike, confidence: float = 0.95) -> tuple
     d = (np.log(np.maximum(at, np.finfo(float).tiny)) if curve.log_size else at) - curve.mu
     half = curve.sigma * d + c * v12
     root = np.sqrt(np.maximum(half**2 - leading * (d**2 - c * v11), 0))
-    return np.asarray(stats.norm.cdf((half - root) / leading)), np.asarray(stats.norm.cdf((half + root) / leading))
+    return np.asarray(stats.norm.cdf((half - root) / leading)), np.asarray(
+        stats.norm.cdf((half + root) / leading)
+    )
 
 
 def _finite(name: str, values: ArrayLike) -> np.ndarray:
     array = np.asarray(values, float).ravel()
     if bad := int((~np.isfinite(array)).sum()):
-        raise UserError(f"{bad} of {len(array)} {name} are not finite numbers", fix="leave these rows out")
+        raise UserError(
+            f"{bad} of {len(array)} {name} are not finite numbers", fix="leave these rows out"
+        )
     return array
 
 
 def _axis(name: str, values: np.ndarray, log: bool) -> np.ndarray:
     if log and np.any(values <= 0):
-        raise UserError(f"{name} <= 0 have no logarithm (smallest {values.min():.6g})", legal="values above 0")
+        raise UserError(
+            f"{name} <= 0 have no logarithm (smallest {values.min():.6g})", legal="values above 0"
+        )
     return np.log(values) if log else values
 
 
@@ -182,7 +225,9 @@ class CensoredFit(NamedTuple):
     log_likelihood: float
 
 
-def fit_censored(design: np.ndarray, y: np.ndarray, below: np.ndarray, above: np.ndarray) -> CensoredFit:
+def fit_censored(
+    design: np.ndarray, y: np.ndarray, below: np.ndarray, above: np.ndarray
+) -> CensoredFit:
     """Fit y = design @ coefficients + tau * normal by maximum likelihood (Tobin 1958). ``design`` (n, p). ``y`` (n,):
     the value, or the limit if ``below`` or ``above`` (n,) says that the value lies beyond it. Solved in Olsen's 1978
     parameters (coefficients / tau, 1 / tau), which make the log-likelihood concave. Raises UserError without a line or
@@ -191,12 +236,17 @@ def fit_censored(design: np.ndarray, y: np.ndarray, below: np.ndarray, above: np
     p = design.shape[1]
     if exact.sum() <= p or np.linalg.matrix_rank(design[exact]) < p:
         what = f"{exact.sum()} of {len(y)} signals lie between the limits: too few, or at too few sizes, for a line"
-        raise UserError(what, legal=f"more than {p} signals that are not censored, at different sizes")
+        raise UserError(
+            what, legal=f"more than {p} signals that are not censored, at different sizes"
+        )
     start = np.linalg.lstsq(design[exact], y[exact], rcond=None)[0]
     rest = y - design @ start
     scale = float(np.sqrt(np.mean(rest[exact] ** 2)))
     if scale <= SAME * float(np.max(np.abs(y[exact] - y[exact].mean()), initial=0.0)) or scale == 0:
-        raise UserError("the signals lie exactly on a line: there is no scatter to estimate", fix="check the column")
+        raise UserError(
+            "the signals lie exactly on a line: there is no scatter to estimate",
+            fix="check the column",
+        )
     # Orthonormal columns and residuals of unit scatter make Newton's system well conditioned in any unit.
     q, r = np.linalg.qr(design)
     q, r = q * np.sqrt(len(y)), r / np.sqrt(len(y))
@@ -214,7 +264,9 @@ def fit_censored(design: np.ndarray, y: np.ndarray, below: np.ndarray, above: np
         information = rows.T @ (np.where(exact, 1.0, mills * (mills + s))[:, None] * rows)
         gradient[-1] += exact.sum() / at[-1]
         information[-1, -1] += exact.sum() / at[-1] ** 2
-        value = (np.log(at[-1]) - 0.5 * s[exact] ** 2 - 0.5 * np.log(2 * np.pi)).sum() + tail[~exact].sum()
+        value = (np.log(at[-1]) - 0.5 * s[exact] ** 2 - 0.5 * np.log(2 * np.pi)).sum() + tail[
+            ~exact
+        ].sum()
         return float(value), gradient, information
 
     def value_and_step(places: np.ndarray, _: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -231,7 +283,12 @@ def fit_censored(design: np.ndarray, y: np.ndarray, below: np.ndarray, above: np
     jacobian[-1, -1] = -(tau**2) * scale
     covariance = jacobian @ np.linalg.solve(information, jacobian.T)
     log_likelihood = value - float(exact.sum() * np.log(scale))
-    return CensoredFit(start + to_user @ slopes, float(tau * scale), (covariance + covariance.T) / 2, log_likelihood)
+    return CensoredFit(
+        start + to_user @ slopes,
+        float(tau * scale),
+        (covariance + covariance.T) / 2,
+        log_likelihood,
+    )
 
 
 class Diagnostic(NamedTuple):
@@ -265,10 +322,14 @@ def diagnose(fit: AhatFit) -> tuple[Diagnostic, ...]:
     ratio = float(np.sum(np.diff(z) ** 2) / np.sum((z - z.mean()) ** 2))
     score = (ratio - 2) / np.sqrt(4 * (n - 2) / ((n - 1) * (n + 1)))
     return (
-        Diagnostic("linearity", "quadratic term, likelihood ratio", bend, float(stats.chi2.sf(bend, 1))),
+        Diagnostic(
+            "linearity", "quadratic term, likelihood ratio", bend, float(stats.chi2.sf(bend, 1))
+        ),
         Diagnostic("equal scatter", "Breusch-Pagan", share, float(stats.chi2.sf(share, 1))),
         Diagnostic("normality", "Anderson-Darling", *_anderson_darling(z)),
-        Diagnostic("independence of rows", "Durbin-Watson", ratio, float(2 * stats.norm.sf(abs(score)))),
+        Diagnostic(
+            "independence of rows", "Durbin-Watson", ratio, float(2 * stats.norm.sf(abs(score)))
+        ),
     )
 
 
@@ -283,7 +344,11 @@ def residual_scores(fit: AhatFit) -> np.ndarray:
             return np.full(len(line), none)
         return ((np.log(limit) if fit.log_signal else limit) - line) / fit.tau
 
-    r, low, high = (fit.y[exact] - line) / fit.tau, standard(fit.left, -np.inf), standard(fit.right, np.inf)
+    r, low, high = (
+        (fit.y[exact] - line) / fit.tau,
+        standard(fit.left, -np.inf),
+        standard(fit.right, np.inf),
+    )
     # Mirrored if the interval lies in the upper tail, so that differences of F keep their digits.
     mirror = np.where(np.minimum(low, r) > 0, -1.0, 1.0)
     ends = special.ndtr(mirror * low), special.ndtr(mirror * high)

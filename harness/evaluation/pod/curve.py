@@ -17,14 +17,18 @@ from scipy import optimize, special
 LARGEST_PREDICTOR = 500.0
 """Limit of |b0 + b1 z|: beyond it, every link is 0 or 1 to the last bit; exp() of the limit does not overflow."""
 
-_F_AND_INVERSE: dict[str, tuple[Callable[[np.ndarray], np.ndarray], Callable[[np.ndarray], np.ndarray]]] = {
+_F_AND_INVERSE: dict[
+    str, tuple[Callable[[np.ndarray], np.ndarray], Callable[[np.ndarray], np.ndarray]]
+] = {
     "logit": (special.expit, special.logit),
     "probit": (special.ndtr, special.ndtri),
     "cloglog": (lambda t: -np.expm1(-np.exp(t)), lambda p: np.log(-np.log1p(-p))),
     "loglog": (lambda t: np.exp(-np.exp(-t)), lambda p: -np.log(-np.log(p))),
 }
 LINKS = tuple(_F_AND_INVERSE)
-CELLS = 2**17  # curves times targets, or resampled boards times their targets, in one block: 1 MB per array
+CELLS = (
+    2**17
+)  # curves times targets, or resampled boards times their targets, in one block: 1 MB per array
 
 
 def link_cdf(link: str, t: np.ndarray) -> np.ndarray:
@@ -40,7 +44,9 @@ def link_ppf(link: str, p: np.ndarray) -> np.ndarray:
 
 def logs_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return ln F, ln(1 - F) and ln f (the density), each of the predictor's shape and accurate in both tails."""
-    t = np.minimum(np.maximum(predictor, -LARGEST_PREDICTOR), LARGEST_PREDICTOR)  # `np.clip` takes five times as long
+    t = np.minimum(
+        np.maximum(predictor, -LARGEST_PREDICTOR), LARGEST_PREDICTOR
+    )  # `np.clip` takes five times as long
     if link == "logit":
         tail = np.log1p(np.exp(-np.abs(t)))
         log_hit, log_miss = np.minimum(t, 0.0) - tail, np.minimum(-t, 0.0) - tail
@@ -50,7 +56,11 @@ def logs_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarr
     signed = t if link == "cloglog" else -t
     hazard = np.exp(signed)
     log_none, log_any = -hazard, np.log(-np.expm1(-hazard))
-    return (log_any, log_none, signed - hazard) if link == "cloglog" else (log_none, log_any, signed - hazard)
+    return (
+        (log_any, log_none, signed - hazard)
+        if link == "cloglog"
+        else (log_none, log_any, signed - hazard)
+    )
 
 
 def slopes_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -60,7 +70,11 @@ def slopes_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.nda
         hit, miss = special.expit(t), special.expit(-t)
         return miss, hit, miss - hit
     log_hit, log_miss, log_density = logs_of_link(link, t)
-    bend = {"probit": lambda: -t, "cloglog": lambda: 1.0 - np.exp(t), "loglog": lambda: np.exp(-t) - 1.0}[link]()
+    bend = {
+        "probit": lambda: -t,
+        "cloglog": lambda: 1.0 - np.exp(t),
+        "loglog": lambda: np.exp(-t) - 1.0,
+    }[link]()
     return np.exp(log_density - log_hit), np.exp(log_density - log_miss), bend
 
 
@@ -149,27 +163,41 @@ class HitsAndMisses:
                 z, weight = self.z, (self.hits + self.misses) * up * down
                 total, cross, square = weight.sum(axis=1), weight @ z, weight @ z**2
                 determinant = total * (square - cross**2 / total)
-                leverage = weight * (square[:, None] - 2 * cross[:, None] * z + total[:, None] * z**2)
+                leverage = weight * (
+                    square[:, None] - 2 * cross[:, None] * z + total[:, None] * z**2
+                )
                 leverage /= determinant[:, None]
-                slope = slope + 0.5 * np.asarray(self.penalty)[:, None] * leverage * (2.0 * bend - up + down)
+                slope = slope + 0.5 * np.asarray(self.penalty)[:, None] * leverage * (
+                    2.0 * bend - up + down
+                )
                 first, second = slope.sum(axis=1), slope @ z
-                along = np.stack([square * first - cross * second, total * second - cross * first], axis=1)
+                along = np.stack(
+                    [square * first - cross * second, total * second - cross * first], axis=1
+                )
                 return np.asarray(along / determinant[:, None])
             if self.link == "logit":  # the same in fewer operations
                 weight = (self.hits + self.misses) * up * down
             else:
-                weight = self.hits * up * np.maximum(up - bend, 0.0) + self.misses * down * np.maximum(down + bend, 0.0)
+                weight = self.hits * up * np.maximum(
+                    up - bend, 0.0
+                ) + self.misses * down * np.maximum(down + bend, 0.0)
             p = self.design.shape[1]
             if p == 1:
                 return np.asarray((slope @ self.design) / (weight @ self.design**2))
             products = (self.design[:, :, None] * self.design[:, None, :]).reshape(-1, p * p)
             information = (weight @ products).reshape(-1, p, p)
-            ridge = (1e-12 * np.trace(information, axis1=1, axis2=2)[:, None, None] + 1e-300) * np.eye(p)
-            return np.asarray(np.linalg.solve(information + ridge, (slope @ self.design)[:, :, None])[:, :, 0])
+            ridge = (
+                1e-12 * np.trace(information, axis1=1, axis2=2)[:, None, None] + 1e-300
+            ) * np.eye(p)
+            return np.asarray(
+                np.linalg.solve(information + ridge, (slope @ self.design)[:, :, None])[:, :, 0]
+            )
 
     def of(self, rows: np.ndarray) -> HitsAndMisses:
         """Return the studies ``rows``."""
-        penalty = None if self.penalty is None else np.broadcast_to(self.penalty, len(self.hits))[rows]
+        penalty = (
+            None if self.penalty is None else np.broadcast_to(self.penalty, len(self.hits))[rows]
+        )
         return replace(self, hits=self.hits[rows], misses=self.misses[rows], penalty=penalty)
 
     def climb(self, places: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -189,7 +217,9 @@ def ascend(
     place, moving = start.copy(), np.arange(len(start))
     best, step = value_and_step(place, moving)
     for _ in range(STEPS):
-        moving = moving[np.abs(step[moving]).max(axis=1) > tolerance * (1.0 + np.abs(place[moving]).max(axis=1))]
+        moving = moving[
+            np.abs(step[moving]).max(axis=1) > tolerance * (1.0 + np.abs(place[moving]).max(axis=1))
+        ]
         if not len(moving):
             break
         trial = place[moving] + step[moving]
@@ -233,8 +263,14 @@ def penalised_maxima(data: HitsAndMisses, tolerance: float = TOLERANCE) -> np.nd
     # Predictors of -1.5 and 1.5 at the ends of the gap, if these are not too close; then several widths through
     # both its ends and its middle.
     widths = [(np.clip(3.0 / np.maximum(gap, 1e-9), 1.0, 100.0), 0.5)]
-    widths += [(np.full_like(gap, slope), share) for slope in np.geomspace(1.5, 150.0, 9) for share in (0.0, 0.5, 1.0)]
-    steep = np.array([np.stack([-slope * (below + share * gap), slope], axis=1) for slope, share in widths])
+    widths += [
+        (np.full_like(gap, slope), share)
+        for slope in np.geomspace(1.5, 150.0, 9)
+        for share in (0.0, 0.5, 1.0)
+    ]
+    steep = np.array(
+        [np.stack([-slope * (below + share * gap), slope], axis=1) for slope, share in widths]
+    )
     if data.link in ("logit", "probit"):
         return ascend(data.climb, steep[0], tolerance)[0]
     share = hits.sum(axis=1) / (hits + data.misses).sum(axis=1)
@@ -247,7 +283,9 @@ def penalised_maxima(data: HitsAndMisses, tolerance: float = TOLERANCE) -> np.nd
     return np.asarray(np.array(places)[np.argmax(values, axis=0), rows])
 
 
-def profile(data: HitsAndMisses, z0: float, level: float, slope: float = 1.0) -> tuple[float, float]:
+def profile(
+    data: HitsAndMisses, z0: float, level: float, slope: float = 1.0
+) -> tuple[float, float]:
     """Return the largest (penalised) log-likelihood of one study's rising curves (slope >= 0) whose predictor is
     ``level`` at ``z0``, and the slope there. ``slope``: start of the search, such as that of a neighbour."""
     if data.penalty is not None:  # concavity is not proved, so the search begins with a grid
@@ -255,12 +293,22 @@ def profile(data: HitsAndMisses, z0: float, level: float, slope: float = 1.0) ->
         def rising(s: np.ndarray) -> np.ndarray:
             return data.value(np.stack([level - np.exp(s) * z0, np.exp(s)], axis=-1))
 
-        return max(_largest(rising, PENALISED_SLOPES), float(data.value(np.array([level, 0.0])))), slope
-    line = replace(data, design=data.z[:, None] - z0, offset=level, hits=data.hits[None], misses=data.misses[None])
+        return max(
+            _largest(rising, PENALISED_SLOPES), float(data.value(np.array([level, 0.0])))
+        ), slope
+    line = replace(
+        data,
+        design=data.z[:, None] - z0,
+        offset=level,
+        hits=data.hits[None],
+        misses=data.misses[None],
+    )
     # far out, only slopes near that of the line through the mean probability have a likelihood that is not tiny
     rate = link_ppf(data.link, data.hits.sum() / (data.hits + data.misses).sum())
     starts = np.array([[slope], [(level - float(rate)) / max(z0, 1.0)]])
-    best, _ = ascend(line.climb, starts[[np.argmax(np.concatenate([line.value(s[None]) for s in starts]))]], 1e-5)
+    best, _ = ascend(
+        line.climb, starts[[np.argmax(np.concatenate([line.value(s[None]) for s in starts]))]], 1e-5
+    )
     best = np.maximum(best, 0.0)
     return float(line.value(best)[0]), float(best[0, 0])
 

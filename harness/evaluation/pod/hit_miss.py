@@ -46,7 +46,9 @@ STEEPEST = 1e3  # largest slope in standardised sizes: a curve that rises within
 NEAR_DEVIANCE = 2.0
 """Largest excess over the least deviance, with one inspection per target, of a model that is hardly worse than the
 best. With equally many parameters, it is a difference of 2 in AIC (Burnham and Anderson 2002, 2.6)."""
-STARTS = 10  # points of a coarse grid from which the search for the maximum with floor or ceiling starts
+STARTS = (
+    10  # points of a coarse grid from which the search for the maximum with floor or ceiling starts
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,32 +119,60 @@ def fit_hit_miss(
         place = penalised_maxima(several, EXACT)[0]
         if x[hits].mean() < x[~hits].mean():
             place[1] = 0.0
-        notes = ("no miss is larger than any hit (separation), so Firth's penalised likelihood is used",)
+        notes = (
+            "no miss is larger than any hit (separation), so Firth's penalised likelihood is used",
+        )
     else:
         place = maxima(several, np.array([float(link_ppf(link, np.array(rate))), 0.0]), EXACT)[0]
     if place[1] <= 0:
         fix = "check that hits are 1 and misses 0, and that size is what detection depends on"
-        raise UserError("the probability of detection does not grow with size: the slope is not positive", fix=fix)
+        raise UserError(
+            "the probability of detection does not grow with size: the slope is not positive",
+            fix=fix,
+        )
     single = HitsAndMisses(design, found, weight - found, link)
     log_likelihood = float(single.value(place))
     unscale = np.array([[1.0, -centre / spread], [0.0, 1.0 / spread]])
     b0, b1 = (float(b) for b in unscale @ place)
     of_hit, of_miss, density = logs_of_link(link, design @ place)
-    information = (design.T * (weight * np.exp(2.0 * density - of_hit - of_miss))) @ design  # expected, of (b0, b1)
+    information = (
+        design.T * (weight * np.exp(2.0 * density - of_hit - of_miss))
+    ) @ design  # expected, of (b0, b1)
     covariance = unscale @ (np.linalg.pinv(information) * repeats) @ unscale.T
-    slopes = np.array([[-1.0 / b1, b0 / b1**2], [0.0, -1.0 / b1**2]])  # of mu = -b0 / b1 and sigma = 1 / b1
+    slopes = np.array(
+        [[-1.0 / b1, b0 / b1**2], [0.0, -1.0 / b1**2]]
+    )  # of mu = -b0 / b1 and sigma = 1 / b1
     if targets < n:
-        notes += (f"{n} inspections of {targets} targets count as {targets} (variance multiplied by {repeats:.4g})",)
+        notes += (
+            f"{n} inspections of {targets} targets count as {targets} (variance multiplied by {repeats:.4g})",
+        )
         if np.ptp(rows_each):
-            notes += (f"{rows_each.min()} to {rows_each.max()} inspections per target: each target counts once",)
+            notes += (
+                f"{rows_each.min()} to {rows_each.max()} inspections per target: each target counts once",
+            )
     curve = PodCurve(link, log_size, -b0 / b1, 1.0 / b1, slopes @ covariance @ slopes.T)
     null = float(-2.0 * n * (rate * np.log(rate) + (1.0 - rate) * np.log1p(-rate)))
-    numbers = (b0, b1, covariance, -2.0 * log_likelihood, null, log_likelihood, n, int(hits.sum()), targets, repeats)
+    numbers = (
+        b0,
+        b1,
+        covariance,
+        -2.0 * log_likelihood,
+        null,
+        log_likelihood,
+        n,
+        int(hits.sum()),
+        targets,
+        repeats,
+    )
     method: Literal["ML", "Firth"] = "Firth" if separated else "ML"
-    return HitMissFit(curve, *numbers, method, notes, centre, spread, place, replace(single, penalty=penalty))
+    return HitMissFit(
+        curve, *numbers, method, notes, centre, spread, place, replace(single, penalty=penalty)
+    )
 
 
-def choose_model(size: ArrayLike, hit: ArrayLike, *, inspections: ArrayLike | None = None) -> tuple[HitMissFit, ...]:
+def choose_model(
+    size: ArrayLike, hit: ArrayLike, *, inspections: ArrayLike | None = None
+) -> tuple[HitMissFit, ...]:
     """Fit every link with a and, if all sizes are positive, with ln a; least deviance first. The order does not depend
     on the limits: a model chosen because its limit is small has no coverage."""
     logs = (False, True) if np.all(np.asarray(size, float) > 0) else (False,)
@@ -169,7 +199,9 @@ def floor_ceiling_tests(fit: HitMissFit) -> tuple[FloorCeilingTest, ...]:
         statistic = max(2.0 * (value - fit.log_likelihood) / fit.repeats, 0.0)
         p_one, p_two = stats.chi2.sf(statistic, [1, 2])
         tail = 0.5 * p_one if beyond != "both" else 0.5 * p_one + 0.25 * p_two
-        tests.append(FloorCeilingTest(beyond, float(tail) if statistic > 1e-9 else 1.0, *place[2:].tolist()))
+        tests.append(
+            FloorCeilingTest(beyond, float(tail) if statistic > 1e-9 else 1.0, *place[2:].tolist())
+        )
     return tuple(tests)
 
 
@@ -185,7 +217,9 @@ def value_and_gradient(data: HitsAndMisses, place: np.ndarray) -> tuple[float, n
     return float(data.hits @ np.log(p_hit) + data.misses @ np.log(p_miss)), gradient
 
 
-def _of_shares(data: HitsAndMisses, share: np.ndarray, miss: np.ndarray, floor: float, ceiling: float) -> np.ndarray:
+def _of_shares(
+    data: HitsAndMisses, share: np.ndarray, miss: np.ndarray, floor: float, ceiling: float
+) -> np.ndarray:
     """Return the log-likelihoods (m,) of curves with floor and ceiling, from their shares (m, n) of hits and misses."""
     p_hit = np.maximum(floor + (ceiling - floor) * share, 1e-300)
     p_miss = np.maximum((1.0 - ceiling) + (ceiling - floor) * miss, 1e-300)
@@ -223,13 +257,18 @@ def _search(
     return likeliest.x, -float(likeliest.fun)
 
 
-def _checked(size: ArrayLike, hit: ArrayLike, link: str, log_size: bool) -> tuple[np.ndarray, np.ndarray]:
+def _checked(
+    size: ArrayLike, hit: ArrayLike, link: str, log_size: bool
+) -> tuple[np.ndarray, np.ndarray]:
     """Return x (n,) and hits (n,) as booleans. Raises UserError for the user's mistake."""
     sizes, hits = np.asarray(size, float), np.asarray(hit, float)
     if link not in LINKS:
         raise UserError(f"link {link!r} is not known", legal=", ".join(LINKS))
     if sizes.ndim != 1 or sizes.shape != hits.shape:
-        raise UserError(f"sizes {sizes.shape} and hits {hits.shape} differ in shape", legal="one hit for each size")
+        raise UserError(
+            f"sizes {sizes.shape} and hits {hits.shape} differ in shape",
+            legal="one hit for each size",
+        )
     if not np.isfinite(sizes).all():
         raise UserError(f"size {np.flatnonzero(~np.isfinite(sizes))[0]} is not a finite number")
     if not np.isin(hits, (0.0, 1.0)).all():
@@ -237,9 +276,14 @@ def _checked(size: ArrayLike, hit: ArrayLike, link: str, log_size: bool) -> tupl
         raise UserError(f"hit {at} is {hits[at]:g}", legal="0 (missed) or 1 (found)")
     if hits.all() or not hits.any():
         every = "found" if len(hits) and hits.all() else "missed"
-        raise UserError(f"every target was {every}: there is no curve to fit", fix="inspect sizes on both sides of it")
+        raise UserError(
+            f"every target was {every}: there is no curve to fit",
+            fix="inspect sizes on both sides of it",
+        )
     if log_size and sizes.min() <= 0:
-        raise UserError(f"size {sizes.min():g} has no logarithm", legal="sizes > 0", fix="fit size itself")
+        raise UserError(
+            f"size {sizes.min():g} has no logarithm", legal="sizes > 0", fix="fit size itself"
+        )
     if np.ptp(sizes) == 0:
         raise UserError(f"all sizes are {sizes[0]:g}: POD against size needs more than one")
     return np.log(sizes) if log_size else sizes, hits == 1.0
@@ -254,16 +298,22 @@ def rows_of_target(size: np.ndarray, inspections: ArrayLike | None) -> np.ndarra
         raise UserError(f"{len(names)} target names for {len(size)} rows", legal="one for each row")
     _, first, target = np.unique(names, return_index=True, return_inverse=True)
     if np.any(differs := size != size[first][target]):
-        raise UserError(f"target {names[differs][0]} has more than one size", legal="one size for each target")
+        raise UserError(
+            f"target {names[differs][0]} has more than one size", legal="one size for each target"
+        )
     return np.bincount(target)[target]
 
 
-FARTHEST = 2.0**40  # largest distance from the estimate, in spreads of the sizes, at which a bound is sought
+FARTHEST = (
+    2.0**40
+)  # largest distance from the estimate, in spreads of the sizes, at which a bound is sought
 DIRECTIONS = 240  # points on the outline of the confidence set that determine a band
 REACH = 10  # most doublings of a distance, from 2 to 2000 standard errors
 
 
-def bound(fit: HitMissFit, pod: float = 0.9, confidence: float = 0.95, *, design_effect: float = 1.0) -> Bound:
+def bound(
+    fit: HitMissFit, pod: float = 0.9, confidence: float = 0.95, *, design_effect: float = 1.0
+) -> Bound:
     """Return the upper bound on the size with this POD; infinite, with the reason, if there is none. ``design_effect``:
     factor of variance and criterion for targets in clusters (Rao and Scott, Annals of Statistics 12 (1984), 46)."""
     if not 0 < pod < 1:
@@ -277,12 +327,20 @@ def bound(fit: HitMissFit, pod: float = 0.9, confidence: float = 0.95, *, design
     return Bound(pod, confidence, METHOD, value)
 
 
-def band(fit: HitMissFit, sizes: np.ndarray, confidence: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
+def band(
+    fit: HitMissFit, sizes: np.ndarray, confidence: float = 0.95
+) -> tuple[np.ndarray, np.ndarray]:
     """Return lower and upper POD at ``sizes`` (n,), each one-sided as in `bound`: the lower crosses 90 % at a90/95."""
-    x = np.log(np.maximum(sizes, np.finfo(float).tiny)) if fit.curve.log_size else np.asarray(sizes, float)
+    x = (
+        np.log(np.maximum(sizes, np.finfo(float).tiny))
+        if fit.curve.log_size
+        else np.asarray(sizes, float)
+    )
     outline = _outline(fit, criterion(confidence) * fit.repeats)
     predictors = outline[:, :1] + outline[:, 1:] * (x - fit.centre) / fit.spread
-    low, high = (link_cdf(fit.curve.link, edge) for edge in (predictors.min(axis=0), predictors.max(axis=0)))
+    low, high = (
+        link_cdf(fit.curve.link, edge) for edge in (predictors.min(axis=0), predictors.max(axis=0))
+    )
     return low, high
 
 
@@ -307,7 +365,9 @@ def _likelihood_bound(fit: HitMissFit, pod: float, allowed: float) -> tuple[floa
     top = float(data.value(place))
     flat = 2.0 * (top - flat_maximum(data, level))
     if flat <= allowed:
-        return float("inf"), f"a constant probability is not rejected (ratio {flat:.2f} <= {allowed:.2f})"
+        return float(
+            "inf"
+        ), f"a constant probability is not rejected (ratio {flat:.2f} <= {allowed:.2f})"
     slope = place[1]
 
     @cache
@@ -333,7 +393,9 @@ def _outline(fit: HitMissFit, allowed: float) -> np.ndarray:
     metric = scale @ (fit.covariance / fit.repeats) @ scale.T
     try:
         root = np.linalg.cholesky(metric)
-    except np.linalg.LinAlgError:  # the covariance of a step is singular: use any metric that spans both directions
+    except (
+        np.linalg.LinAlgError
+    ):  # the covariance of a step is singular: use any metric that spans both directions
         spread, directions = np.linalg.eigh(metric)
         root = directions * np.sqrt(np.maximum(spread, 1e-4 * max(float(spread[-1]), 1e-8)))
     angle = np.linspace(0.0, 2.0 * np.pi, DIRECTIONS, endpoint=False)
@@ -345,7 +407,10 @@ def _outline(fit: HitMissFit, allowed: float) -> np.ndarray:
     def excess(distance: np.ndarray, along: np.ndarray) -> np.ndarray:
         places, at_once = best + distance[..., None] * step[along], max(1, CELLS // len(data.z))
         starts = range(0, max(len(places), 1), at_once)
-        return np.concatenate([data.value(places[first : first + at_once]) for first in starts]) - lowest
+        return (
+            np.concatenate([data.value(places[first : first + at_once]) for first in starts])
+            - lowest
+        )
 
     inside, outside = np.zeros(DIRECTIONS), np.minimum(farthest, 2.0)
     for _ in range(REACH):
@@ -356,6 +421,9 @@ def _outline(fit: HitMissFit, allowed: float) -> np.ndarray:
         outside = np.where(further, np.minimum(2.0 * outside, farthest), outside)
     crossed = excess(outside, which) < 0
     outside[crossed] = elementwise.find_root(
-        excess, (inside[crossed], outside[crossed]), args=(which[crossed],), tolerances={"xrtol": 1e-9, "fatol": 1e-9}
+        excess,
+        (inside[crossed], outside[crossed]),
+        args=(which[crossed],),
+        tolerances={"xrtol": 1e-9, "fatol": 1e-9},
     ).x
     return np.asarray(best + outside[:, None] * step)

@@ -106,12 +106,21 @@ class PodStatement:
     def doubts(self) -> list[str]:
         """Return warnings: near models with a90/95 more than `APART` apart; data that suggest a floor or ceiling."""
         doubts = [note for note in self.notes if note.endswith(DOUBTED)]
-        most = min(row.deviance for row in self.models) + NEAR_DEVIANCE * len(self.read.size) / self.read.targets
+        most = (
+            min(row.deviance for row in self.models)
+            + NEAR_DEVIANCE * len(self.read.size) / self.read.targets
+        )
         limits = [row.bound.value for row in self.models if row.deviance <= most]
         if max(limits) <= (1 + APART) * min(limits):
             return doubts
-        texts = [f"{limit:.3g}" if np.isfinite(limit) else "not demonstrated" for limit in (min(limits), max(limits))]
-        return [f"{len(limits)} models fit about equally well, and their a90/95 differ: {' to '.join(texts)}", *doubts]
+        texts = [
+            f"{limit:.3g}" if np.isfinite(limit) else "not demonstrated"
+            for limit in (min(limits), max(limits))
+        ]
+        return [
+            f"{len(limits)} models fit about equally well, and their a90/95 differ: {' to '.join(texts)}",
+            *doubts,
+        ]
 
     def to_data(self) -> dict[str, Any]:
         """Return the statement as JSON's types; an infinite size becomes None, and ``why`` gives the reason."""
@@ -125,7 +134,11 @@ class PodStatement:
         data = {
             "file": str(read.path),
             **{"kind": self.kind, "unit": self.unit, "size_column": read.size_column},
-            **{"response_column": read.response_column, "targets": read.targets, "model": self.model},
+            **{
+                "response_column": read.response_column,
+                "targets": read.targets,
+                "model": self.model,
+            },
             "inspections": len(read.size),
             "hits": None if self.signal else int(read.response.sum()),
             "curve": {**of_curve, "covariance_mu_sigma": curve.covariance},
@@ -140,7 +153,12 @@ class PodStatement:
 
 
 def state_hits(
-    read: Inspections, *, link: str | None = None, log_size: bool | None = None, unit: str = "", tested: bool = True
+    read: Inspections,
+    *,
+    link: str | None = None,
+    log_size: bool | None = None,
+    unit: str = "",
+    tested: bool = True,
 ) -> PodStatement:
     """State the curve of hits and misses: the fit with the least deviance, over all links and over sizes or their
     logarithms, unless ``link`` or ``log_size`` restricts them. The bound is the largest over the `near_models` among
@@ -149,7 +167,11 @@ def state_hits(
     with POOLS().limit(limits=1, user_api="blas"):
         size, hit = read.size, read.response
         tried = hit_miss.choose_model(size, hit, inspections=read.target)
-        left = [fit for fit in tried if link in (None, fit.curve.link) and log_size in (None, fit.curve.log_size)]
+        left = [
+            fit
+            for fit in tried
+            if link in (None, fit.curve.link) and log_size in (None, fit.curve.log_size)
+        ]
         fit, near = left[0], hit_miss.near_models(left)
         curve, notes = fit.curve, [*read.notes, *fit.notes]
         tests = hit_miss.floor_ceiling_tests(fit) if tested else ()
@@ -157,9 +179,13 @@ def state_hits(
         limit = max((limit for fit, limit in models if fit in near), key=lambda limit: limit.value)
 
     if fit.targets < LEAST_TARGETS:
-        notes.append(f"{fit.targets} independent targets; MIL-HDBK-1823A asks for at least {LEAST_TARGETS}")
+        notes.append(
+            f"{fit.targets} independent targets; MIL-HDBK-1823A asks for at least {LEAST_TARGETS}"
+        )
     if limit.demonstrated and limit.value > (largest := float(size.max())):
-        notes.append(f"a90/95 = {limit.value:.3g} lies beyond the largest size inspected, {largest:.4g}")
+        notes.append(
+            f"a90/95 = {limit.value:.3g} lies beyond the largest size inspected, {largest:.4g}"
+        )
     if any(test.needed for test in tests):
         likeliest = min(tests, key=lambda test: test.p_value)
         suggests = f"the data suggest {TESTED[likeliest.beyond]} (p = {likeliest.p_value:.2g})"
@@ -167,9 +193,20 @@ def state_hits(
     texts = []
     for test in tests:
         fitted = f"(floor {test.floor:.3f}, ceiling {test.ceiling:.3f})"
-        texts.append((TESTED[test.beyond], test.p_value, f"{'needed' if test.needed else 'not needed'} {fitted}"))
+        texts.append(
+            (
+                TESTED[test.beyond],
+                test.p_value,
+                f"{'needed' if test.needed else 'not needed'} {fitted}",
+            )
+        )
     errors = np.sqrt(np.diag(fit.covariance)).tolist()
-    numbers = {"b0": fit.b0, "b0's standard error": errors[0], "b1": fit.b1, "b1's standard error": errors[1]}
+    numbers = {
+        "b0": fit.b0,
+        "b0's standard error": errors[0],
+        "b1": fit.b1,
+        "b1's standard error": errors[1],
+    }
     numbers |= {"mu": curve.mu, "sigma": curve.sigma, "deviance": fit.deviance}
     numbers |= {"deviance of a constant": fit.null_deviance, "log likelihood": fit.log_likelihood}
     numbers |= {"inspections": float(fit.n), "targets": float(fit.targets), "hits": float(fit.hits)}
@@ -190,8 +227,14 @@ def state_signals(
 ) -> PodStatement:
     """State the curve of signals against sizes: the fit with the least deviance over all pairs of axes that the data
     allow, unless ``log_size`` or ``log_signal`` restricts them. Bounds are by the delta method on x."""
-    tried = choose_axes(read.size, read.response, decision=decision, left=left, right=right, inspections=read.target)
-    fits = [fit for fit in tried if log_size in (None, fit.log_size) and log_signal in (None, fit.log_signal)]
+    tried = choose_axes(
+        read.size, read.response, decision=decision, left=left, right=right, inspections=read.target
+    )
+    fits = [
+        fit
+        for fit in tried
+        if log_size in (None, fit.log_size) and log_signal in (None, fit.log_signal)
+    ]
     if not fits:
         fix = "leave out --log or --log-signal"
         raise UserError(f"{read.path}: the requested axes need logarithms of values <= 0", fix=fix)
@@ -199,13 +242,20 @@ def state_signals(
     limit = ahat_bound(fit, POD, CONFIDENCE)
     (of_mu, common), (_, of_sigma) = curve.covariance.tolist()
     numbers = {"b0": fit.b0, "b1": fit.b1, "tau": fit.tau, "mu": curve.mu, "sigma": curve.sigma}
-    numbers |= {"variance of mu": of_mu, "covariance of mu, sigma": common, "variance of sigma": of_sigma}
+    numbers |= {
+        "variance of mu": of_mu,
+        "covariance of mu, sigma": common,
+        "variance of sigma": of_sigma,
+    }
     numbers |= {"signals at or below --left": float(fit.below.sum())}
     numbers |= {"signals at or above --right": float(fit.above.sum()), "decision": fit.decision}
     numbers |= false_positives(read, fit)
     models = [(fit, ahat_bound(fit, POD, CONFIDENCE)) for fit in tried]
     reads = {True: f"doubtful at {LEVEL:.0%}", False: f"not rejected at {LEVEL:.0%}"}
-    tests = [(f"{test.assumption} ({test.test})", test.p_value, reads[test.p_value < LEVEL]) for test in diagnose(fit)]
+    tests = [
+        (f"{test.assumption} ({test.test})", test.p_value, reads[test.p_value < LEVEL])
+        for test in diagnose(fit)
+    ]
     what = (read, "signal against size", unit, (), fit, _models(models, (fit,)), limit)
     return PodStatement(*what, numbers, (*read.notes, *fit.notes), tuple(tests))
 
@@ -265,5 +315,8 @@ def drawn_sizes(size: np.ndarray, log_size: bool, marks: tuple[float, ...]) -> n
 
 
 def _bound_data(bound: Bound) -> dict[str, Any]:
-    facts = {name: getattr(bound, name) for name in ("pod", "confidence", "method", "demonstrated", "why")}
+    facts = {
+        name: getattr(bound, name)
+        for name in ("pod", "confidence", "method", "demonstrated", "why")
+    }
     return {**facts, "size": bound.value}

@@ -43,7 +43,9 @@ def chance_hits(
     rate: FalseCallRate | None = None,
 ) -> ChanceHits:
     """Count chance hits of one set-up at one number of frames, from its rows of the study's tables."""
-    probability, laid = _shuffled(holes.drop_duplicates(["board", "hole"]), runs, findings, radius_mm)
+    probability, laid = _shuffled(
+        holes.drop_duplicates(["board", "hole"]), runs, findings, radius_mm
+    )
     per_m2 = np.nan if rate is None else rate.rate_per_m2
     n, found = 0, 0.0
     if not sites.empty:
@@ -54,14 +56,18 @@ def chance_hits(
     return ChanceHits(probability, laid, expected, n, found / n if n else np.nan, ends)
 
 
-def _shuffled(places: pd.DataFrame, runs: pd.DataFrame, findings: pd.DataFrame, radius_mm: float) -> tuple[float, int]:
+def _shuffled(
+    places: pd.DataFrame, runs: pd.DataFrame, findings: pd.DataFrame, radius_mm: float
+) -> tuple[float, int]:
     """Return the share of places, moved to runs of other boards, with an unmatched finding near, and their number."""
     at, own = places[["true_x_mm", "true_y_mm"]].to_numpy(float), places["board"]
     judged = runs[runs["role"].isin(("damaged", "hole_free"))]
     on_own = judged.loc[judged["role"] == "damaged", "board"].map(own.value_counts()).sum()
     laid, near = int(len(own) * len(judged) - on_own), 0
     if not findings.empty:
-        unmatched = findings[findings["role"].isin(("damaged", "hole_free")) & (findings["hole"] == "")]
+        unmatched = findings[
+            findings["role"].isin(("damaged", "hole_free")) & (findings["hole"] == "")
+        ]
         for (role, board, _), calls in unmatched.groupby(["role", "board", "repeat"]):
             offset = at[:, None] - calls[["x_mm", "y_mm"]].to_numpy(float)
             hit = ((offset**2).sum(axis=2) <= radius_mm**2).any(axis=1)
@@ -116,10 +122,14 @@ def roc_curve(holes: pd.DataFrame, sites: pd.DataFrame, threshold: float) -> Roc
     """Return the ROC of all damages; None without damages or places. Damage without judged pixels cannot be found."""
     if holes.empty or sites.empty:
         return None
-    positive, negative = (table["signal"].fillna(-np.inf).to_numpy(float) for table in (holes, sites))
+    positive, negative = (
+        table["signal"].fillna(-np.inf).to_numpy(float) for table in (holes, sites)
+    )
     levels = np.unique(np.concatenate([positive, negative]))[::-1]
     both = (negative, positive)
-    false, true = (np.append(0.0, 1 - np.searchsorted(np.sort(s), levels, "left") / len(s)) for s in both)
+    false, true = (
+        np.append(0.0, 1 - np.searchsorted(np.sort(s), levels, "left") / len(s)) for s in both
+    )
     at = (float((negative > threshold).mean()), float((positive > threshold).mean()))
     return Roc(false, true, at, float(np.trapezoid(true, false)), len(positive), len(negative))
 
@@ -137,7 +147,11 @@ def free_response(
         return None
     area_m2 = float(free["inspected_m2"].sum())
     thresholds = np.asarray(operating["threshold"].iloc[0], float)[::-1]
-    calls = _counts(operating.loc[operating["role"] == "hole_free", "findings"]).sum(axis=0)[::-1].astype(float)
+    calls = (
+        _counts(operating.loc[operating["role"] == "hole_free", "findings"])
+        .sum(axis=0)[::-1]
+        .astype(float)
+    )
     kept = calls >= np.maximum.accumulate(calls)
     damaged = operating[operating["role"] == "damaged"]
     of_board = holes.groupby("board", sort=True).size()
@@ -146,7 +160,9 @@ def free_response(
     counted = of_run.groupby(level=0).sum().reindex(of_board.index, fill_value=0)
     hits, inspections = counted.to_numpy(float)[:, ::-1][:, kept], of_board.to_numpy(float)
     blocks = weights_in_blocks(draws, (of_board.index.to_numpy(), "damaged"))
-    drawn = np.concatenate([(weights @ hits) / (weights @ inspections)[:, None] for (weights,) in blocks])
+    drawn = np.concatenate(
+        [(weights @ hits) / (weights @ inspections)[:, None] for (weights,) in blocks]
+    )
     edges = [percentiles(column) for column in drawn.T]
     low, high = np.array([(edge.low, edge.high) for edge in edges]).reshape(-1, 2).T
     at = (int(free["false_calls"].sum()) / area_m2, float(holes["detected"].mean()))
@@ -169,7 +185,9 @@ def pixel_curves(pixels: pd.DataFrame) -> PixelCurves | None:
         why = f"the thresholds counted end at a false-positive rate of {false[-2]:.3g}"
         return PixelCurves(false, overlap, np.nan, why)
     x = np.append(false[false < PRO_LIMIT], PRO_LIMIT)
-    area = np.trapezoid(np.append(overlap[false < PRO_LIMIT], np.interp(PRO_LIMIT, false, overlap)), x)
+    area = np.trapezoid(
+        np.append(overlap[false < PRO_LIMIT], np.interp(PRO_LIMIT, false, overlap)), x
+    )
     return PixelCurves(false, overlap, float(area / PRO_LIMIT), "")
 
 

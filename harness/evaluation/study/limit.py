@@ -16,7 +16,13 @@ import numpy as np
 from scipy.optimize import linprog
 from scipy.stats import chi2
 
-from harness.evaluation.intervals import UNKNOWN, FalseCallRate, Interval, false_call_rate, percentiles
+from harness.evaluation.intervals import (
+    UNKNOWN,
+    FalseCallRate,
+    Interval,
+    false_call_rate,
+    percentiles,
+)
 from harness.evaluation.pod.curve import (
     CELLS,
     Bound,
@@ -51,11 +57,15 @@ class Targets:
     unit: np.ndarray | None = None
 
 
-def targets_of(board: np.ndarray, hole: np.ndarray, size_mm: np.ndarray, hit: np.ndarray) -> Targets:
+def targets_of(
+    board: np.ndarray, hole: np.ndarray, size_mm: np.ndarray, hit: np.ndarray
+) -> Targets:
     """Combine rows (n,) of inspections into targets: repeats of one damage of one board are one target."""
     _, boards = np.unique(board, return_inverse=True)
     _, holes = np.unique(hole, return_inverse=True)
-    _, first, which = np.unique(boards * (holes.max(initial=0) + 1) + holes, return_index=True, return_inverse=True)
+    _, first, which = np.unique(
+        boards * (holes.max(initial=0) + 1) + holes, return_index=True, return_inverse=True
+    )
     hits, inspections = np.bincount(which, np.asarray(hit, float)), np.bincount(which).astype(float)
     return Targets(board[first], size_mm[first], hits, inspections)
 
@@ -66,28 +76,44 @@ def _drawn(stream: np.random.Generator, boards: int, draws: int) -> np.ndarray:
     return stream.multinomial(boards, np.full(boards, 1.0 / boards), size=draws).astype(float)
 
 
-def weights_in_blocks(draws: int, *rows: tuple[np.ndarray, str]) -> Iterator[tuple[np.ndarray, ...]]:
+def weights_in_blocks(
+    draws: int, *rows: tuple[np.ndarray, str]
+) -> Iterator[tuple[np.ndarray, ...]]:
     """Resample boards for one or several (board (n,), population). Yield, in blocks of draws to limit the memory, how
     often each draw has the board of each row, (draws, n). Draws are the same for equal numbers of boards of a
     population, so set-ups are paired; two populations ("damaged", "hole-free") are drawn independently."""
     found = [(*np.unique(board, return_inverse=True), population) for board, population in rows]
-    streams = [random_stream(0, "boards drawn again", population, len(names)) for names, _, population in found]
+    streams = [
+        random_stream(0, "boards drawn again", population, len(names))
+        for names, _, population in found
+    ]
     at_once = max(1, CELLS // max(1, *(len(which) for _, which, _ in found)))
     for first in range(0, draws, at_once):
         count = min(at_once, draws - first)
         drawn = zip(streams, found, strict=True)
-        yield tuple(_drawn(stream, len(names), count)[:, which] for stream, (names, which, _) in drawn)
+        yield tuple(
+            _drawn(stream, len(names), count)[:, which] for stream, (names, which, _) in drawn
+        )
 
 
-def refitted_sizes(targets: Targets, curve: PodCurve, pods: tuple[float, ...], draws: int = DRAWS) -> np.ndarray:
+def refitted_sizes(
+    targets: Targets, curve: PodCurve, pods: tuple[float, ...], draws: int = DRAWS
+) -> np.ndarray:
     """Refit ``curve``'s link and axis to resampled boards: sizes (len(pods), draws) in mm, by Firth's likelihood if
     hits and misses are separated. Infinite if nothing is found or POD does not grow; smallest if all is found."""
-    rows = [(targets.board, "damaged")] + ([] if targets.unit is None else [(targets.unit, "units")])
-    blocks = (_refitted(targets, curve, pods, np.multiply.reduce(w)) for w in weights_in_blocks(draws, *rows))
+    rows = [(targets.board, "damaged")] + (
+        [] if targets.unit is None else [(targets.unit, "units")]
+    )
+    blocks = (
+        _refitted(targets, curve, pods, np.multiply.reduce(w))
+        for w in weights_in_blocks(draws, *rows)
+    )
     return np.concatenate(list(blocks), axis=1)
 
 
-def _refitted(targets: Targets, curve: PodCurve, pods: tuple[float, ...], weights: np.ndarray) -> np.ndarray:
+def _refitted(
+    targets: Targets, curve: PodCurve, pods: tuple[float, ...], weights: np.ndarray
+) -> np.ndarray:
     """Refit the curve to targets with ``weights`` (draws, n)."""
     x = np.log(targets.size_mm) if curve.log_size else targets.size_mm
     centre, spread = float(x.mean()), float(x.std()) or 1.0
@@ -103,7 +129,9 @@ def _refitted(targets: Targets, curve: PodCurve, pods: tuple[float, ...], weight
     b[overlap] = maxima(data.of(overlap), start)
     apart = np.isfinite(largest_miss) & np.isfinite(smallest_hit) & ~overlap
     if apart.any():
-        separated = HitsAndMisses(data.design, hits[apart], misses[apart], curve.link, repeats[apart])
+        separated = HitsAndMisses(
+            data.design, hits[apart], misses[apart], curve.link, repeats[apart]
+        )
         b[apart] = penalised_maxima(separated, 1e-6)
     at = crossings(b, curve.link, pods)
     at[:, largest_miss == -np.inf] = z.min()
@@ -129,7 +157,9 @@ def design_effect(targets: Targets, curve: PodCurve, pod: float) -> float:
     slope = targets.hits * up - (targets.inspections - targets.hits) * down
     design = np.column_stack([np.ones_like(x), x])
     # x_p = (level - b0) / b1: its slopes by b0 and b1.
-    gradient = -curve.sigma * np.array([1.0, curve.mu + curve.sigma * float(link_ppf(curve.link, np.array(pod)))])
+    gradient = -curve.sigma * np.array(
+        [1.0, curve.mu + curve.sigma * float(link_ppf(curve.link, np.array(pod)))]
+    )
     information = design.T @ ((targets.inspections * up * down)[:, None] * design)
     influence = (design * slope[:, None]) @ np.linalg.solve(information, gradient)
     _, which = np.unique(targets.board, return_inverse=True)
@@ -178,7 +208,9 @@ def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | No
     hit = seen.hit
     if not len(hit) or hit.all() or not hit.any():
         return None, "all damages had the same outcome: there is no surface to fit"
-    diameters, depths = ((float(sizes.min()), float(sizes.max())) for sizes in (seen.diameter_mm, seen.depth_mm))
+    diameters, depths = (
+        (float(sizes.min()), float(sizes.max())) for sizes in (seen.diameter_mm, seen.depth_mm)
+    )
     if depths[0] <= 0 or not depth_varies(seen.depth_mm):
         return None, "depth does not vary: {:g} to {:g} mm".format(*depths)
     if diameters[0] == diameters[1]:
@@ -186,14 +218,21 @@ def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | No
     a, d = np.log(seen.diameter_mm), np.log(seen.depth_mm)
     crossed = np.stack([np.ones_like(a), a, d, a * d], axis=1)
     if _separated(crossed[:, :3], hit):
-        return None, f"hits and misses do not overlap over {seen.size_of} and depth (separation): no surface fits"
+        return (
+            None,
+            f"hits and misses do not overlap over {seen.size_of} and depth (separation): no surface fits",
+        )
     repeats = len(hit) / len({*zip(seen.board.tolist(), seen.hole.tolist(), strict=True)})
 
     def fit(link: str, design: np.ndarray) -> tuple[float, np.ndarray, str]:
         """Return deviance, coefficients (4,) and link."""
         hits = hit.astype(float)
         b = _coefficients(design, hits[None], 1 - hits[None], link)[0]
-        return float(-2 * HitsAndMisses(design, hits, 1 - hits, link).value(b)), np.pad(b, (0, 4 - len(b))), link
+        return (
+            float(-2 * HitsAndMisses(design, hits, 1 - hits, link).value(b)),
+            np.pad(b, (0, 4 - len(b))),
+            link,
+        )
 
     deviance, b, link = min((fit(link, crossed[:, :3]) for link in LINKS), key=lambda made: made[0])
     if b[1] <= 0:
@@ -202,15 +241,22 @@ def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | No
     if not _separated(crossed, hit):
         least, bent, _ = fit(link, crossed)
         p = float(chi2.sf(max(deviance - least, 0.0) / repeats, 1))
-        rises = min(bent[1] + bent[3] * np.log(depths).min(), bent[1] + bent[3] * np.log(depths).max()) > 0
+        rises = (
+            min(bent[1] + bent[3] * np.log(depths).min(), bent[1] + bent[3] * np.log(depths).max())
+            > 0
+        )
         if p < 0.05 and rises:
             deviance, b, terms = least, bent, 4
         elif p < 0.05:
-            interaction = f"{seen.size_of} and depth interact (p = {p:.2g}), which the surface leaves out"
+            interaction = (
+                f"{seen.size_of} and depth interact (p = {p:.2g}), which the surface leaves out"
+            )
             note = "; ".join(filter(None, (note, interaction)))
     level, columns = float(link_ppf(link, np.array(POD))), crossed[:, :terms]
     blocks = weights_in_blocks(draws, (seen.board, "damaged"))
-    again = np.concatenate([_coefficients(columns, w * hit, w * ~hit, link, b[:terms]) for (w,) in blocks])
+    again = np.concatenate(
+        [_coefficients(columns, w * hit, w * ~hit, link, b[:terms]) for (w,) in blocks]
+    )
     b0, b1, b2, b3 = np.vstack([b, np.pad(again, ((0, 0), (0, 4 - terms)))]).T[..., None]
     many = len(np.unique(seen.board)) > 1
 
@@ -224,7 +270,11 @@ def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | No
 
 
 def _coefficients(
-    design: np.ndarray, hits: np.ndarray, misses: np.ndarray, link: str, start: np.ndarray | None = None
+    design: np.ndarray,
+    hits: np.ndarray,
+    misses: np.ndarray,
+    link: str,
+    start: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return coefficients (draws, p). The first column is the constant; the others are scaled for the search."""
     centre, scale = design[:, 1:].mean(axis=0), design[:, 1:].std(axis=0)
@@ -239,9 +289,17 @@ def _coefficients(
 def _separated(design: np.ndarray, hit: np.ndarray) -> bool:
     """Return whether a plane separates hits from misses (Albert and Anderson, Biometrika 71 (1984), 1), by linear
     programming: the largest sum of one-sided margins is 0 if hits and misses overlap."""
-    scaled = np.column_stack([np.ones(len(design)), (design[:, 1:] - design[:, 1:].mean(0)) / design[:, 1:].std(0)])
+    scaled = np.column_stack(
+        [np.ones(len(design)), (design[:, 1:] - design[:, 1:].mean(0)) / design[:, 1:].std(0)]
+    )
     signed = np.where(hit, 1.0, -1.0)[:, None] * scaled
-    found = linprog(-signed.sum(axis=0), A_ub=-signed, b_ub=np.zeros(len(signed)), bounds=(-1, 1), method="highs")
+    found = linprog(
+        -signed.sum(axis=0),
+        A_ub=-signed,
+        b_ub=np.zeros(len(signed)),
+        bounds=(-1, 1),
+        method="highs",
+    )
     return bool(-found.fun > 1e-7 * len(signed))
 
 
@@ -296,7 +354,9 @@ class SetUpLimit:
     @property
     def boards_matter(self) -> bool:
         """Return whether the limit over boards exceeds a90/95 by more than 10 %, with a known design effect."""
-        return bool(np.isfinite(self.design_effect) and self.over_boards.value > WIDER * self.a90_95.value)
+        return bool(
+            np.isfinite(self.design_effect) and self.over_boards.value > WIDER * self.a90_95.value
+        )
 
 
 def limit_of(record: SetUpRecord, *, draws: int = DRAWS, tested: bool = False) -> SetUpLimit:
@@ -330,14 +390,25 @@ def limit_of(record: SetUpRecord, *, draws: int = DRAWS, tested: bool = False) -
             if max(at_least_one) > 1:
                 over_boards = largest_bound(statement.fits, at_least_one)
         if apart.unit is not None:
-            units = over_units(apart.size_mm, seen.hit, target_names(seen), apart.unit, statement.curve, over_boards)
+            units = over_units(
+                apart.size_mm,
+                seen.hit,
+                target_names(seen),
+                apart.unit,
+                statement.curve,
+                over_boards,
+            )
     elif n and seen.hit.all():
         # If the POD of the 29th smallest target were below 90 %, so would that of the 28 smaller ones, and all 29
         # would be found in less than 5 % of studies. So a90 lies below its size, provided that POD grows with size.
         a50 = a90 = float(targets.size_mm.min())
         a90_95 = _all_found(targets.size_mm, "targets")
-        smallest = [targets.size_mm[targets.board == board].min() for board in np.unique(targets.board)]
-        over_boards = _all_found(np.array(smallest), "targets, one a board")  # independent for certain
+        smallest = [
+            targets.size_mm[targets.board == board].min() for board in np.unique(targets.board)
+        ]
+        over_boards = _all_found(
+            np.array(smallest), "targets, one a board"
+        )  # independent for certain
         of_a50 = of_a90 = np.full(draws, a90)
     else:
         a50 = a90 = np.nan
@@ -349,15 +420,30 @@ def limit_of(record: SetUpRecord, *, draws: int = DRAWS, tested: bool = False) -
     counts = (len(np.unique(targets.board)), len(targets.board), int(seen.hit.sum()), n)
     estimates = (a90_95, a50, a90, of_a90, *ends, over_boards, effect)
     largest_mm = float(seen.size_mm.max()) if n else np.nan
-    return SetUpLimit(record, statement, why, *estimates, *counts, calls, calls_interval, largest_mm, units, beside)
+    return SetUpLimit(
+        record,
+        statement,
+        why,
+        *estimates,
+        *counts,
+        calls,
+        calls_interval,
+        largest_mm,
+        units,
+        beside,
+    )
 
 
 def target_names(seen: Inspected) -> np.ndarray:
     """Return a name (n,) for what each row inspects; repeats of one damage of one board share it."""
-    return np.array([f"{board}:{hole}" for board, hole in zip(seen.board, seen.hole, strict=True)], dtype=str)
+    return np.array(
+        [f"{board}:{hole}" for board, hole in zip(seen.board, seen.hole, strict=True)], dtype=str
+    )
 
 
-def _false_calls(runs: Unflawed | None, draws: int, population: str) -> tuple[FalseCallRate | None, Interval]:
+def _false_calls(
+    runs: Unflawed | None, draws: int, population: str
+) -> tuple[FalseCallRate | None, Interval]:
     """Return the rate of false calls in runs, and its interval over boards; unknown without runs or calls."""
     if runs is None or not len(runs.board):
         return None, UNKNOWN
@@ -365,19 +451,31 @@ def _false_calls(runs: Unflawed | None, draws: int, population: str) -> tuple[Fa
     if not rate.calls or len(np.unique(runs.board)) < 2:
         return rate, UNKNOWN
     blocks = weights_in_blocks(draws, (runs.board, population))
-    return rate, percentiles(np.concatenate([(w @ runs.calls) / (w @ runs.area_m2) for (w,) in blocks]))
+    return rate, percentiles(
+        np.concatenate([(w @ runs.calls) / (w @ runs.area_m2) for (w,) in blocks])
+    )
 
 
 def _rows(record: SetUpRecord) -> Inspections:
     seen, names = record.inspected, target_names(record.inspected)
     target = names if len(np.unique(names)) < len(names) else None
     lines = np.arange(1, len(names) + 1)
-    return Inspections(Path(record.label), seen.limit_of, "hit", seen.size_mm, seen.hit.astype(float), target, lines)
+    return Inspections(
+        Path(record.label),
+        seen.limit_of,
+        "hit",
+        seen.size_mm,
+        seen.hit.astype(float),
+        target,
+        lines,
+    )
 
 
 def _all_found(size_mm: np.ndarray, what: str) -> Bound:
     method = f"all found: binomial on the {ALL_FOUND} smallest {what}"
     if len(size_mm) >= ALL_FOUND:
         return Bound(POD, CONFIDENCE, method, float(np.sort(size_mm)[ALL_FOUND - 1]))
-    reason = f"not demonstrated: all of {len(size_mm)} {what} were found, but {ALL_FOUND} are needed"
+    reason = (
+        f"not demonstrated: all of {len(size_mm)} {what} were found, but {ALL_FOUND} are needed"
+    )
     return Bound(POD, CONFIDENCE, method, np.inf, reason)

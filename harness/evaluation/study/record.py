@@ -29,9 +29,13 @@ from harness.vocabulary.files import RECORD_BYTES, bounded_bytes, strict_json
 from harness.vocabulary.path_names import in_words
 from harness.vocabulary.provenance import check_version
 
-RECORD_VERSION = 2  # 1: hits by depth alone. Increased when the meaning of a field, or of a hit, changes
-OLDEST_VERSION = 1  # still read: if no damage is found only by missing returns, its hits are those of today
-LEGAL = "a study.json, or a baseline that python -m harness.check --update wrote"
+RECORD_VERSION = (
+    2  # 1: hits by depth alone. Increased when the meaning of a field, or of a hit, changes
+)
+OLDEST_VERSION = (
+    1  # still read: if no damage is found only by missing returns, its hits are those of today
+)
+LEGAL = "a study.json, or a baseline that tofpod check --update wrote"
 AGAIN = "run the study again, which rewrites the file; do not edit it by hand"
 
 
@@ -42,10 +46,14 @@ class StoredColumn:
     dtype: type
     value: Any
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
         listed = core_schema.list_schema(handler.generate_schema(self.value), strict=True)
         return core_schema.no_info_after_validator_function(
-            lambda values: np.array([np.nan if value is None else value for value in values], self.dtype),
+            lambda values: np.array(
+                [np.nan if value is None else value for value in values], self.dtype
+            ),
             listed,
             serialization=core_schema.plain_serializer_function_ser_schema(
                 lambda column: [None if value != value else value for value in column.tolist()]
@@ -55,11 +63,15 @@ class StoredColumn:
 
 def _one_table(table: Any) -> Any:
     """Refuse columns of different lengths, and repeated rows."""
-    columns = {name: column for name, column in vars(table).items() if isinstance(column, np.ndarray)}
+    columns = {
+        name: column for name, column in vars(table).items() if isinstance(column, np.ndarray)
+    }
     lengths = {len(column): f"{name} {len(column)}" for name, column in columns.items()}
     if len(lengths) > 1:
         raise ValueError(f"columns of different lengths: {', '.join(lengths.values())}")
-    named = [column.tolist() for name, column in columns.items() if name in ("board", "repeat", "hole")]
+    named = [
+        column.tolist() for name, column in columns.items() if name in ("board", "repeat", "hole")
+    ]
     if len(set(zip(*named, strict=True))) < len(table.board):
         raise ValueError("the same inspection occurs twice")
     return table
@@ -116,7 +128,11 @@ class Inspected:
     def limit_of(self) -> str:
         """The name of the limits' size: depth if only depth varies, else diameter, width or length."""
         one_diameter = len(self.hit) > 0 and np.ptp(self.diameter_mm) == 0
-        return "depth" if one_diameter and 0 < self.depth_mm.min() < self.depth_mm.max() else self.size_of
+        return (
+            "depth"
+            if one_diameter and 0 < self.depth_mm.min() < self.depth_mm.max()
+            else self.size_of
+        )
 
     @property
     def size_mm(self) -> np.ndarray:
@@ -198,14 +214,18 @@ class StudyRecord:
     hit_radius_mm: Size
     false_calls_per_m2: Size | None
     provenance: Mapping[str, Any]
-    set_ups: Annotated[tuple[SetUpRecord, ...], Field(min_length=1), AfterValidator(_no_set_up_twice)]
+    set_ups: Annotated[
+        tuple[SetUpRecord, ...], Field(min_length=1), AfterValidator(_no_set_up_twice)
+    ]
     hit_overlap: Size | None = None
 
     @property
     def hit_rule(self) -> str:
         """Rule for a hit, as the end of a sentence that begins with a damage."""
         long = any(set_up.inspected.size_of != "diameter" for set_up in self.set_ups)
-        centre = "its centre line" if long else "its own" if self.hit_overlap is None else "its centre"
+        centre = (
+            "its centre line" if long else "its own" if self.hit_overlap is None else "its centre"
+        )
         rule = f"where the centre of a finding lies within {self.hit_radius_mm:.3g} mm of {centre}"
         if self.hit_overlap is None:
             return rule
@@ -231,7 +251,9 @@ def read_record(path: Path) -> StudyRecord:
     none, if it is not a record or is damaged (with set-up and field), and if it has another version."""
     file = Path(path) / "study.json" if Path(path).is_dir() else Path(path)
     try:
-        data = strict_json(bounded_bytes(file, RECORD_BYTES), nan=True)  # NaN is allowed in the record's columns
+        data = strict_json(
+            bounded_bytes(file, RECORD_BYTES), nan=True
+        )  # NaN is allowed in the record's columns
     except OSError as error:
         fix = "name a folder that a sweep with a `study` wrote, such as results/detection_limit/<digest>"
         raise UserError(f"{file}: cannot be read ({error.strerror})", fix=fix) from error
@@ -239,7 +261,14 @@ def read_record(path: Path) -> StudyRecord:
         raise UserError(f"{file}: is not JSON ({error})", legal=LEGAL, fix=AGAIN) from error
     if not isinstance(data, dict) or "record_version" not in data:
         raise UserError(f"{file}: is not the record of a study", legal=LEGAL)
-    check_version(data.pop("record_version"), RECORD_VERSION, file, "a record", oldest=OLDEST_VERSION, again=AGAIN)
+    check_version(
+        data.pop("record_version"),
+        RECORD_VERSION,
+        file,
+        "a record",
+        oldest=OLDEST_VERSION,
+        again=AGAIN,
+    )
     try:
         return TypeAdapter(StudyRecord).validate_python(data)
     except ValidationError as error:
@@ -249,9 +278,14 @@ def read_record(path: Path) -> StudyRecord:
 def set_up_named(study: StudyRecord, name: str | None) -> SetUpRecord:
     """Return the set-up with this label, or the only one. Raises UserError if there is none, or none is named."""
     by_label = {record.label: record for record in study.set_ups}
-    name, known = name or (next(iter(by_label)) if len(by_label) == 1 else None), "; ".join(by_label)
+    name, known = (
+        name or (next(iter(by_label)) if len(by_label) == 1 else None),
+        "; ".join(by_label),
+    )
     if name is None:
-        raise UserError(f"{study.name} has {len(by_label)} set-ups", legal=known, fix='name one: --set-up "..."')
+        raise UserError(
+            f"{study.name} has {len(by_label)} set-ups", legal=known, fix='name one: --set-up "..."'
+        )
     if name not in by_label:
         near = nearest(name, by_label)
         meant = f"; did you mean {near!r}?" if near else ""
@@ -264,7 +298,11 @@ def _mistake(error: ValidationError, data: Any) -> str:
     first, *others = error.errors(include_url=False)
     path = [part for part in first["loc"] if not str(part).startswith(("float", "none"))]
     where, value = ".".join(map(str, path)), first.get("input")
-    if path[:1] == ["set_ups"] and len(path) > 1 and isinstance(set_up := data["set_ups"][path[1]], dict):
+    if (
+        path[:1] == ["set_ups"]
+        and len(path) > 1
+        and isinstance(set_up := data["set_ups"][path[1]], dict)
+    ):
         where += f" (set-up {set_up.get('variant')}, frames {set_up.get('frames')})"
     given = f", not {shown(value)}" if value is None or isinstance(value, str | int | float) else ""
     text = str(first.get("ctx", {}).get("error", first["msg"])).partition(" or an instance of")[0]

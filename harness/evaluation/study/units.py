@@ -39,7 +39,12 @@ class OverUnits:
 
 
 def over_units(
-    size_mm: np.ndarray, hit: np.ndarray, target: np.ndarray, unit: np.ndarray, curve: PodCurve, limit: Bound
+    size_mm: np.ndarray,
+    hit: np.ndarray,
+    target: np.ndarray,
+    unit: np.ndarray,
+    curve: PodCurve,
+    limit: Bound,
 ) -> OverUnits:
     """Judge inspections, one per row (n,): ``hit`` bool, names of ``target``, numbers of ``unit``. ``curve``: of all
     units; ``limit``: its a90/95 over boards. If a unit found all or nothing, no limit of a new unit is demonstrated."""
@@ -59,7 +64,9 @@ def over_units(
     margin = float(t.ppf(CONFIDENCE, units - 1)) * spread * np.sqrt(1 + 1 / units)
     value, why = np.inf, f"not demonstrated: {limit.why.removeprefix('not demonstrated: ')}"
     if not np.isfinite(spread):
-        why = "not demonstrated: a unit found every damage or none, so that units cannot be compared"
+        why = (
+            "not demonstrated: a unit found every damage or none, so that units cannot be compared"
+        )
     elif limit.demonstrated:
         a90 = float(curve.size_at(POD))
         value, why = a90 * float(np.exp(np.hypot(np.log(limit.value / a90), margin))), ""

@@ -24,7 +24,13 @@ from harness.vocabulary.geometry import MM, Reason
 from scenes.sensor.amcw import kernels, ranging
 from scenes.sensor.amcw.certainty import Certainty, certainty, even_pixels, fill_even
 from scenes.sensor.amcw.kernels import LANES
-from scenes.sensor.amcw.linear import DEVIATIONS, Light, light_of_samples, linearised, unknown_filtered
+from scenes.sensor.amcw.linear import (
+    DEVIATIONS,
+    Light,
+    light_of_samples,
+    linearised,
+    unknown_filtered,
+)
 from scenes.sensor.normals import EXACT_SUMS, FAST
 from scenes.sensor.unit import N_REASONS, FrameTotals
 
@@ -122,13 +128,23 @@ def add_linear_frames(  # type: ignore[no-untyped-def]
     half = side // 2
     width = (w + 2 * half) * LANES
     # noise of the picture rows of a window, and of one beyond the picture; its sums along columns, and over windows
-    rows, down, across = np.zeros((side + 1, width), f4), np.empty(width, f4), np.empty(w * LANES, f4)
-    noise, starts, places = rows.reshape(rows.size), np.empty(side, np.int64), np.empty(side * side, np.int64)
+    rows, down, across = (
+        np.zeros((side + 1, width), f4),
+        np.empty(width, f4),
+        np.empty(w * LANES, f4),
+    )
+    noise, starts, places = (
+        rows.reshape(rows.size),
+        np.empty(side, np.int64),
+        np.empty(side * side, np.int64),
+    )
     beside = np.arange(side) * LANES
     sums, rounded = np.empty(LANES, f4), np.empty(LANES, f4)
     for y in range(-half, h):
         if y + half < h:
-            _noise_row(y + half, words, given, given_at, linear.noise, w, half, rows[(y + half) % side])
+            _noise_row(
+                y + half, words, given, given_at, linear.noise, w, half, rows[(y + half) % side]
+            )
         if y < 0:
             continue
         for q in range(side):
@@ -139,7 +155,18 @@ def add_linear_frames(  # type: ignore[no-untyped-def]
             i, own = y * w + x, starts[half] + (x + half) * LANES
             z, by_path = linear.z[i], linear.by_path[i]
             if linear.kind[i] == EVEN:
-                _round(z, by_path, errors, linear.each[i], across, x * LANES, linear.more[i], noise, own, rounded)
+                _round(
+                    z,
+                    by_path,
+                    errors,
+                    linear.each[i],
+                    across,
+                    x * LANES,
+                    linear.more[i],
+                    noise,
+                    own,
+                    rounded,
+                )
             elif linear.kind[i] == UNEVEN:
                 for q in range(side * side):
                     places[q] = starts[q // side] + (x + q % side) * LANES
@@ -153,7 +180,9 @@ def add_linear_frames(  # type: ignore[no-untyped-def]
                 squares[part, i] += b
 
 
-MOST_LISTED = 0.25  # if more of the pixels had to be simulated one by one, whole frames would cost less
+MOST_LISTED = (
+    0.25  # if more of the pixels had to be simulated one by one, whole frames would cost less
+)
 LEAST_DITHER = 0.6  # from this noise of a sample over the converter's step, rounding is noise of step^2/12, to 1e-3
 JITTERS = 6.0  # limits of range keep this many deviations of a frame's displacement away
 
@@ -174,7 +203,9 @@ def _listed(wanted: np.ndarray, side: int, flying: bool) -> Listed:
     ranges = grown(wanted, 3) if flying else wanted
     halo = grown(ranges, side)
     # running numbers of the pixels, -1 elsewhere
-    in_range, in_halo = (np.where(m, np.cumsum(m).reshape(m.shape) - 1, -1).astype(np.int32) for m in (ranges, halo))
+    in_range, in_halo = (
+        np.where(m, np.cumsum(m).reshape(m.shape) - 1, -1).astype(np.int32) for m in (ranges, halo)
+    )
     range_, wanted_ = np.flatnonzero(ranges), np.flatnonzero(wanted)
     window, near = windows_of(in_halo, side, -1, range_), windows_of(in_range, 3, -1, wanted_)
     return Listed(np.flatnonzero(halo), range_, in_range.ravel()[wanted_], window, near)
@@ -187,7 +218,9 @@ def grown(pixels: np.ndarray, side: int) -> np.ndarray:
 
 def windows_of(image: np.ndarray, side: int, beyond: float, pixels: np.ndarray) -> np.ndarray:
     """Return the windows (m, side^2) of an image (h, w) at flat ``pixels`` (m,), with ``beyond`` outside the border."""
-    windows = np.lib.stride_tricks.sliding_window_view(np.pad(image, side // 2, constant_values=beyond), (side, side))
+    windows = np.lib.stride_tricks.sliding_window_view(
+        np.pad(image, side // 2, constant_values=beyond), (side, side)
+    )
     return windows[np.divmod(pixels, image.shape[1])].reshape(-1, side * side)
 
 
@@ -218,7 +251,9 @@ def at_once(imager: AmcwImager, exposure: AmcwExposure, pixels: np.ndarray) -> A
     # in the finished image, the engine looks one pixel beyond the requested ones
     rest = np.flatnonzero(~(even | lost) & grown(pixels, 3).ravel())
     moved = linearised(rest, light, window, shape, lost, filtered)
-    farthest_m = (unit.jump_mm.value + JITTERS * unit.jitter_mm.value + abs(unit.drift_mm.value)) * MM
+    farthest_m = (
+        unit.jump_mm.value + JITTERS * unit.jitter_mm.value + abs(unit.drift_mm.value)
+    ) * MM
     certain = certainty(filtered, imager.engine, lost, shape, farthest_m)
     wanted = ~(certain.always | certain.never) & pixels.ravel()
     if wanted.mean() > MOST_LISTED:
@@ -230,7 +265,9 @@ def at_once(imager: AmcwImager, exposure: AmcwExposure, pixels: np.ndarray) -> A
     if window.by_amplitude:
         pull = metres * light.amplitude / np.median(light.amplitude, axis=1, keepdims=True)
     linear = _linear(imager, light, certain, pull, (np.flatnonzero(even), *of_even), (rest, moved))
-    listing = _listed(wanted.reshape(shape), window.space.shape[0], imager.engine.flying is not None)
+    listing = _listed(
+        wanted.reshape(shape), window.space.shape[0], imager.engine.flying is not None
+    )
     halo = Light(*(np.ascontiguousarray(part[:, listing.halo]) for part in light))
     each = (pull[:, listing.halo] * halo.turn).T
     shares = (each / np.sqrt((each**2).sum(axis=1, keepdims=True))).astype(f4)
@@ -238,7 +275,12 @@ def at_once(imager: AmcwImager, exposure: AmcwExposure, pixels: np.ndarray) -> A
 
 
 def _linear(
-    imager: AmcwImager, light: Light, certain: Certainty, pull: np.ndarray, at_even: Arrays, at_rest: Arrays
+    imager: AmcwImager,
+    light: Light,
+    certain: Certainty,
+    pull: np.ndarray,
+    at_even: Arrays,
+    at_rest: Arrays,
 ) -> Linear:
     """Return the linear pixels: even ones with the results of `fill_even`, the others with those of `linearised`."""
     (even, of_each, of_centre), (rest, moved) = at_even, at_rest
@@ -261,11 +303,18 @@ def _linear(
     at = rest[kept]
     kind[at], row[at] = UNEVEN, np.arange(len(at))
     pulls = metres[:, :, None] * moved[:, kept]
-    by_each = np.copysign(np.sqrt((pulls**2).sum(axis=0)), pulls.sum(axis=0)) * by_path[at, None] / f4(step_m)
+    by_each = (
+        np.copysign(np.sqrt((pulls**2).sum(axis=0)), pulls.sum(axis=0))
+        * by_path[at, None]
+        / f4(step_m)
+    )
     by_each /= windows_of(noise.reshape(imager.region.shape), side, 1.0, at)
     taps = space[side // 2] / np.sqrt(space[side // 2, side // 2])
     rim = (10 * ((side + 4) // 10) + 5 - side) // 2
-    taps, by_each = np.pad(taps, rim), np.pad(by_each.reshape(-1, side, side), ((0, 0), (rim, rim), (rim, rim)))
+    taps, by_each = (
+        np.pad(taps, rim),
+        np.pad(by_each.reshape(-1, side, side), ((0, 0), (rim, rim), (rim, rim))),
+    )
     by_each = by_each.reshape(-1, taps.size**2)
     base = np.round(z)
     return Linear(kind, noise, base, z - base, by_path, each, more, row, by_each, taps)
@@ -294,12 +343,20 @@ class AtOnce:
     @cached_property
     def noise_m(self) -> float:
         """Median deviation of a frame's z over the sure pixels, before rounding, without noise shared by a frame."""
-        return float(np.median(self.certain.deviation_m[self.certain.always])) if self.sure_pixels else 0.0
+        return (
+            float(np.median(self.certain.deviation_m[self.certain.always]))
+            if self.sure_pixels
+            else 0.0
+        )
 
     @cached_property
     def z_by_error(self) -> float:
         """Change of z per displacement of a frame: the median over the sure pixels."""
-        return float(np.median(self.certain.z_by_path[self.certain.always])) if self.sure_pixels else 1.0
+        return (
+            float(np.median(self.certain.z_by_path[self.certain.always]))
+            if self.sure_pixels
+            else 1.0
+        )
 
     @cached_property
     def listed(self) -> np.ndarray:
@@ -310,10 +367,15 @@ class AtOnce:
     def _engine(self) -> ranging.DepthEngine:
         """The engine of the listed pixels, repeated for each lane."""
         engine, at = self.imager.engine, np.repeat(self.list.range, LANES)
-        return engine._replace(geometry=engine.geometry.take(at, axis=1), outside_mask=engine.outside_mask[at])
+        return engine._replace(
+            geometry=engine.geometry.take(at, axis=1), outside_mask=engine.outside_mask[at]
+        )
 
     def totals(
-        self, parts: Sequence[np.ndarray], errors_m: np.ndarray, stream: Callable[[int], np.random.Generator]
+        self,
+        parts: Sequence[np.ndarray],
+        errors_m: np.ndarray,
+        stream: Callable[[int], np.random.Generator],
     ) -> Sequence[FrameTotals]:
         """Return the sums over the first of ``parts``, over the first two, and so on: each has numbers of frames (t,),
         no number twice. ``errors_m``: displacements by number. The noise of frames `LANES` k to `LANES` (k + 1) - 1
@@ -321,7 +383,11 @@ class AtOnce:
         n, p, k = self.linear.z.size, len(self.listed), len(parts)
         shape, step_m = self.shape, self.imager.camera.z_step_m
         total, squares, sway = np.zeros((k, n)), np.zeros((k, n)), np.zeros((k, n), f4)
-        sums = (np.zeros((k, p), np.int32), *np.zeros((3, k, p)), np.zeros((k, N_REASONS, p), np.uint16))
+        sums = (
+            np.zeros((k, p), np.int32),
+            *np.zeros((3, k, p)),
+            np.zeros((k, N_REASONS, p), np.uint16),
+        )
         given_at = np.full(n, -1, np.int32)
         given_at[self.list.halo] = np.arange(len(self.list.halo))
         blocks = 1 + max(int(frames.max(initial=0)) for frames in parts) // LANES
@@ -335,7 +401,9 @@ class AtOnce:
             draw = rng.bit_generator.random_raw
             words, signs = draw(n * LANES // 8).view(np.int8), draw(n)
             steps = errors[lanes] / f4(step_m)
-            add_linear_frames(shape, self.linear, words, given, given_at, steps, counted, total, squares)
+            add_linear_frames(
+                shape, self.linear, words, given, given_at, steps, counted, total, squares
+            )
             for part, there in zip(sway, counted, strict=True):
                 # the amplitude's noise in each frame is one deviation up or down
                 bits = np.uint64(sum(1 << lane for lane in np.flatnonzero(there).tolist()))
@@ -348,7 +416,12 @@ class AtOnce:
         return [self._finished(*each) for each in zip(frames_in, *running, strict=True)]
 
     def _finished(
-        self, frames: int, total: np.ndarray, squares: np.ndarray, sway: np.ndarray, *sums: np.ndarray
+        self,
+        frames: int,
+        total: np.ndarray,
+        squares: np.ndarray,
+        sway: np.ndarray,
+        *sums: np.ndarray,
     ) -> FrameTotals:
         """Return the sums over ``frames`` frames from those of the linear and of the listed pixels."""
         certain, taps, shape = self.certain, self.linear.taps, self.shape
@@ -378,23 +451,43 @@ class AtOnce:
         words, noise = words.reshape(g, n_frequencies, LANES), np.empty((g, LANES), f4)
         planes = np.empty((g // kernels.BESIDE + 2, n_frequencies, 3, kernels.STRIDE), f4)
         kernels.noisy_phasors(*light[:2], *light[3:], self.shares, words, planes, noise)
-        filtered, edge = np.empty((n_frequencies, 3, m, LANES), f4), np.empty((n_frequencies, m, LANES), f4)
+        filtered, edge = (
+            np.empty((n_frequencies, 3, m, LANES), f4),
+            np.empty((n_frequencies, m, LANES), f4),
+        )
         kernels.filter_listed(planes, self.list.window, self.imager.filter_settings, filtered, edge)
         flat, unsaturated = filtered.reshape(n_frequencies, 3, -1), np.zeros(m * LANES, np.uint8)
         errors = np.tile(errors_m, m)
-        ranges = ranging.ranges_of(flat, edge.reshape(n_frequencies, -1), unsaturated, self._engine, errors)
+        ranges = ranging.ranges_of(
+            flat, edge.reshape(n_frequencies, -1), unsaturated, self._engine, errors
+        )
         z_m, reason, total = (plane.reshape(m, LANES) for plane in ranges)
         flying = np.zeros((len(wanted), LANES), bool)
         if flying_gate is not None:
             ranging.find_flying(z_m, total, reason, wanted, self.list.near, flying_gate, flying)
         base, step_m = self.linear.base[self.listed], f4(self.imager.camera.z_step_m)
-        _add_listed(z_m, reason, total, flying, wanted, part_of, 1.0 / n_frequencies, step_m, base, *sums)
+        _add_listed(
+            z_m, reason, total, flying, wanted, part_of, 1.0 / n_frequencies, step_m, base, *sums
+        )
         return noise
 
 
 @numba.njit(**FAST)
 def _add_listed(  # type: ignore[no-untyped-def]
-    z_m, reason, strength, flying, wanted, part_of, share, step_m, base, count, total, squares, amplitude, reasons
+    z_m,
+    reason,
+    strength,
+    flying,
+    wanted,
+    part_of,
+    share,
+    step_m,
+    base,
+    count,
+    total,
+    squares,
+    amplitude,
+    reasons,
 ):
     """Add the frames of listed pixels to sums (k, p) and ``reasons`` (k, r, p), each to its part; -1: not counted."""
     for p in range(wanted.size):

@@ -18,8 +18,13 @@ from scenes.sensor.amcw.linear import DEVIATIONS, Filtered, Light, linearised, u
 from scenes.sensor.normals import FAST
 
 f4 = np.float32
-MOST_LEFT_OUT = 0.025  # most variance not of first order: it is then right to 1 %; beyond, frames are simulated
-MOST_TURNED, MOST_SPREAD = 1e3, 1e9  # in place of an unknown deviation: of a phase in radians, of an amplitude in units
+MOST_LEFT_OUT = (
+    0.025  # most variance not of first order: it is then right to 1 %; beyond, frames are simulated
+)
+MOST_TURNED, MOST_SPREAD = (
+    1e3,
+    1e9,
+)  # in place of an unknown deviation: of a phase in radians, of an amplitude in units
 
 
 class Certainty(NamedTuple):
@@ -38,7 +43,11 @@ class Certainty(NamedTuple):
 
 
 def certainty(
-    filtered: Filtered, engine: ranging.DepthEngine, lost: np.ndarray, shape: tuple[int, int], farthest_error_m: float
+    filtered: Filtered,
+    engine: ranging.DepthEngine,
+    lost: np.ndarray,
+    shape: tuple[int, int],
+    farthest_error_m: float,
 ) -> Certainty:
     """Sort the pixels of a view of ``shape`` whose frames are displaced by at most ``farthest_error_m``."""
     gates, lattice, amplitude = engine.gates, engine.lattice, filtered.amplitude
@@ -49,7 +58,9 @@ def certainty(
     # the engine on the mean phasors, and the change of z by half a path: the range is that at which range and distance
     # to the emitter come to twice as much
     planes = np.stack([filtered.phasor.real, filtered.phasor.imag, amplitude], axis=1)
-    mean_m, reason, _ = ranging.ranges_of(planes, filtered.edge_least, lost.astype(np.uint8), engine, np.zeros(n))
+    mean_m, reason, _ = ranging.ranges_of(
+        planes, filtered.edge_least, lost.astype(np.uint8), engine, np.zeros(n)
+    )
     (along, square, cosine), weights = engine.geometry, lattice.metres_per_turn[:, None]
     range_m = mean_m / cosine
     emitter_m = np.sqrt(range_m * range_m - 2 * range_m * along + square)
@@ -72,7 +83,10 @@ def certainty(
     slack_m = DEVIATIONS * deviation_m + farthest_error_m
     far_m = mean_m if gates.axial > 0 else range_m
     if gates.edge_mean > 0:  # the frequencies' noise is independent
-        steepest = filtered.edge.mean(axis=0) + DEVIATIONS * np.sqrt((filtered.edge_spread**2).sum(axis=0)) / f
+        steepest = (
+            filtered.edge.mean(axis=0)
+            + DEVIATIONS * np.sqrt((filtered.edge_spread**2).sum(axis=0)) / f
+        )
     else:
         steepest = (filtered.edge + DEVIATIONS * filtered.edge_spread).max(axis=0)
 
@@ -101,29 +115,46 @@ def certainty(
     never = unmeasured | (known & unwraps & too_far)
     always = known & unwraps & (at_worst == ranging.VALID) & ~never
     if engine.flying is not None:
-        images = (each.reshape(shape) for each in (mean_m, DEVIATIONS * deviation_m, known, unmeasured))
+        images = (
+            each.reshape(shape) for each in (mean_m, DEVIATIONS * deviation_m, known, unmeasured)
+        )
         always &= ~_may_fly(engine.flying, *images)
     of_amplitude = np.sqrt((spread**2).sum(axis=0)) / f
-    return Certainty(always, never, mean_m, by_path, deviation_m, amplitude.mean(axis=0), of_amplitude, reason)
+    return Certainty(
+        always, never, mean_m, by_path, deviation_m, amplitude.mean(axis=0), of_amplitude, reason
+    )
 
 
 def _edge_fails(filtered: Filtered, gates: ranging.Gates) -> np.ndarray:
     """Find pixels whose edge sum, in one frequency or in the mean of all, always exceeds the limit."""
-    limit, least, loose = float(gates.edge), filtered.edge_least, np.maximum(filtered.edge_loose, 1e-9)
+    limit, least, loose = (
+        float(gates.edge),
+        filtered.edge_least,
+        np.maximum(filtered.edge_loose, 1e-9),
+    )
     if np.isinf(limit):
         return np.zeros(least.shape[1], bool)
     if gates.edge_mean > 0:
-        return np.asarray(least.sum(axis=0) - DEVIATIONS * np.sqrt((loose**2).sum(axis=0)) > limit * len(least))
+        return np.asarray(
+            least.sum(axis=0) - DEVIATIONS * np.sqrt((loose**2).sum(axis=0)) > limit * len(least)
+        )
     return np.asarray((np.maximum((least - limit) / loose, 0.0) ** 2).sum(axis=0) > DEVIATIONS**2)
 
 
 def _may_fly(
-    gate: ranging.FlyingGate, z_m: np.ndarray, slack_m: np.ndarray, known: np.ndarray, unmeasured: np.ndarray
+    gate: ranging.FlyingGate,
+    z_m: np.ndarray,
+    slack_m: np.ndarray,
+    known: np.ndarray,
+    unmeasured: np.ndarray,
 ) -> np.ndarray:
     """Find pixels (h, w), flat, that the gate on the finished image may remove in some frame."""
     slack_m, z_m = np.nan_to_num(slack_m), np.nan_to_num(z_m)
     measured = known & ~unmeasured
-    low, high = np.where(measured, z_m - slack_m, np.inf), np.where(measured, z_m + slack_m, -np.inf)
+    low, high = (
+        np.where(measured, z_m - slack_m, np.inf),
+        np.where(measured, z_m + slack_m, -np.inf),
+    )
     square = np.ones((3, 3), np.uint8)
     nearest, farthest = np.asarray(cv2.erode(low, square)), np.asarray(cv2.dilate(high, square))
     wild = (~known & ~unmeasured).astype(int)
@@ -133,7 +164,9 @@ def _may_fly(
 
 
 MOST_EDGE = 0.004  # a window with a smaller edge sum is even: a neighbour 0.13 rad off changes its weight by 3 %
-MOST_UNLIKE = 0.005  # largest difference of c s^2 in a window with even noise: that share of a weight
+MOST_UNLIKE = (
+    0.005  # largest difference of c s^2 in a window with even noise: that share of a weight
+)
 MOST_NOISE = 0.15  # largest phase noise in radians of the table, beyond what `certainty` accepts
 NOISES = np.linspace(0.0, MOST_NOISE, 33)
 
@@ -143,7 +176,10 @@ def _shares_of(window: FilterSettings) -> tuple[np.ndarray, np.ndarray]:
     # windows with one noise each, below one another
     side, k, count = window.space.shape[0], window.space.size, len(NOISES)
     weights = window.space.ravel() / window.space.sum()
-    each, bright = np.repeat(NOISES, k)[None].astype(f4), np.full((1, count * k), 1e3 * max(window.dim, 1.0), f4)
+    each, bright = (
+        np.repeat(NOISES, k)[None].astype(f4),
+        np.full((1, count * k), 1e3 * max(window.dim, 1.0), f4),
+    )
     light = Light(np.ones_like(each, np.complex64), bright, bright, each, each / f4(1e3))
     middles, out = np.arange(count) * k + k // 2, unknown_filtered(1, count * k)
     lost = np.zeros(count * k, bool)
@@ -166,7 +202,10 @@ def even_pixels(
     even = np.asarray(cv2.dilate(unlike.reshape(shape).astype(np.uint8), square)) == 0
     even[:half], even[-half:], even[:, :half], even[:, -half:] = False, False, False, False
     for f, plane in enumerate(window.concentration * light.turn.reshape(-1, *shape) ** 2):
-        even &= np.asarray(cv2.dilate(plane, square)) - np.asarray(cv2.erode(plane, square)) < MOST_UNLIKE
+        even &= (
+            np.asarray(cv2.dilate(plane, square)) - np.asarray(cv2.erode(plane, square))
+            < MOST_UNLIKE
+        )
         even &= edge[f].reshape(shape) < MOST_EDGE
     return even.ravel()
 
@@ -189,21 +228,46 @@ def fill_even(
     taps = window.space[middle] / np.sqrt(window.space[middle, middle])
 
     def summed(values: np.ndarray, taps: np.ndarray) -> np.ndarray:
-        return cv2.sepFilter2D(values.reshape(shape), -1, taps, taps, borderType=cv2.BORDER_CONSTANT).ravel()
+        return cv2.sepFilter2D(
+            values.reshape(shape), -1, taps, taps, borderType=cv2.BORDER_CONSTANT
+        ).ravel()
 
     for f in range(len(edge)):
         ours, theirs = Light(*(part[f] for part in light)), Filtered(*(part[f] for part in out))
         carried = ours.amplitude if window.by_amplitude else np.ones_like(ours.amplitude)
         squares, spreads = (carried * ours.turn) ** 2, (ours.amplitude * ours.swell) ** 2
         sums = summed(carried, taps), summed(squares, taps**2), summed(spreads, taps**2)
-        inputs = at, filtered[f], edge[f], ours, carried, *sums, window.space, tables, window.by_amplitude
+        inputs = (
+            at,
+            filtered[f],
+            edge[f],
+            ours,
+            carried,
+            *sums,
+            window.space,
+            tables,
+            window.by_amplitude,
+        )
         _fill_even(*inputs, theirs, each[f], centre[f])
     return each, centre
 
 
 @numba.njit(**FAST)
 def _fill_even(  # type: ignore[no-untyped-def]
-    at, filtered, edge, light, carried, weights, squares, spreads, space, tables, by_amplitude, out, each, centre
+    at,
+    filtered,
+    edge,
+    light,
+    carried,
+    weights,
+    squares,
+    spreads,
+    space,
+    tables,
+    by_amplitude,
+    out,
+    each,
+    centre,
 ):
     """Do the work of `fill_even` for one frequency; sums over windows are (n,)."""
     middle, kept, whole = space[len(space) // 2, len(space) // 2], space.size - 1, space.sum()
@@ -222,7 +286,9 @@ def _fill_even(  # type: ignore[no-untyped-def]
         centre[m] = np.sqrt(centre2)
         # noise moves the mean towards the centre's own phase, as it does the shares
         alone = complex(filtered[0, i], filtered[1, i])
-        mean = light.phasor[i] * (1 - share) + alone * (share / np.sqrt(alone.real**2 + alone.imag**2))
+        mean = light.phasor[i] * (1 - share) + alone * (
+            share / np.sqrt(alone.real**2 + alone.imag**2)
+        )
         out.phasor[i] = mean / np.sqrt(mean.real**2 + mean.imag**2)
         # noise perpendicular to a mean phasor lengthens it
         out.amplitude[i] = filtered[2, i] * (1 + 0.5 * variance if by_amplitude else 1.0)
@@ -230,5 +296,7 @@ def _fill_even(  # type: ignore[no-untyped-def]
         out.spread[i] = np.sqrt(spreads[i]) / whole
         out.left_out[i] = rest / variance
         out.edge[i] = edge[i] + 0.5 * kept * (1 - np.exp(-own2))
-        out.edge_spread[i] = np.sqrt((kept * 6 / 16 + kept**2 / 8) * own2 * own2 + (1 + kept) * edge[i] * own2)
+        out.edge_spread[i] = np.sqrt(
+            (kept * 6 / 16 + kept**2 / 8) * own2 * own2 + (1 + kept) * edge[i] * own2
+        )
         out.edge_least[i], out.edge_loose[i] = out.edge[i], out.edge_spread[i]

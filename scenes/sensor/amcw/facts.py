@@ -45,7 +45,9 @@ class UnwrapTable(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def unwrap_table(frequencies_hz: tuple[float, ...], fusion: Literal["least_squares", "mean"]) -> UnwrapTable:
+def unwrap_table(
+    frequencies_hz: tuple[float, ...], fusion: Literal["least_squares", "mean"]
+) -> UnwrapTable:
     """Return the table for one to three frequencies. Raises UserError if they have no common base frequency."""
     lattice, base_hz = _integer_ratios(frequencies_hz)
     combination = _orthogonal_rows(lattice)
@@ -58,7 +60,11 @@ def unwrap_table(frequencies_hz: tuple[float, ...], fusion: Literal["least_squar
     table = np.full((np.prod(sizes, dtype=int), lattice.size), -1, np.float32)
     table[(keys + offset) @ strides] = counts
     unambiguous_m = SPEED_OF_LIGHT_AIR / (2 * base_hz)
-    weights = lattice / (lattice**2).sum() if fusion == "least_squares" else np.full(lattice.size, 1 / lattice.sum())
+    weights = (
+        lattice / (lattice**2).sum()
+        if fusion == "least_squares"
+        else np.full(lattice.size, 1 / lattice.sum())
+    )
     return UnwrapTable(
         lattice.astype(np.float32),
         combination.astype(np.float32),
@@ -87,28 +93,49 @@ def _wrap_counts(lattice: np.ndarray, noise_turns: float = 0.03) -> np.ndarray:
     """Return the wrap counts (n, f) that occur within the unambiguous range."""
     distance = (np.arange(0, 1, 1 / (64 * int(lattice.max()))) + 1e-9)[:, None] * lattice
     errors = sorted(
-        product((-noise_turns, 0.0, noise_turns), repeat=lattice.size), key=lambda e: -sum(abs(x) for x in e)
+        product((-noise_turns, 0.0, noise_turns), repeat=lattice.size),
+        key=lambda e: -sum(abs(x) for x in e),
     )
-    wraps = np.concatenate([np.floor(distance + np.array(error)) for error in errors]).astype(np.int64)
+    wraps = np.concatenate([np.floor(distance + np.array(error)) for error in errors]).astype(
+        np.int64
+    )
     return wraps[(wraps >= 0).all(axis=1) & (wraps < lattice).all(axis=1)]
 
 
 def _orthogonal_rows(lattice: np.ndarray, reach: int = 16) -> np.ndarray:
     """Return the shortest independent integer rows t (f - 1, f) with t . m = 0 that distinguish all wrap counts."""
     if lattice.size < 3:
-        return np.array([[-lattice[1], lattice[0]]]) if lattice.size == 2 else np.empty((0, 1), np.int64)
-    rows = [np.array(t) for t in product(range(-reach, reach + 1), repeat=3) if any(t) and np.dot(t, lattice) == 0]
+        return (
+            np.array([[-lattice[1], lattice[0]]])
+            if lattice.size == 2
+            else np.empty((0, 1), np.int64)
+        )
+    rows = [
+        np.array(t)
+        for t in product(range(-reach, reach + 1), repeat=3)
+        if any(t) and np.dot(t, lattice) == 0
+    ]
     rows.sort(key=lambda t: (int((t**2).sum()), tuple(-t)))
     # a pair that spans the whole orthogonal lattice has |t1 x t2| = |m|; a longer cross product would confuse wraps
     for second in rows[1:]:
         if (np.cross(rows[0], second) ** 2).sum() == (lattice**2).sum():
             return np.stack([rows[0], second])
-    raise UserError(f"modulation frequency ratios {lattice.tolist()} cannot be unwrapped within {reach} turns")
+    raise UserError(
+        f"modulation frequency ratios {lattice.tolist()} cannot be unwrapped within {reach} turns"
+    )
 
 
-Contrasts = Annotated[Fact[tuple[float, ...]], checked("above 0 and at most 1", lambda value: 0 < value <= 1)]
-Window = Annotated[Fact[int], checked("an odd number from 1 to 31", lambda value: 0 < value < 32 and value % 2 == 1)]
-Phases = Annotated[Fact[int], checked("3 or more, to tell phase, amplitude and offset apart", lambda value: value >= 3)]
+Contrasts = Annotated[
+    Fact[tuple[float, ...]], checked("above 0 and at most 1", lambda value: 0 < value <= 1)
+]
+Window = Annotated[
+    Fact[int],
+    checked("an odd number from 1 to 31", lambda value: 0 < value < 32 and value % 2 == 1),
+]
+Phases = Annotated[
+    Fact[int],
+    checked("3 or more, to tell phase, amplitude and offset apart", lambda value: value >= 3),
+]
 WIDEST_PX = 2128  # row with the filter's window: `kernels.STRIDE`, repeated here so that declarations compile nothing
 
 
@@ -172,14 +199,18 @@ class ModulationFacts(Config):
     def _one_value_each(self) -> ModulationFacts:
         count = len(self.frequencies_hz.value)
         if not 1 <= count <= 3 or len(set(self.frequencies_hz.value)) != count:
-            raise ValueError(f"there are {count} frequencies_hz; this kind of camera has 1, 2 or 3, all different")
+            raise ValueError(
+                f"there are {count} frequencies_hz; this kind of camera has 1, 2 or 3, all different"
+            )
         for key in ("contrast", "wiggling_residual"):
             if len(getattr(self, key).value) != count:
                 raise ValueError(f"{key} needs one value for each of the {count} frequencies_hz")
         try:
             unwrap_table(self.frequencies_hz.value, "least_squares")
         except UserError as mistake:
-            raise ValueError(f"frequencies_hz: {mistake.message}; legal: {mistake.legal}") from mistake
+            raise ValueError(
+                f"frequencies_hz: {mistake.message}; legal: {mistake.legal}"
+            ) from mistake
         return self
 
 
@@ -287,9 +318,13 @@ class AmcwCamera(CameraFacts):
     def _parts_fit_each_other(self) -> AmcwCamera:
         widest_px = WIDEST_PX - self.engine.window_px.value + 1
         if self.lens.width_px.value > widest_px:
-            raise ValueError(f"lens.width_px is {self.lens.width_px.value}; the model allows at most {widest_px}")
+            raise ValueError(
+                f"lens.width_px is {self.lens.width_px.value}; the model allows at most {widest_px}"
+            )
         if len(self.engine.amplitude_gains.value) != len(self.frequencies_hz):
-            raise ValueError("engine.amplitude_gains needs one value for each of modulation.frequencies_hz")
+            raise ValueError(
+                "engine.amplitude_gains needs one value for each of modulation.frequencies_hz"
+            )
         return self
 
     @property
@@ -304,7 +339,9 @@ class AmcwCamera(CameraFacts):
         return self.optics_with(
             **self.emitter.optics(),
             frequencies_hz=self.frequencies_hz,
-            margin_px=self.engine.window_px.value // 2 + (1 if self.engine.flying_pixels else 0) + blur_px,
+            margin_px=self.engine.window_px.value // 2
+            + (1 if self.engine.flying_pixels else 0)
+            + blur_px,
             farthest_m=self.engine.max_range_mm.value * MM,
             limits_along=self.engine.limits_along.value,
         )

@@ -67,7 +67,11 @@ def scattered(image: np.ndarray, facts: ScatterFacts) -> np.ndarray:
     share = facts.stray_share.value
 
     def spread(light: np.ndarray, sigma_px: float) -> np.ndarray:
-        return ndimage.gaussian_filter(light, sigma_px, mode="nearest", axes=(-2, -1)) if sigma_px > 0 else light
+        return (
+            ndimage.gaussian_filter(light, sigma_px, mode="nearest", axes=(-2, -1))
+            if sigma_px > 0
+            else light
+        )
 
     sharp = spread(image, facts.blur_px.value)
     return (1 - share) * sharp + share * spread(image, facts.stray_px.value) if share > 0 else sharp
@@ -81,9 +85,14 @@ def pixel_spans(lens: Lens, slopes: np.ndarray) -> np.ndarray:
     above, below = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
     radial = above / below
     # twice the radial factor's derivative by r^2
-    grows = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / below
+    grows = (
+        2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / below
+    )
     # derivatives of u / fx and v / fy by the slopes
-    ux, vy = radial + x * x * grows + 2 * p1 * y + 6 * p2 * x, radial + y * y * grows + 6 * p1 * y + 2 * p2 * x
+    ux, vy = (
+        radial + x * x * grows + 2 * p1 * y + 6 * p2 * x,
+        radial + y * y * grows + 6 * p1 * y + 2 * p2 * x,
+    )
     both = x * y * grows + 2 * p1 * x + 2 * p2 * y
     return np.asarray(1 / np.abs(ux * vy - both**2))
 
@@ -91,9 +100,13 @@ def pixel_spans(lens: Lens, slopes: np.ndarray) -> np.ndarray:
 class AmcwImager(UnitModel[AmcwCamera]):
     """A camera of this kind on a region of its sensor: `expose` once per view, then `frame` for each exposure."""
 
-    def __init__(self, camera: AmcwCamera, config: CameraConfig, region: Region, slopes: np.ndarray) -> None:
+    def __init__(
+        self, camera: AmcwCamera, config: CameraConfig, region: Region, slopes: np.ndarray
+    ) -> None:
         super().__init__(camera, config, region, slopes)
-        phases = 2 * np.pi * np.arange(camera.modulation.phases.value) / camera.modulation.phases.value
+        phases = (
+            2 * np.pi * np.arange(camera.modulation.phases.value) / camera.modulation.phases.value
+        )
         self._waves = np.cos(phases).astype(f4), np.sin(phases).astype(f4)
         self.gains = np.array(camera.engine.amplitude_gains.value, f4)
         self.unwrap = unwrap_table(camera.frequencies_hz, camera.engine.fusion.value)
@@ -113,13 +126,19 @@ class AmcwImager(UnitModel[AmcwCamera]):
     def gathered(self) -> np.ndarray:
         """Light (h, w) that a pixel gathers from a surface of given radiance, relative to the axis: |d slopes / d
         pixel| cos^4. Not modelled: mechanical vignetting, and growth of the pupil with angle."""
-        return pixel_spans(self.camera.nominal_lens, self.slopes) / (1 + (self.slopes**2).sum(axis=-1)) ** 2
+        return (
+            pixel_spans(self.camera.nominal_lens, self.slopes)
+            / (1 + (self.slopes**2).sum(axis=-1)) ** 2
+        )
 
     def pattern_mm(self, rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
         """Draw smooth and pixel-wise range errors, before the filter."""
         facts = self.camera.fixed_pattern
         smooth, pixel = rng.standard_normal((2, *shape), dtype=f4)
-        return facts.smooth_mm.value * smooth_field(smooth, facts.smooth_length_px.value) + facts.pixel_mm.value * pixel
+        return (
+            facts.smooth_mm.value * smooth_field(smooth, facts.smooth_length_px.value)
+            + facts.pixel_mm.value * pixel
+        )
 
     def expose(self, view: NoiseFreeView) -> AmcwExposure:
         """Return the noise-free samples of a view that covers this imager's region."""
@@ -127,22 +146,32 @@ class AmcwImager(UnitModel[AmcwCamera]):
             light, facts = (view.phasor, view.phasor_direct, view.intensity), self.camera.scatter
             phasor, direct, intensity = (scattered(image, facts) for image in light)
             view = replace(view, phasor=phasor, phasor_direct=direct, intensity=intensity)
-        camera, photons, phases = self.camera, self.camera.photons, self.camera.modulation.phases.value
+        camera, photons, phases = (
+            self.camera,
+            self.camera.photons,
+            self.camera.modulation.phases.value,
+        )
         phasor, intensity = light_of(view, self.config.effects)
         electrons = photons.signal_electrons.value * self.gathered
         contrast = np.array(camera.modulation.contrast.value)[:, None, None]
         # range errors that all frames share act as a delay of the light
-        turns = np.array(camera.frequencies_hz)[:, None, None] * (2 * self.static_error_m / SPEED_OF_LIGHT_AIR)
+        turns = np.array(camera.frequencies_hz)[:, None, None] * (
+            2 * self.static_error_m / SPEED_OF_LIGHT_AIR
+        )
         delay = np.empty(phasor.shape, complex)
         delay.real, delay.imag = np.cos(2 * np.pi * turns), np.sin(2 * np.pi * turns)
         signal = phasor * delay * (contrast * electrons)
         if self.config.effects.wiggling:
-            signal = with_harmonics(signal, phases, np.array(camera.modulation.wiggling_residual.value))
+            signal = with_harmonics(
+                signal, phases, np.array(camera.modulation.wiggling_residual.value)
+            )
         both_wells = electrons * intensity + self.ambient_electrons(view, intensity)
         # an exposure that ends early is scaled to the full length, with its noise
         share = 1.0
         if photons.exposure_ends_electrons is not None:
-            share = np.minimum(1.0, photons.exposure_ends_electrons.value / np.maximum(both_wells, 1e-9))
+            share = np.minimum(
+                1.0, photons.exposure_ends_electrons.value / np.maximum(both_wells, 1e-9)
+            )
         variance = both_wells / share + 2 * (photons.read_noise_electrons.value / share) ** 2
         sigma = np.sqrt(variance) if self.config.effects.noise else np.zeros_like(variance)
         # the samples Re(S exp(-2 pi j k / N)) of the demodulated signal S (f, h, w) at N phases
@@ -171,59 +200,87 @@ class AmcwImager(UnitModel[AmcwCamera]):
         if not config.effects.ambient:
             return np.zeros(intensity.shape)
         irradiance = config.ambient_uw_cm2_nm * UW_CM2 * photons.band_nm.value
-        one_metre = photons.signal_electrons.value * irradiance / self.camera.emitter.irradiance_w_m2.value
-        nearest_m = ndimage.minimum_filter(np.where(np.isfinite(view.range_m), view.range_m, np.inf), 3, mode="nearest")
+        one_metre = (
+            photons.signal_electrons.value * irradiance / self.camera.emitter.irradiance_w_m2.value
+        )
+        nearest_m = ndimage.minimum_filter(
+            np.where(np.isfinite(view.range_m), view.range_m, np.inf), 3, mode="nearest"
+        )
         nearest_m = np.where(np.isfinite(nearest_m), nearest_m, 0.0)
         range_m = np.where(view.coverage < 1, nearest_m, np.nan_to_num(view.range_m))
         return np.asarray(one_metre * self.gathered * intensity * range_m**2)
 
-    def frame(self, exposure: AmcwExposure, rng: np.random.Generator, error_m: float = 0.0) -> DecodedFrame:
+    def frame(
+        self, exposure: AmcwExposure, rng: np.random.Generator, error_m: float = 0.0
+    ) -> DecodedFrame:
         """Draw a frame with noise from ``rng`` on the samples, then run the engine. ``error_m`` displaces the frame."""
         unit, amplitude, saturated = self.phasors(exposure, rng)
         return self._decode(*self.filter(unit, amplitude, exposure.shape), saturated, error_m)
 
-    def phasors(self, exposure: AmcwExposure, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def phasors(
+        self, exposure: AmcwExposure, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Draw a noisy reading: unit phasors (2, f, n), amplitudes (f, n) times the gains, saturated (n,) uint8."""
         n_frequencies, _, n = exposure.means.shape
         unit, amplitude = np.empty((2, n_frequencies, n), f4), np.empty((n_frequencies, n), f4)
         saturated = np.empty(n, np.uint8)
-        normals, knee = standard_normals(rng, exposure.means.shape), f4(self.camera.converter.knee_units.value)
-        kernels.expose(*exposure[:3], normals, knee, self.gains, *self._waves, unit, amplitude, saturated)
+        normals, knee = (
+            standard_normals(rng, exposure.means.shape),
+            f4(self.camera.converter.knee_units.value),
+        )
+        kernels.expose(
+            *exposure[:3], normals, knee, self.gains, *self._waves, unit, amplitude, saturated
+        )
         return unit, amplitude, saturated
 
-    def filter(self, unit: np.ndarray, amplitude: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    def filter(
+        self, unit: np.ndarray, amplitude: np.ndarray, shape: tuple[int, int]
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Apply the engine's joint bilateral filter: (f, 3, h, w), and edge sums (f, h, w)."""
-        filtered, edge = np.empty((len(amplitude), 3, *shape), f4), np.empty((len(amplitude), *shape), f4)
+        filtered, edge = (
+            np.empty((len(amplitude), 3, *shape), f4),
+            np.empty((len(amplitude), *shape), f4),
+        )
         for f in range(len(amplitude)):
             planes, strength = unit[:, f].reshape(2, *shape), amplitude[f].reshape(shape)
             kernels.filter_image(planes, strength, self.filter_settings, filtered[f], edge[f])
         return filtered, edge
 
-    def _decode(self, filtered: np.ndarray, edge: np.ndarray, saturated: np.ndarray, error_m: float) -> DecodedFrame:
+    def _decode(
+        self, filtered: np.ndarray, edge: np.ndarray, saturated: np.ndarray, error_m: float
+    ) -> DecodedFrame:
         """Unwrap, correct, gate and round: the remaining steps of the depth engine."""
         (n_frequencies, _, *shape), n, engine = filtered.shape, saturated.size, self.engine
         filtered, edge = filtered.reshape(n_frequencies, 3, -1), edge.reshape(n_frequencies, -1)
-        z_m, reason, total = ranging.ranges_of(filtered, edge, saturated, engine, np.full(n, error_m))
+        z_m, reason, total = ranging.ranges_of(
+            filtered, edge, saturated, engine, np.full(n, error_m)
+        )
         if engine.flying:
             flying = np.empty((n, 1), bool)
             planes = (plane[:, None] for plane in (z_m, total, reason))
             ranging.find_flying(*planes, np.arange(n), self._near, engine.flying, flying)
             reason[flying[:, 0]] = ranging.EDGE
         ranging.round_valid(z_m, reason, f4(self.camera.z_step_m))
-        return DecodedFrame(z_m.reshape(shape), reason.reshape(shape), total.reshape(shape) / f4(n_frequencies))
+        return DecodedFrame(
+            z_m.reshape(shape), reason.reshape(shape), total.reshape(shape) / f4(n_frequencies)
+        )
 
     @cached_property
     def _near(self) -> np.ndarray:
         """Return (n, 9) int32: each pixel's neighbours and itself, -1 beyond the region's border."""
         h, w = self.region.shape
-        return np.ascontiguousarray(windows_of(np.arange(h * w, dtype=np.int32).reshape(h, w), 3, -1, np.arange(h * w)))
+        return np.ascontiguousarray(
+            windows_of(np.arange(h * w, dtype=np.int32).reshape(h, w), 3, -1, np.arange(h * w))
+        )
 
     @cached_property
     def filter_settings(self) -> kernels.FilterSettings:
         """The filter's settings in float32."""
         engine = self.camera.engine
         half, sigma_px = engine.window_px.value // 2, engine.spatial_sigma_px
-        across = np.exp(-(np.arange(-half, half + 1) ** 2) / (2 * sigma_px.value**2 if sigma_px else np.inf))
+        across = np.exp(
+            -(np.arange(-half, half + 1) ** 2) / (2 * sigma_px.value**2 if sigma_px else np.inf)
+        )
         space = np.outer(across, across).astype(f4)
         limits = f4(engine.concentration.value), f4(engine.dim_amplitude_units.value)
         by_amplitude = engine.filter_on.value == "phasors"
@@ -235,8 +292,16 @@ class AmcwImager(UnitModel[AmcwCamera]):
         """The engine's steps after the filter."""
         facts, emitter = self.camera.engine, self.camera.optics.emitter_m
         along, cosine = rays_of(self.slopes, emitter)
-        geometry = np.stack([along, np.full_like(along, emitter @ emitter), cosine]).reshape(3, -1).astype(f4)
-        edge, lattice, by_amplitude = facts.edge_threshold, facts.lattice_residual_turns, facts.residual_by_amplitude
+        geometry = (
+            np.stack([along, np.full_like(along, emitter @ emitter), cosine])
+            .reshape(3, -1)
+            .astype(f4)
+        )
+        edge, lattice, by_amplitude = (
+            facts.edge_threshold,
+            facts.lattice_residual_turns,
+            facts.residual_by_amplitude,
+        )
         gates = ranging.Gates(
             edge=f4(edge.value if edge and self.config.edge_gate else np.inf),
             edge_mean=f4(facts.edges_in.value == "mean"),
@@ -255,5 +320,9 @@ class AmcwImager(UnitModel[AmcwCamera]):
         flying = None
         if (fly := facts.flying_pixels) is not None:
             lengths_m = (f4(mm.value * MM) for mm in (fly.near_mm, fly.far_mm, fly.most_mm))
-            flying = ranging.FlyingGate(f4(fly.relative_deviation.value), f4(fly.least_mean_units.value), *lengths_m)
-        return ranging.DepthEngine(geometry, self.outside_mask.reshape(-1), self.unwrap, gates, flying)
+            flying = ranging.FlyingGate(
+                f4(fly.relative_deviation.value), f4(fly.least_mean_units.value), *lengths_m
+            )
+        return ranging.DepthEngine(
+            geometry, self.outside_mask.reshape(-1), self.unwrap, gates, flying
+        )

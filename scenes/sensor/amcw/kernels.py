@@ -12,11 +12,15 @@ f4 = np.float32
 ZERO, HALF, ONE = f4(0), f4(0.5), f4(1)
 C3, C4 = f4(1 / 6), f4(1 / 24)
 SMALLEST, TINY = f4(1e-30), f4(2.0**-40)  # TINY: a concentration so small that all weights are 1
-OUTSIDE = f4(-1)  # amplitude beyond the border and of saturated pixels: below every floor, so always dropped
+OUTSIDE = f4(
+    -1
+)  # amplitude beyond the border and of saturated pixels: below every floor, so always dropped
 
 STRIDE = 2128  # longest padded row of an image; a power of two would share cache lines, up to 4 times as slow
 LANES = 56  # frames of a listed pixel that are drawn together; loops over 8 n frames are vectorised from n = 4 on
-BESIDE = STRIDE // LANES  # listed pixels whose frames stand side by side, like the pixels of one row
+BESIDE = (
+    STRIDE // LANES
+)  # listed pixels whose frames stand side by side, like the pixels of one row
 
 
 @numba.njit(**FAST)
@@ -135,11 +139,22 @@ def _filter_window(planes, centre, starts, space, length, settings, total, filte
     ``space`` (k,), k a multiple of `TOGETHER`. ``total``: room for 5 planes. Writes ``filtered`` (3, length) and
     ``edge`` (length,). Indices are unsigned: the compiler gathers by signed ones."""
     _, concentration, dim, drop_dim, dim_edges, by_amplitude = settings
-    p1, p2, p3, p4 = np.uint64(STRIDE), np.uint64(2 * STRIDE), np.uint64(3 * STRIDE), np.uint64(4 * STRIDE)
+    p1, p2, p3, p4 = (
+        np.uint64(STRIDE),
+        np.uint64(2 * STRIDE),
+        np.uint64(3 * STRIDE),
+        np.uint64(4 * STRIDE),
+    )
     middle, of_bright = np.uint64(centre), max(concentration / f4(16), TINY)
     least_of_bright, edge_of_any = dim if drop_dim else ZERO, ZERO if dim_edges else dim
     for x in range(np.uint64(length)):
-        total[x], total[p1 + x], total[p2 + x], total[p3 + x], total[p4 + x] = ZERO, ZERO, ZERO, ZERO, ZERO
+        total[x], total[p1 + x], total[p2 + x], total[p3 + x], total[p4 + x] = (
+            ZERO,
+            ZERO,
+            ZERO,
+            ZERO,
+            ZERO,
+        )
     for q in range(0, starts.size, TOGETHER):
         s1, s2, s3, s4, s5 = starts[q], starts[q + 1], starts[q + 2], starts[q + 3], starts[q + 4]
         w1, w2, w3, w4, w5 = space[q], space[q + 1], space[q + 2], space[q + 3], space[q + 4]

@@ -21,13 +21,17 @@ from scenes.sensor.normals import FAST
 if TYPE_CHECKING:
     from scenes.sensor.amcw.imager import AmcwExposure
 
-DEVIATIONS = 4.5  # a limit so far away counts as never met: 3e-6 a frame for pixels just that far off
+DEVIATIONS = (
+    4.5  # a limit so far away counts as never met: 3e-6 a frame for pixels just that far off
+)
 NOISY = 0.35  # phase noise in radians above which a pixel's phase is not a normal about its mean
 SMALLEST = 1e-12
 MOST_TURN = 1e3  # limit of the phase noise in radians, which would be too large for float32 where there is no light
 f4 = np.float32
 LEAST, REACH, SQRT_3 = f4(SMALLEST), f4(DEVIATIONS), f4(np.sqrt(3.0))
-ZERO, QUARTER, HALF, ONE, TWO, THREE, FOUR, FIVE, SIX, TEN = (f4(x) for x in (0, 0.25, 0.5, 1, 2, 3, 4, 5, 6, 10))
+ZERO, QUARTER, HALF, ONE, TWO, THREE, FOUR, FIVE, SIX, TEN = (
+    f4(x) for x in (0, 0.25, 0.5, 1, 2, 3, 4, 5, 6, 10)
+)
 
 
 class Light(NamedTuple):
@@ -68,7 +72,8 @@ def unknown_filtered(frequencies: int, n: int) -> Filtered:
 
 LENGTHS = np.linspace(0.0, 15.0, 1501)
 RICE = np.sqrt(np.pi / 2) * (
-    (1 + LENGTHS**2 / 2) * special.ive(0, LENGTHS**2 / 4) + LENGTHS**2 / 2 * special.ive(1, LENGTHS**2 / 4)
+    (1 + LENGTHS**2 / 2) * special.ive(0, LENGTHS**2 / 4)
+    + LENGTHS**2 / 2 * special.ive(1, LENGTHS**2 / 4)
 )
 """Mean length, by Rice, of a vector of `LENGTHS` plus normals of deviation 1 both ways; 1e-5 between them."""
 ABREAST = 32  # pixels that a loop does side by side, in vector registers
@@ -90,11 +95,17 @@ def light_of_samples(exposure: AmcwExposure, knee: float, gains: np.ndarray) -> 
     """Return the light of an exposure. Each sample has its own variance, plus step^2/12 by the converter's rounding."""
     phases = exposure.means.shape[1]
     angle = 2 * np.pi * np.arange(phases)[:, None] / phases
-    cosines, sines, shape = np.cos(angle).astype(f4), np.sin(angle).astype(f4), (len(gains), exposure.sigma.size)
+    cosines, sines, shape = (
+        np.cos(angle).astype(f4),
+        np.sin(angle).astype(f4),
+        (len(gains), exposure.sigma.size),
+    )
     light = Light(np.empty(shape, np.complex64), *(np.empty(shape, f4) for _ in range(4)))
     for f, means in enumerate(exposure.means):
         # the companding converter's step at a sample, in knees: its bits without the mantissa
-        step = np.maximum((np.abs(means / f4(knee)).view(np.uint32) & np.uint32(0x7F800000)).view(f4), ONE)
+        step = np.maximum(
+            (np.abs(means / f4(knee)).view(np.uint32) & np.uint32(0x7F800000)).view(f4), ONE
+        )
         variance = exposure.sigma**2 + step**2 / 12
         # direction and length of the phasor; without light there is no direction: any will do
         re, im = (means * cosines).sum(axis=0), (means * sines).sum(axis=0)
@@ -107,13 +118,22 @@ def light_of_samples(exposure: AmcwExposure, knee: float, gains: np.ndarray) -> 
         light.swell[f] = np.sqrt((variance * (re * cosines + im * sines) ** 2).sum(axis=0)) / size
     light.bright[:] = light.amplitude * np.sqrt(ONE + light.turn**2)
     near = light.swell > 0.1
-    deviation = light.amplitude[near] * np.sqrt((light.turn[near] ** 2 + light.swell[near] ** 2) / 2)
-    light.bright[near] = deviation * np.interp(light.amplitude[near] / np.maximum(deviation, SMALLEST), LENGTHS, RICE)
+    deviation = light.amplitude[near] * np.sqrt(
+        (light.turn[near] ** 2 + light.swell[near] ** 2) / 2
+    )
+    light.bright[near] = deviation * np.interp(
+        light.amplitude[near] / np.maximum(deviation, SMALLEST), LENGTHS, RICE
+    )
     return light
 
 
 def linearised(
-    pixels: np.ndarray, light: Light, window: FilterSettings, shape: tuple[int, int], lost: np.ndarray, out: Filtered
+    pixels: np.ndarray,
+    light: Light,
+    window: FilterSettings,
+    shape: tuple[int, int],
+    lost: np.ndarray,
+    out: Filtered,
 ) -> np.ndarray:
     """Fill ``out`` at the ``pixels`` (m,) of a view of ``shape``. None of them is ``lost`` (n,) bool: always saturated.
     Return (f, m, k) float32: the change of a pixel's phase, in radians, by one deviation of each neighbour's noise."""
@@ -142,7 +162,9 @@ def _linearise(pixels, light, window, shape, lost, out, moved):  # type: ignore[
         _amplitude_of(at, light.phasor, by_amplitude, middle, others, room, sums, out)
         if sums[FIT : FIT + W].max() > ZERO:
             _moves_of(at, light.phasor, by_amplitude, middle, others, room, sums, out)
-            _rest_of(at, by_amplitude, middle, others, room, sums, out, moved[start : start + ABREAST])
+            _rest_of(
+                at, by_amplitude, middle, others, room, sums, out, moved[start : start + ABREAST]
+            )
 
 
 @numba.njit(**FAST)
@@ -204,7 +226,9 @@ def _look_around(window, middle, others, room, sums):  # type: ignore[no-untyped
 def _exp(x):  # type: ignore[no-untyped-def]
     """Return the exponential of -8 <= x <= 0, to 2e-5 of its value: the sixteenth power of a series."""
     t = x * f4(1 / 16)
-    e = ONE + t * (ONE + t * (HALF + t * (f4(1 / 6) + t * (f4(1 / 24) + t * (f4(1 / 120) + t * f4(1 / 720))))))
+    e = ONE + t * (
+        ONE + t * (HALF + t * (f4(1 / 6) + t * (f4(1 / 24) + t * (f4(1 / 120) + t * f4(1 / 720)))))
+    )
     e = e * e
     e = e * e
     e = e * e
@@ -220,8 +244,14 @@ def _edge_of(at, window, middle, others, room, sums, out):  # type: ignore[no-un
     for place in others:
         for x in range(W):
             turn, own = room[place + TURN + x], room[middle + TURN + x]
-            re, im, reach = room[place + BETWEEN + x], room[place + BETWEEN + W + x], REACH * room[place + SWAY + x]
-            counts = (room[place + SIZE + x] > ZERO) & (dim_edges | (room[place + BRIGHT + x] + reach >= dim))
+            re, im, reach = (
+                room[place + BETWEEN + x],
+                room[place + BETWEEN + W + x],
+                REACH * room[place + SWAY + x],
+            )
+            counts = (room[place + SIZE + x] > ZERO) & (
+                dim_edges | (room[place + BRIGHT + x] + reach >= dim)
+            )
             certain = counts & (dim_edges | (room[place + AMPLITUDE + x] - reach > dim))
             one, sure = ONE if counts else ZERO, ONE if certain else ZERO
             turn2, own2 = turn * turn, own * own
@@ -229,7 +259,9 @@ def _edge_of(at, window, middle, others, room, sums, out):  # type: ignore[no-un
             sums[sines + x] += one * HALF * im
             sums[cosines + x] += one * QUARTER * re
             across, along = HALF * im * turn, QUARTER * re
-            sums[variance + x] += one * (across * across + along * along * TWO * turn2 * (turn2 + TWO * own2))
+            sums[variance + x] += one * (
+                across * across + along * along * TWO * turn2 * (turn2 + TWO * own2)
+            )
             sums[doubtful + x] += one - sure
             sums[counted + x] += sure
             # a phase's mean resultant length is concave in 1 / turn, so its slope at 0, sqrt(pi / 8), bounds it
@@ -241,7 +273,11 @@ def _edge_of(at, window, middle, others, room, sums, out):  # type: ignore[no-un
             sums[loose + x] += sure * (QUARTER * turn2 if turn < f4(NOISY) else f4(0.125))
     for x in range(at.size):
         i, own, doubt = at[x], room[middle + TURN + x], sums[doubtful + x]
-        spread = np.sqrt(sums[variance + x] + (sums[sines + x] * own) ** 2 + 2.0 * (sums[cosines + x] * own * own) ** 2)
+        spread = np.sqrt(
+            sums[variance + x]
+            + (sums[sines + x] * own) ** 2
+            + 2.0 * (sums[cosines + x] * own * own) ** 2
+        )
         # ``edge`` and its deviation are right if no neighbour counts, or none is too noisy
         known = sums[counted + x] + doubt == 0 or sums[NOISE + x] <= NOISY
         sure = sums[SURE + x] > 0
@@ -253,7 +289,9 @@ def _edge_of(at, window, middle, others, room, sums, out):  # type: ignore[no-un
             # the centre's own noise turns it at most that far or, where that is large, to any angle
             re, im = sums[longest + x], sums[longest + W + x]
             away = max(abs(np.arctan2(im, re)) - DEVIATIONS * own, 0.0) if own < NOISY else 0.0
-            out.edge_least[i] = 0.5 * (sums[counted + x] - np.sqrt(re * re + im * im) * np.cos(away))
+            out.edge_least[i] = 0.5 * (
+                sums[counted + x] - np.sqrt(re * re + im * im) * np.cos(away)
+            )
             out.edge_loose[i] = np.sqrt(sums[loose + x])
         if not sure:
             out.edge_least[i] = 0.0
@@ -287,11 +325,19 @@ def _amplitude_of(at, phasor, by_amplitude, middle, others, room, sums, out):  #
     # noise of phases changes weights and how phasors add up: its variance, times the squared sum of weights
     for place in others:
         for x in range(W):
-            re, im, weight = room[place + BETWEEN + x], room[place + BETWEEN + W + x], room[place + WEIGHT + x]
+            re, im, weight = (
+                room[place + BETWEEN + x],
+                room[place + BETWEEN + W + x],
+                room[place + WEIGHT + x],
+            )
             slope, amplitude = sums[C + x] * im, sums[amplitudes + x]
             if by_amplitude:
-                along = sums[total + W + x] * (re - slope * im) - sums[total + x] * (slope * re + im)
-                change = weight * (room[place + AMPLITUDE + x] * along / sums[size + x] + slope * amplitude)
+                along = sums[total + W + x] * (re - slope * im) - sums[total + x] * (
+                    slope * re + im
+                )
+                change = weight * (
+                    room[place + AMPLITUDE + x] * along / sums[size + x] + slope * amplitude
+                )
             else:
                 change = slope * weight * (amplitude - room[place + BRIGHT + x])
             sums[spread + x] += (change * min(room[place + TURN + x], HALF)) ** 2
@@ -334,13 +380,19 @@ def _turned(c, between, v):  # type: ignore[no-untyped-def]
     g2, half = complex(sine * sine - ONE, -TWO * sine), HALF * v
     second = g2 - cosine
     third = g * (g2 - THREE * cosine) + sine
-    fourth = g2 * (g2 - SIX * cosine) + complex(cosine * (THREE * cosine + ONE) - FOUR * sine * sine, FOUR * sine)
+    fourth = g2 * (g2 - SIX * cosine) + complex(
+        cosine * (THREE * cosine + ONE) - FOUR * sine * sine, FOUR * sine
+    )
     fifth = g * (g2 * (g2 - TEN * cosine) + FIVE * cosine * (THREE * cosine + ONE))
     fifth += complex(TEN * sine * (g2.real - cosine) - sine, -TEN * TWO * sine * sine)
     e = _exp(cosine - c)
     value = complex(e * between.real, e * between.imag)
     mean = ONE + half * (second + HALF * half * fourth)
-    return value * mean, value * (g + half * (third + HALF * half * fifth)), value * (second + half * fourth)
+    return (
+        value * mean,
+        value * (g + half * (third + HALF * half * fifth)),
+        value * (second + half * fourth),
+    )
 
 
 @numba.njit(**FAST)
@@ -352,44 +404,70 @@ def _moves_of(at, phasor, by_amplitude, middle, others, room, sums, out):  # typ
         for q in range(others.size + 1):
             place = np.uint64(q) * FIELDS
             for x in range(W):
-                room[place + SIZE + x] *= room[place + AMPLITUDE + x] * (ONE + HALF * room[place + TURN + x] ** 2)
+                room[place + SIZE + x] *= room[place + AMPLITUDE + x] * (
+                    ONE + HALF * room[place + TURN + x] ** 2
+                )
     sums[mean : mean + W + W] = ZERO
     for number in range(3):
         # without the centre's noise, then sqrt(3) deviations of it either way
         share = f4(1 / 6) if number else f4(2 / 3)
         for x in range(W):
             away = SQRT_3 * room[middle + TURN + x]
-            turn = _at(sums, node + x).conjugate() if number == 2 else complex(np.cos(away), np.sin(away))
+            turn = (
+                _at(sums, node + x).conjugate()
+                if number == 2
+                else complex(np.cos(away), np.sin(away))
+            )
             _put(sums, node + x, turn if number else complex(ONE, ZERO))
             _put(sums, total + x, complex(room[middle + SIZE + x], ZERO))
         sums[squares : squares + W + W] = ZERO
         for place in others:
             for x in range(W):
                 turn, size = room[place + TURN + x], room[place + SIZE + x]
-                between = _at(room, place + BETWEEN + x) * complex(sums[node + x], -sums[node + W + x])
+                between = _at(room, place + BETWEEN + x) * complex(
+                    sums[node + x], -sums[node + W + x]
+                )
                 value, slope, bend = _turned(sums[C + x], between, turn * turn)
                 sums[total + x] += size * value.real
                 sums[total + W + x] += size * value.imag
-                room[place + SLOPE + x], room[place + SLOPE + W + x] = size * slope.real, size * slope.imag
-                room[place + BEND + x], room[place + BEND + W + x] = size * bend.real, size * bend.imag
+                room[place + SLOPE + x], room[place + SLOPE + W + x] = (
+                    size * slope.real,
+                    size * slope.imag,
+                )
+                room[place + BEND + x], room[place + BEND + W + x] = (
+                    size * bend.real,
+                    size * bend.imag,
+                )
         for x in range(W):
             _put(sums, inverse + x, _inverse(_at(sums, total + x)))
         for place in others:
             for x in range(W):
-                slope, turn2 = _at(room, place + SLOPE + x) * _at(sums, inverse + x), room[place + TURN + x] ** 2
+                slope, turn2 = (
+                    _at(room, place + SLOPE + x) * _at(sums, inverse + x),
+                    room[place + TURN + x] ** 2,
+                )
                 _put(room, place + SLOPE + x, slope)
                 sums[squares + x] += turn2 * (slope.real * slope.real - slope.imag * slope.imag)
                 sums[squares + W + x] += turn2 * TWO * slope.real * slope.imag
         for place in others:
             for x in range(W):
                 # E[d arg S], with S and its derivative moving together: d^3 ln S has 2 S'^3 / S^3 and -3 S' S'' / S^2
-                bend, turn2 = _at(room, place + BEND + x) * _at(sums, inverse + x), room[place + TURN + x] ** 2
-                more = complex(ONE + sums[squares + x] - turn2 * bend.real, sums[squares + W + x] - turn2 * bend.imag)
+                bend, turn2 = (
+                    _at(room, place + BEND + x) * _at(sums, inverse + x),
+                    room[place + TURN + x] ** 2,
+                )
+                more = complex(
+                    ONE + sums[squares + x] - turn2 * bend.real,
+                    sums[squares + W + x] - turn2 * bend.imag,
+                )
                 room[place + MOVED + x] += share * (_at(room, place + SLOPE + x) * more).imag
         for x in range(W):
             # E[arg S] = arg E[S] - Im(E[dS^2] / S^2) / 2
             whole, less = _at(sums, total + x), complex(ONE, -HALF * sums[squares + W + x])
-            size, turned = share / max(np.sqrt(_power(whole)), LEAST), whole * less * _at(sums, node + x)
+            size, turned = (
+                share / max(np.sqrt(_power(whole)), LEAST),
+                whole * less * _at(sums, node + x),
+            )
             sums[mean + x] += size * turned.real
             sums[mean + W + x] += size * turned.imag
     for x in range(at.size):
@@ -418,10 +496,15 @@ def _rest_of(at, by_amplitude, middle, others, room, sums, out, moved):  # type:
             c, turn2, own2 = sums[C + x], room[place + TURN + x] ** 2, room[middle + TURN + x] ** 2
             cosine, s = c * room[place + BETWEEN + x], c * room[place + BETWEEN + W + x]
             here = _at(room, place + BETWEEN + x) * _at(sums, inverse + x)
-            longer, weight = room[place + AMPLITUDE + x] if by_amplitude else ONE, room[place + WEIGHT + x]
+            longer, weight = (
+                room[place + AMPLITUDE + x] if by_amplitude else ONE,
+                room[place + WEIGHT + x],
+            )
             size, ss = weight * longer, s * s
             bend = size * (here.imag * (ss - ONE - cosine) - here.real * TWO * s)
-            third = here.real * (THREE * (ss - cosine) - ONE) + here.imag * s * (FOUR + THREE * cosine - ss)
+            third = here.real * (THREE * (ss - cosine) - ONE) + here.imag * s * (
+                FOUR + THREE * cosine - ss
+            )
             sums[bends + x] += bend
             higher = (size * third) ** 2 * f4(1 / 6) * turn2 * (turn2 + THREE * own2)
             sums[rest + x] += turn2 * (bend * bend * (HALF * turn2 + own2) + higher)

@@ -17,7 +17,9 @@ ATAN = tuple(map(f4, (-0.0040540580, 0.0218612288, -0.0559098861, 0.0964200441))
 ATAN += tuple(map(f4, (-0.1390853351, 0.1994653599, -0.3332985605, 0.9999993329)))
 """Minimax odd polynomial of the arctangent on 0..1, highest power first (Remez, |error| < 1.2e-7 rad)."""
 BLOCK = 1024
-VALID, SATURATED, OUTSIDE_MASK = map(np.int32, (Reason.VALID, Reason.SATURATED, Reason.OUTSIDE_MASK))
+VALID, SATURATED, OUTSIDE_MASK = map(
+    np.int32, (Reason.VALID, Reason.SATURATED, Reason.OUTSIDE_MASK)
+)
 LOW_AMPLITUDE, LOW_REFLECTIVITY = map(np.int32, (Reason.LOW_AMPLITUDE, Reason.LOW_REFLECTIVITY))
 AMPLITUDE_RATIO, UNWRAP = map(np.int32, (Reason.AMPLITUDE_RATIO, Reason.UNWRAP))
 EDGE, OUT_OF_RANGE = map(np.int32, (Reason.EDGE, Reason.OUT_OF_RANGE))
@@ -97,7 +99,9 @@ def _add_scaled(scale: np.float32, plane: np.ndarray, total: np.ndarray) -> None
 
 
 @numba.njit(**FAST)
-def half_path(turn: np.ndarray, n: int, lattice: UnwrapTable, half: np.ndarray, residual2: np.ndarray) -> None:
+def half_path(
+    turn: np.ndarray, n: int, lattice: UnwrapTable, half: np.ndarray, residual2: np.ndarray
+) -> None:
     """Convert wrapped phases (f, >= n) in turns, unwrapped in place, to half the light's path (n,) in metres, with the
     squared lattice residual (n,) in turns^2, infinite if no wrap counts fit."""
     n_frequencies = turn.shape[0]
@@ -186,7 +190,11 @@ def first_failed_each(gates, at):  # type: ignore[no-untyped-def]
 
 
 def ranges_of(
-    filtered: np.ndarray, edge: np.ndarray, saturated: np.ndarray, engine: DepthEngine, errors_m: np.ndarray
+    filtered: np.ndarray,
+    edge: np.ndarray,
+    saturated: np.ndarray,
+    engine: DepthEngine,
+    errors_m: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Convert filtered phasors (f, 3, n) and edge sums (f, n) to z in metres (of invalid pixels too), the first gate
     that each pixel fails, and the sum of amplitudes, (n,) each. ``errors_m`` (n,) is added to half the path."""
@@ -225,7 +233,21 @@ def _range_and_gates(  # type: ignore[no-untyped-def]
         _reasons(block[CODE, :length], saturated[these], outside_mask[these], reason[these])
 
 
-AMPLITUDE, GAP, LEAST, GREATEST, TOTAL, STEEPEST, STEPS, HALF_PATH, RESIDUAL, ERROR, ALONG, EMITTER, COSINE = range(13)
+(
+    AMPLITUDE,
+    GAP,
+    LEAST,
+    GREATEST,
+    TOTAL,
+    STEEPEST,
+    STEPS,
+    HALF_PATH,
+    RESIDUAL,
+    ERROR,
+    ALONG,
+    EMITTER,
+    COSINE,
+) = range(13)
 LIMIT, RANGE, CODE = 13, 14, 15
 """Rows of a block: the first two of a frequency, five of all frequencies; the two before the last of `DepthEngine`."""
 
@@ -235,7 +257,11 @@ def _fold(block, first):  # type: ignore[no-untyped-def]
     """Take another frequency's amplitude and edge sum into the extremes and sums over the frequencies."""
     for i in range(np.uint64(BLOCK)):
         a, e = block[AMPLITUDE * BLOCK + i], block[GAP * BLOCK + i]
-        least, greatest, steepest = block[LEAST * BLOCK + i], block[GREATEST * BLOCK + i], block[STEEPEST * BLOCK + i]
+        least, greatest, steepest = (
+            block[LEAST * BLOCK + i],
+            block[GREATEST * BLOCK + i],
+            block[STEEPEST * BLOCK + i],
+        )
         block[LEAST * BLOCK + i] = a if first or a < least else least
         block[GREATEST * BLOCK + i] = a if first or a > greatest else greatest
         block[STEEPEST * BLOCK + i] = e if first or e > steepest else steepest
@@ -254,7 +280,11 @@ def _judge(block, gates, n_frequencies):  # type: ignore[no-untyped-def]
         range_m = (FOUR * path * path - block[EMITTER * BLOCK + i]) / ratio
         z = range_m * block[COSINE * BLOCK + i]
         limited = z if gates.axial > f4(0) else range_m
-        least, greatest, total = block[LEAST * BLOCK + i], block[GREATEST * BLOCK + i], block[TOTAL * BLOCK + i]
+        least, greatest, total = (
+            block[LEAST * BLOCK + i],
+            block[GREATEST * BLOCK + i],
+            block[TOTAL * BLOCK + i],
+        )
         r2 = block[RESIDUAL * BLOCK + i]
         at = GateInputs(edge, least, greatest, total, r2, greatest, range_m, limited, limited)
         block[CODE * BLOCK + i] = f4(first_failed(gates, block[LIMIT * BLOCK + i], at))
@@ -295,7 +325,9 @@ def find_flying(z_m, total, reason, pixels, near, gate, flying):  # type: ignore
             if between and max(z - nearest, farthest - z) > gate.most_m:
                 sample = window[:size]
                 # amplitudes scatter by at least the gate's share of their mean
-                flying[p, t] = sample.std() >= gate.relative_deviation * max(sample.mean(), gate.least_mean)
+                flying[p, t] = sample.std() >= gate.relative_deviation * max(
+                    sample.mean(), gate.least_mean
+                )
 
 
 @numba.njit(**FAST)

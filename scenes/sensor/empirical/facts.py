@@ -11,10 +11,21 @@ from pydantic import model_validator
 from harness.vocabulary.config import Config
 from harness.vocabulary.geometry import MM
 from scenes.optics import Optics
-from scenes.sensor.facts import CameraFacts, Fact, LimitFacts, NonNegative, Positive, PositiveEach, ShareEach, checked
+from scenes.sensor.facts import (
+    CameraFacts,
+    Fact,
+    LimitFacts,
+    NonNegative,
+    Positive,
+    PositiveEach,
+    ShareEach,
+    checked,
+)
 
 CARRIER_HZ = 1e6  # its phase gives a pixel's mean distance, unambiguous up to 150 m; complex64 rounds by 2 um
-BLUR_REACH = 3.0  # margin of a region in deviations of the edge's kernel: 0.3 % of the kernel lies beyond
+BLUR_REACH = (
+    3.0  # margin of a region in deviations of the edge's kernel: 0.3 % of the kernel lies beyond
+)
 
 Taps = Fact[tuple[float, ...]]  # taps of a causal filter; their squares sum to 1
 
@@ -77,10 +88,15 @@ class EmpiricalCamera(CameraFacts):
 
     @model_validator(mode="after")
     def _possible(self) -> EmpiricalCamera:
-        for section, key, other in (("noise", "range_mm", "sigma_mm"), ("dropouts", "amplitude", "share")):
+        for section, key, other in (
+            ("noise", "range_mm", "sigma_mm"),
+            ("dropouts", "amplitude", "share"),
+        ):
             levels, values = (getattr(getattr(self, section), name).value for name in (key, other))
             if not levels or len(levels) != len(values) or list(levels) != sorted(set(levels)):
-                raise ValueError(f"{section}.{key} must increase, and {section}.{other} needs a value for each of them")
+                raise ValueError(
+                    f"{section}.{key} must increase, and {section}.{other} needs a value for each of them"
+                )
         return self
 
     @cached_property

@@ -24,13 +24,19 @@ from scenes.sensor.facts import (
 )
 
 SMOOTHING_REACH = 2.5  # deviations at which the smoothing's weights end: 0.04 of the central weight
-NS, MRAD, MW = 1e-9, 1e-3, 1e-3  # seconds in a nanosecond, radians in a milliradian, watts in a milliwatt
+NS, MRAD, MW = (
+    1e-9,
+    1e-3,
+    1e-3,
+)  # seconds in a nanosecond, radians in a milliradian, watts in a milliwatt
 
 
 class BeamFacts(Config):
     """The beam at rest: round, Gaussian in angle. ``power_mw``: mean over the code, a reference for ambient light."""
 
-    fwhm_mrad: Annotated[Fact[float], checked("above 0 and at most 20 milliradians", lambda value: 0 < value <= 20)]
+    fwhm_mrad: Annotated[
+        Fact[float], checked("above 0 and at most 20 milliradians", lambda value: 0 < value <= 20)
+    ]
     power_mw: Positive
 
 
@@ -74,7 +80,9 @@ class LidarEngineFacts(OutputFacts):
     neighbours along columns, then along rows; 0: none. ``agree_deviations``: largest difference of a neighbour's half
     path. ``least_agreeing``: share of the weights that must agree. ``confidence_electrons``: least strength."""
 
-    smoothing_px: Annotated[Fact[tuple[float, float]], checked("from 0 to 6 pixels", lambda value: 0 <= value <= 6)]
+    smoothing_px: Annotated[
+        Fact[tuple[float, float]], checked("from 0 to 6 pixels", lambda value: 0 <= value <= 6)
+    ]
     agree_deviations: Positive
     least_agreeing: Share
     confidence_electrons: NonNegative
@@ -84,7 +92,9 @@ class ScannedLidar(CameraFacts):
     """A lidar that sends one beam per pixel, one after another; pixels are directions at the transmitter."""
 
     kind: Literal["scanned_lidar"]
-    receiver: Annotated[ConeFacts, Field(description="the one detector, of the whole field, beside the transmitter")]
+    receiver: Annotated[
+        ConeFacts, Field(description="the one detector, of the whole field, beside the transmitter")
+    ]
     beam: BeamFacts
     scan: ScanFacts
     code: CodeFacts
@@ -99,9 +109,13 @@ class ScannedLidar(CameraFacts):
         if self.integration_points > 3:
             raise ValueError("code.integration_ns may span at most three times scan.point_ns")
         if self.engine.min_range_mm.value * MM >= self.unambiguous_m:
-            raise ValueError("engine.min_range_mm must lie within the range of one period of the code")
+            raise ValueError(
+                "engine.min_range_mm must lie within the range of one period of the code"
+            )
         if len(self.weights) < 3:
-            raise ValueError("code.period_ns must be longer: fewer than three spectral lines are within the band")
+            raise ValueError(
+                "code.period_ns must be longer: fewer than three spectral lines are within the band"
+            )
         return self
 
     @property
@@ -144,7 +158,12 @@ class ScannedLidar(CameraFacts):
         """Return the electrons of an integration from ambient light of that irradiance on the whole field. The field's
         solid angle sends a E / pi times it; the beam of power P sends, from albedo 1 at 1 m, P / pi."""
         irradiance_w_m2 = irradiance_uw_cm2_nm * UW_CM2 * self.photons.band_nm.value
-        by_beam = irradiance_w_m2 * self.photons.room_albedo.value * self.field_sr / (self.beam.power_mw.value * MW)
+        by_beam = (
+            irradiance_w_m2
+            * self.photons.room_albedo.value
+            * self.field_sr
+            / (self.beam.power_mw.value * MW)
+        )
         return self.photons.signal_electrons.value * by_beam
 
     @cached_property

@@ -12,7 +12,9 @@ import numpy as np
 from harness.vocabulary.geometry import Reason
 from scenes.sensor.normals import FAST, IN_DOUBLE
 
-SAMPLES_PER_LINE = 4  # of the correlation per spectral line in a period; two just represent it, four miss no peak
+SAMPLES_PER_LINE = (
+    4  # of the correlation per spectral line in a period; two just represent it, four miss no peak
+)
 NEWTON_STEPS = 4  # from a sample's parabola: three converge to 1e-7 of a sample even where two pulses almost separate
 NO_PEAK = -1e9  # height of a peak that does not exist
 
@@ -74,7 +76,11 @@ def _refined(spectrum: np.ndarray, start: float, spacing: float) -> tuple[float,
 
 @numba.njit(**IN_DOUBLE)
 def _peaks(
-    samples: np.ndarray, spectrum: np.ndarray, delay: np.ndarray, height: np.ndarray, curvature: np.ndarray
+    samples: np.ndarray,
+    spectrum: np.ndarray,
+    delay: np.ndarray,
+    height: np.ndarray,
+    curvature: np.ndarray,
 ) -> None:
     """Find peaks among ``samples`` (n, M) and refine them on ``spectrum`` (n, 2 K); outputs (2, n)."""
     n, m = samples.shape
@@ -102,7 +108,8 @@ def _peaks(
 
 
 VALID, SATURATED, LOW_AMPLITUDE, EDGE, OUT_OF_RANGE = map(
-    np.int32, (Reason.VALID, Reason.SATURATED, Reason.LOW_AMPLITUDE, Reason.EDGE, Reason.OUT_OF_RANGE)
+    np.int32,
+    (Reason.VALID, Reason.SATURATED, Reason.LOW_AMPLITUDE, Reason.EDGE, Reason.OUT_OF_RANGE),
 )
 NOWHERE_M = np.float32(1e9)  # half path beyond the picture's border: it agrees with nothing
 
@@ -146,7 +153,16 @@ def stronger_peak(  # type: ignore[no-untyped-def]
 
 @numba.njit(**FAST)
 def noise_peaks(  # type: ignore[no-untyped-def]
-    weak, noise, averaged, uniforms, rate, bandwidth_m, unambiguous_m, won_m, won_height, won_deviation_m
+    weak,
+    noise,
+    averaged,
+    uniforms,
+    rate,
+    bandwidth_m,
+    unambiguous_m,
+    won_m,
+    won_height,
+    won_deviation_m,
 ):
     """Let the highest maximum of the noise over one period win where it exceeds the return, at flat indices ``weak``.
     Noise crosses a level of x deviations upwards rate * exp(-x^2 / 2) times in a period (Rice); if Poisson, the highest
@@ -180,7 +196,9 @@ def smooth(  # type: ignore[no-untyped-def]
             n, sums[:] = min(CHUNK, w - start), np.float32(0)
             for k in range(-r, r + 1):
                 near = (v + p, q + start + k) if along_rows else (v + p + k, q + start)
-                _add_agreeing(image, gate_m, near, (v + p, q + start), (v, start), n, taps[k + r], sums)
+                _add_agreeing(
+                    image, gate_m, near, (v + p, q + start), (v, start), n, taps[k + r], sums
+                )
             for u in range(n):
                 out_m[v, start + u] = half_m[v + p, q + start + u] + sums[u] / sums[CHUNK + u]
                 out_share[v, start + u] = sums[CHUNK + u]
@@ -195,7 +213,12 @@ def _add_agreeing(image, gate_m, near, own, at, n, tap, sums):  # type: ignore[n
     """Add n neighbours, from the place ``near`` on, of the pixels from ``own`` on, whose gates begin at ``at``. Images
     are passed whole, as a slice costs as much as tens of sums."""
     (half_m, share, height), row, column = image, np.uint64(near[0]), np.uint64(near[1])
-    own_row, own_column, v, start = np.uint64(own[0]), np.uint64(own[1]), np.uint64(at[0]), np.uint64(at[1])
+    own_row, own_column, v, start = (
+        np.uint64(own[0]),
+        np.uint64(own[1]),
+        np.uint64(at[0]),
+        np.uint64(at[1]),
+    )
     for u in range(np.uint64(n)):
         off = half_m[row, column + u] - half_m[own_row, own_column + u]
         counted = tap if abs(off) <= gate_m[v, start + u] else np.float32(0)
@@ -207,7 +230,18 @@ def _add_agreeing(image, gate_m, near, own, at, n, tap, sums):  # type: ignore[n
 
 @numba.njit(**FAST)
 def gated(  # type: ignore[no-untyped-def]
-    half_m, share, height, everyone, along_m, cosine, saturated, limits, error_m, z_m, reason, strength
+    half_m,
+    share,
+    height,
+    everyone,
+    along_m,
+    cosine,
+    saturated,
+    limits,
+    error_m,
+    z_m,
+    reason,
+    strength,
 ):
     """Convert smoothed half paths (h, w) to ranges, with gates and rounding. ``share``, ``height``: weight and strength
     of the neighbours that agree. ``everyone``: weight of all within the picture. Half the path s with a receiver at e
@@ -219,7 +253,9 @@ def gated(  # type: ignore[no-untyped-def]
         for u in range(w):
             support = height[v, u] / everyone[v, u]
             half = half_m[v, u] + error_m
-            range_m = (np.float32(4) * half * half - e2) / (np.float32(4) * half - np.float32(2) * along_m[v, u])
+            range_m = (np.float32(4) * half * half - e2) / (
+                np.float32(4) * half - np.float32(2) * along_m[v, u]
+            )
             code = VALID if (range_m >= nearest) & (range_m <= farthest) else OUT_OF_RANGE
             code = code if share[v, u] >= alike * everyone[v, u] else EDGE
             code = code if support >= least else LOW_AMPLITUDE

@@ -45,7 +45,9 @@ class LidarReturns(NamedTuple):
 class LidarScanner(UnitModel[ScannedLidar]):
     """A camera of this kind on a region of its raster: `expose` once per view, then `frame` for each exposure."""
 
-    def __init__(self, camera: ScannedLidar, config: CameraConfig, region: Region, slopes: np.ndarray) -> None:
+    def __init__(
+        self, camera: ScannedLidar, config: CameraConfig, region: Region, slopes: np.ndarray
+    ) -> None:
         super().__init__(camera, config, region, slopes)
         # weights of the points along a column whose light one point integrates
         self.smear = smear_weights(camera.integration_points)
@@ -53,12 +55,18 @@ class LidarScanner(UnitModel[ScannedLidar]):
         self.slope = camera.bandwidth_rad_s * camera.period_s / (2 * np.pi)
         # electrons of ambient light in one integration, equal for all pixels: one detector sees the whole field
         ambient = config.effects.ambient
-        self.ambient_electrons = camera.ambient_electrons(config.ambient_uw_cm2_nm) if ambient else 0.0
+        self.ambient_electrons = (
+            camera.ambient_electrons(config.ambient_uw_cm2_nm) if ambient else 0.0
+        )
         self._noise_taps = overlap_taps(camera.integration_points).astype(f4)
         # (2, h, w): the receiver's offset along the ray in metres, and the ray's cosine to the axis
         receiver_m, engine = camera.optics.emitter_m, camera.engine
         self._geometry = np.stack(rays_of(slopes, receiver_m)).astype(f4)
-        least = receiver_m @ receiver_m, engine.confidence_electrons.value, engine.least_agreeing.value
+        least = (
+            receiver_m @ receiver_m,
+            engine.confidence_electrons.value,
+            engine.least_agreeing.value,
+        )
         range_m = engine.min_range_mm.value * MM, camera.unambiguous_m, camera.z_step_m
         self._limits = tuple(map(f4, (*least, *range_m)))
 
@@ -76,7 +84,9 @@ class LidarScanner(UnitModel[ScannedLidar]):
     @cached_property
     def gathered(self) -> np.ndarray:
         """Signal electrons (h, w) of a point per unit of the view's light: the receiver's aperture is flat."""
-        return np.asarray(self.camera.photons.signal_electrons.value / np.sqrt(1 + (self.slopes**2).sum(axis=-1)))
+        return np.asarray(
+            self.camera.photons.signal_electrons.value / np.sqrt(1 + (self.slopes**2).sum(axis=-1))
+        )
 
     def expose(self, view: NoiseFreeView) -> LidarReturns:
         """Return the two strongest returns of each beam of a view that covers this region, and their noise."""
@@ -88,22 +98,36 @@ class LidarScanner(UnitModel[ScannedLidar]):
         noise = np.sqrt(shot + photons.amplifier_electrons.value**2)
         height, half_m, deviation_m = self._peaks(phasor, noise)
         full = photons.full_scale_electrons.value if effects.saturation else np.inf
-        weak = height[0] < CERTAIN_DEVIATIONS * self.averaged * noise if effects.noise else np.zeros(noise.shape, bool)
+        weak = (
+            height[0] < CERTAIN_DEVIATIONS * self.averaged * noise
+            if effects.noise
+            else np.zeros(noise.shape, bool)
+        )
         half_m, saturated = half_m + self.static_error_m, electrons + self.ambient_electrons > full
-        height, half_m, deviation_m, noise = (each.astype(f4) for each in (height, half_m, deviation_m, noise))
+        height, half_m, deviation_m, noise = (
+            each.astype(f4) for each in (height, half_m, deviation_m, noise)
+        )
         return LidarReturns(height, half_m, deviation_m, noise, saturated, np.flatnonzero(weak))
 
-    def _peaks(self, phasor: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _peaks(
+        self, phasor: np.ndarray, noise: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return heights in electrons, half paths and their deviations in metres, each (2, h, w)."""
         camera = self.camera
         blocks = (slice(row, row + BLOCK_ROWS) for row in range(0, len(noise), BLOCK_ROWS))
-        found = [strongest_peaks(self._along_sweeps(phasor, rows), camera.weights) for rows in blocks]
+        found = [
+            strongest_peaks(self._along_sweeps(phasor, rows), camera.weights) for rows in blocks
+        ]
         peaks = Peaks(*(np.concatenate(parts, axis=1) for parts in zip(*found, strict=True)))
         with np.errstate(divide="ignore", invalid="ignore"):
             metres_per_radian = camera.unambiguous_m / (2 * np.pi)
             deviation_m = metres_per_radian * self.slope * noise / (peaks.curvature * self.gathered)
         # where two pulses almost separate, the peak is flat; it still lies within their width
-        width_m = camera.unambiguous_m * camera.code.correlation_fwhm_ns.value / camera.code.period_ns.value
+        width_m = (
+            camera.unambiguous_m
+            * camera.code.correlation_fwhm_ns.value
+            / camera.code.period_ns.value
+        )
         deviation_m = np.where(deviation_m >= 0, np.minimum(deviation_m, width_m), width_m)
         return peaks.height * self.gathered, peaks.delay * camera.unambiguous_m, deviation_m
 
@@ -111,7 +135,9 @@ class LidarScanner(UnitModel[ScannedLidar]):
         """Return light (..., h, w) integrated over the points of a column that one point's time spans."""
         every = np.arange(light.shape[-2])
         total = np.zeros((), light.dtype)
-        for ahead, weight in enumerate(self.smear.astype(light.real.dtype), -(len(self.smear) // 2)):
+        for ahead, weight in enumerate(
+            self.smear.astype(light.real.dtype), -(len(self.smear) // 2)
+        ):
             total = total + weight * light[..., np.clip(every[rows] + ahead, 0, every[-1]), :]
         return total
 
@@ -123,13 +149,19 @@ class LidarScanner(UnitModel[ScannedLidar]):
             ndimage.convolve1d(everyone, taps, axis, everyone, mode="constant")
         return everyone
 
-    def frame(self, exposure: LidarReturns, rng: np.random.Generator, error_m: float = 0.0) -> DecodedFrame:
+    def frame(
+        self, exposure: LidarReturns, rng: np.random.Generator, error_m: float = 0.0
+    ) -> DecodedFrame:
         """Draw a frame: noise from ``rng`` on the peaks, then the processing; ``error_m`` displaces the frame."""
         camera, (h, w) = self.camera, exposure.noise.shape
         p, q = (len(taps) // 2 for taps in camera.smoothing_taps)
         inner, bordered = (slice(p, p + h), slice(q, q + w)), (h + 2 * p, w + 2 * q)
         # half path, share and height, with a border that agrees with nothing
-        half_m, share, height = np.full(bordered, kernels.NOWHERE_M), np.zeros(bordered, f4), np.zeros(bordered, f4)
+        half_m, share, height = (
+            np.full(bordered, kernels.NOWHERE_M),
+            np.zeros(bordered, f4),
+            np.zeros(bordered, f4),
+        )
         share[inner] = 1.0
         won = half_m[inner], height[inner], np.empty((h, w), f4)
         # standard normals, correlated along columns, and the sweeps' errors
@@ -151,9 +183,15 @@ class LidarScanner(UnitModel[ScannedLidar]):
         for axis, taps in enumerate(camera.smoothing_taps):
             smoothed = tuple(np.empty((h, w), f4) for _ in image)
             kernels.smooth(*image, gate_m, taps, axis == 1, *smoothed)
-            for bordered_image, result in zip(image, smoothed if axis == 0 else (), strict=axis == 0):
+            for bordered_image, result in zip(
+                image, smoothed if axis == 0 else (), strict=axis == 0
+            ):
                 bordered_image[inner] = result
-        z_m, strength, reason = np.empty((h, w), f4), np.empty((h, w), f4), np.empty((h, w), np.uint8)
+        z_m, strength, reason = (
+            np.empty((h, w), f4),
+            np.empty((h, w), f4),
+            np.empty((h, w), np.uint8),
+        )
         scene = *self._geometry, exposure.saturated, self._limits, f4(error_m)
         kernels.gated(*smoothed, self._everyone, *scene, z_m, reason, strength)
         return DecodedFrame(z_m, reason, strength)
@@ -163,7 +201,9 @@ def smear_weights(points: float) -> np.ndarray:
     """Return weights, with sum 1, of points around one whose integration covers ``points``; light between is linear."""
     reach = int(np.ceil(points / 2))
     hat, half = interpolate.BSpline.basis_element([-1, 0, 1]), points / 2
-    weights = [hat.integrate(-half - k, half - k, extrapolate=False) for k in range(-reach, reach + 1)]
+    weights = [
+        hat.integrate(-half - k, half - k, extrapolate=False) for k in range(-reach, reach + 1)
+    ]
     return np.array(weights) / points
 
 

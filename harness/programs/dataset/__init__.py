@@ -1,0 +1,1 @@
+"""`tofpod dataset`, `score` and `export`: simulated boards as files, and the limits of anomaly maps on them."""
